@@ -1,0 +1,34 @@
+"""`carlasc`: the SDK for CarlaSC, the data set of complete, trace-free semantic scenes.
+
+Importing it loads NumPy and nothing heavier; the names below are found in their modules on first use.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {  # public name -> module
+    "GridSpec": "grids",
+    "Grid": "grids",
+    "Scan": "scans",
+    "ClassTable": "labels",
+    "Remap": "labels",
+    "open": "sources",
+}
+
+__all__ = ["__version__", "errors", *_HOME]  # noqa: PLE0604 (names of the table)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"carlasc.{_HOME[name]}"), name)
+    if name in ("errors", "metrics", "labels", "geometry", "layout"):
+        return importlib.import_module(f"carlasc.{name}")
+    raise AttributeError(f"module 'carlasc' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Observations to votes to grid: the ground truth and how a run over a data set makes it."""

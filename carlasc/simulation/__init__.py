@@ -1,0 +1,1 @@
+"""A small procedural town, LiDARs in it, and the raw capture they record."""

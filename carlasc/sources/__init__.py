@@ -1,0 +1,6 @@
+"""Where sequences are read from and written to."""
+
+from carlasc.sources.base import Metadata, Sequence, SequenceWriter, Sink, Source
+from carlasc.sources.folder import FolderSink, FolderSource
+
+__all__ = ["FolderSink", "FolderSource", "Metadata", "Sequence", "SequenceWriter", "Sink", "Source"]
