@@ -1,0 +1,5 @@
+"""`python -m carlasc` is `carlasc`."""
+
+from carlasc.cli import main
+
+main()
