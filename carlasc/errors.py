@@ -49,9 +49,6 @@ def import_extra(module: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        reason = (
-            "is not installed"
-            if getattr(error, "name", None) == module.partition(".")[0]
-            else f"does not load ({error})"
-        )
-        raise DependencyError(f"{module} {reason}: install it with `pip install 'carlasc[{extra}]'`") from error
+        package = module.partition(".")[0]
+        reason = "is not installed" if error.name == package else f"does not load ({error})"
+        raise DependencyError(f"{package} {reason}: install it with `pip install 'carlasc[{extra}]'`") from error
