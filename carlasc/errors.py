@@ -33,6 +33,10 @@ class ConflictError(CarlascError):
     """Writing would destroy or mix with something that is already there."""
 
 
+class StorageError(CarlascError):
+    """The output cannot be written: a full disk, a folder that is not ours. Whatever comes next would meet the same."""
+
+
 def import_extra(module: str, extra: str) -> ModuleType:
     """Import an optional module, or say in one line which extra to install.
 

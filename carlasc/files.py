@@ -5,12 +5,15 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import socket
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from carlasc.errors import CarlascError, FormatError
+from carlasc.errors import FormatError, StorageError
 
 
 def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], object]) -> None:
@@ -21,12 +24,14 @@ def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], 
         content: the bytes, or a function that writes them to an open file.
 
     Raises:
-        CarlascError: the disk is full or the folder cannot be written to; nothing is left behind.
+        StorageError: the disk is full or the folder cannot be written to; nothing is left behind.
     """
     temporary: str | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        handle, temporary = tempfile.mkstemp(
+            prefix=f".{path.name}.{_HOST}-{os.getpid()}.", suffix=_PART, dir=path.parent
+        )
         with os.fdopen(handle, "wb") as file:
             if callable(content):
                 content(file)
@@ -36,13 +41,55 @@ def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], 
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
-        advice = {errno.ENOSPC: "free some space and run again", errno.EACCES: "choose a folder that you may write to"}
-        raise CarlascError(
-            f"{path}: cannot be written: {error.strerror or error}: {advice.get(error.errno or 0, 'check the path')}"
-        ) from error
+        raise _storage_error(path, error) from error
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a text file; it is made where it is not there, with its folders.
+
+    Raises:
+        StorageError: the disk is full or the folder cannot be written to.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(f"{line}\n")
+    except OSError as error:
+        raise _storage_error(path, error) from error
+
+
+def remove_stale(folder: Path) -> None:
+    """Remove what writers that were killed left half-written in a folder and the folders in it.
+
+    A temporary file is stale when the process that wrote it, on this machine, is gone, or when it is a day old.
+    """
+    for part in (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}")):
+        match = re.search(rf"\.{re.escape(_HOST)}-([0-9]+)\.[^.]+{re.escape(_PART)}$", part.name)
+        try:
+            if (match and not _is_alive(int(match[1]))) or time.time() - part.stat().st_mtime > 86400:
+                part.unlink()
+        except FileNotFoundError:
+            continue  # its writer finished meanwhile
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # signal 0 only asks
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _storage_error(path: Path, error: OSError) -> StorageError:
+    advice = {errno.ENOSPC: "free some space and run again", errno.EACCES: "choose a folder that you may write to"}
+    return StorageError(
+        f"{path}: cannot be written: {error.strerror or error}: {advice.get(error.errno or 0, 'check the path')}"
+    )
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -76,4 +123,6 @@ def _read_umask() -> int:
     return mask
 
 
+_PART = ".part"
+_HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
 _UMASK = _read_umask()  # read once, at import: asking sets it for a moment, which threads would notice
