@@ -1,0 +1,44 @@
+"""A frame's confusion matrix against the loop over classes, masks included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from carlasc.metrics import ConfusionMatrix, known
+
+K = 11
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Labels as common as in the data set: 9 of 10 voxels free, 6 of 10 known."""
+    rng = np.random.default_rng(0)
+    shape, shares = (128, 128, 8), np.r_[0.9, np.full(10, 0.01)]
+    target = rng.choice(K, shape, p=shares).astype(np.uint8)
+    pred = np.where(rng.random(shape) < 0.9, target, rng.choice(K, shape, p=shares)).astype(np.uint8)
+    counts = rng.integers(0, 10, shape) * (rng.random(shape) < 0.6)
+    return pred, target, counts.astype(np.float32)
+
+
+def per_class_loop(pred, target, counts):
+    figures = []
+    for c in range(K):
+        hit = ((pred == c) & (target == c) & (counts > 0)).sum()
+        either = (((pred == c) | (target == c)) & (counts > 0)).sum()
+        figures.append((hit, either))
+    return figures
+
+
+@pytest.mark.benchmark(group="metrics")
+def test_bench_confusion_matrix(benchmark, frame):
+    pred, target, counts = frame
+    matrix = benchmark(lambda: ConfusionMatrix(K).update(pred, target, known(counts)))
+    assert matrix.total == (counts > 0).sum()
+
+
+@pytest.mark.benchmark(group="metrics")
+def test_bench_per_class_loop(benchmark, frame):
+    figures = benchmark(per_class_loop, *frame)
+    matrix = ConfusionMatrix(K).update(frame[0], frame[1], known(frame[2]))
+    np.testing.assert_allclose([hit / either for hit, either in figures], matrix.iou)

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics import ConfusionMatrix
+
+K = 11
+
+
+def per_class_loop(pred, target, mask, num_classes):
+    """The straightforward way, for comparison: a pass over the voxels for each class and figure."""
+    rows = []
+    for c in range(num_classes):
+        hit = ((pred == c) & (target == c) & mask).sum()
+        missed = ((pred != c) & (target == c) & mask).sum()
+        wrong = ((pred == c) & (target != c) & mask).sum()
+        rows.append((hit, wrong, missed))
+    return np.array(rows)
+
+
+def labels_and_mask(seed, shape=(2, 9, 7, 5), dtype=np.uint8):
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, K, shape).astype(dtype), rng.integers(0, K, shape).astype(dtype), rng.random(shape) < 0.6
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])
+def test_counts_are_those_of_the_per_class_loop_for_every_integer_type(dtype):
+    pred, target, mask = labels_and_mask(0, dtype=dtype)
+    matrix = ConfusionMatrix(K).update(pred, target, mask)
+    expected = per_class_loop(pred, target, mask, K)
+    found = np.stack([matrix.true_positives, matrix.false_positives, matrix.false_negatives], 1)
+    np.testing.assert_array_equal(found, expected)
+    assert matrix.total == mask.sum()
+
+
+def test_figures_of_a_matrix_worked_out_by_hand():
+    matrix = ConfusionMatrix(4)
+    matrix.update(np.array([0, 0, 1, 1, 1, 2]), np.array([0, 1, 1, 1, 2, 0]))
+    np.testing.assert_allclose(matrix.iou, [1 / 3, 2 / 4, 0, np.nan])
+    assert matrix.miou == pytest.approx((1 / 3 + 1 / 2) / 4)  # the absent class 3 counts zero
+    assert matrix.mean_iou(absent="skip") == pytest.approx((1 / 3 + 1 / 2) / 3)
+    assert matrix.mean_iou(with_free=False) == pytest.approx((1 / 2) / 3)
+    assert matrix.mean_iou(with_free=False, absent="skip") == pytest.approx((1 / 2) / 2)
+    assert matrix.accuracy == pytest.approx(3 / 6)
+    np.testing.assert_allclose(matrix.recall, [1 / 2, 2 / 3, 0, np.nan])
+    np.testing.assert_allclose(matrix.precision, [1 / 2, 2 / 3, 0, np.nan])
+    geometry = matrix.completeness()  # occupied: predicted at 2..5, true at 1..4
+    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx((3 / 4, 3 / 4, 3 / 5))
+
+
+def test_an_empty_matrix_has_no_figures_rather_than_zeros_or_errors():
+    matrix = ConfusionMatrix(3)
+    assert np.isnan(matrix.accuracy)
+    assert np.isnan(matrix.completeness().iou)
+    assert np.isnan(matrix.iou).all()
+    assert np.isnan(matrix.mean_iou(absent="skip"))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 59))
+def test_matrices_of_parts_add_up_to_the_matrix_of_the_whole(seed, cut):
+    pred, target, mask = (array.reshape(-1)[:60] for array in labels_and_mask(seed))
+    whole = ConfusionMatrix(K).update(pred, target, mask)
+    left = ConfusionMatrix(K).update(pred[:cut], target[:cut], mask[:cut])
+    right = ConfusionMatrix(K).update(pred[cut:], target[cut:], mask[cut:])
+    assert left + right == whole
+    left += right
+    assert left == whole
+
+
+def test_tensors_count_as_arrays_do():
+    torch = pytest.importorskip("torch")
+    pred, target, mask = labels_and_mask(3)
+    expected = ConfusionMatrix(K).update(pred, target, mask)
+    tensors = [torch.from_numpy(a) for a in (pred, target, mask)]
+    assert ConfusionMatrix(K).update(*tensors) == expected
+    assert ConfusionMatrix(K).update(tensors[0], target, mask) == expected
+    assert ConfusionMatrix(K).update(tensors[0].long(), tensors[1]) == ConfusionMatrix(K).update(pred, target)
+
+
+def test_the_count_on_another_device_is_that_on_the_cpu():
+    torch = pytest.importorskip("torch")
+    from carlasc.metrics import confusion
+
+    pred, target, mask = labels_and_mask(4)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    tensors = [torch.from_numpy(a).to(device) for a in (pred, target, mask)]
+    expected = ConfusionMatrix(K).update(pred, target, mask)
+    np.testing.assert_array_equal(confusion._count_on(device, *tensors, K), expected.counts)
+    np.testing.assert_array_equal(confusion._count_on(device, tensors[0], target, mask, K), expected.counts)
+    with pytest.raises(FormatError, match=r"prediction: expected class ids 0\.\.2, found"):
+        confusion._count_on(device, *tensors, 3)
+    with pytest.raises(FormatError, match="truth: expected integer"):
+        confusion._count_on(device, tensors[0], tensors[1].float(), None, K)
+
+
+def test_ids_out_of_range_are_named_unless_masked():
+    pred, target, mask = np.array([0, 11, 255]), np.array([0, 1, 2]), np.array([True, False, False])
+    assert ConfusionMatrix(K).update(pred, target, mask).total == 1
+    with pytest.raises(FormatError, match=r"prediction: expected class ids 0\.\.10, found 11 \(2 voxels"):
+        ConfusionMatrix(K).update(pred, target)
+    with pytest.raises(FormatError, match=r"truth: expected class ids 0\.\.10, found -1"):
+        ConfusionMatrix(K).update(target, np.array([0, -1, 2]))
+
+
+def test_shapes_and_types_that_do_not_fit_are_refused():
+    with pytest.raises(FormatError, match=r"truth's shape \(2, 2\), found \(4,\)"):
+        ConfusionMatrix(K).update(np.zeros(4, int), np.zeros((2, 2), int))
+    with pytest.raises(FormatError, match=r"mask of \(3,\)"):
+        ConfusionMatrix(K).update(np.zeros(4, int), np.zeros(4, int), np.ones(3, bool))
+    with pytest.raises(FormatError, match="prediction: expected integer class ids, found float64"):
+        ConfusionMatrix(K).update(np.zeros(4), np.zeros(4, int))
+    with pytest.raises(ArgumentError):
+        ConfusionMatrix(0)
+    with pytest.raises(ArgumentError):
+        ConfusionMatrix(3, counts=np.zeros((2, 2), int))
+    with pytest.raises(ArgumentError):
+        ConfusionMatrix(3) + ConfusionMatrix(4)
+    with pytest.raises(ArgumentError):
+        ConfusionMatrix(3).mean_iou(absent="maybe")
+
+
+def test_metrics_of_arrays_do_not_import_torch():
+    code = (
+        "import sys, numpy as np; from carlasc.metrics import ConfusionMatrix; a = np.zeros(3, int);"
+        "ConfusionMatrix(2).update(a, a); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

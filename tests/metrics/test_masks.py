@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from carlasc import Grid, GridSpec
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics import distance_band, field_of_view, known, score_truth, semantickitti
+
+SPEC = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -1.0), (4.0, 4.0, 1.0))
+
+
+def test_distance_bands_tile_the_grid():
+    bands = [distance_band(SPEC, low, high) for low, high in ((0, 2), (2, 4), (4, math.inf))]
+    np.testing.assert_array_equal(np.sum(bands, axis=0), np.ones(SPEC.size))
+    assert bands[0][4, 4].all()  # centre (0.5, 0.5)
+    assert not bands[0][0, 0].any()
+    assert bands[2][0, 0].all()
+
+
+def test_distance_bands_of_a_cylindrical_grid_follow_the_radius():
+    spec = GridSpec("cylindrical", (10, 6, 2), (0.0, -math.pi, -1.0), (10.0, math.pi, 1.0))
+    band = distance_band(spec, 2.0, 5.0)
+    assert band[2:5].all()
+    assert not band[:2].any()
+    assert not band[5:].any()
+
+
+def test_field_of_view_of_90_degrees_is_the_quarter_ahead():
+    seen = field_of_view(SPEC, math.pi / 2)
+    x, y, _ = np.moveaxis(SPEC.centers(), -1, 0)
+    np.testing.assert_array_equal(seen, np.abs(y) <= x)
+    assert field_of_view(SPEC).all()
+
+
+def test_vertical_field_of_view_leaves_out_what_is_above():
+    seen = field_of_view(SPEC, vertical_rad=(-math.pi / 2, 0.0))
+    assert seen[..., 0].all()
+    assert not seen[..., 1].any()
+
+
+def test_semantickitti_scores_empty_voxels_but_neither_ignored_classes_nor_invalid_ones():
+    labels = np.array([0, 0, 1, 52, 99, 10, 252, 40], np.uint16)
+    invalid = np.array([0, 1, 0, 0, 0, 0, 0, 1])
+    np.testing.assert_array_equal(semantickitti(labels), [1, 1, 0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(semantickitti(labels, invalid), [1, 0, 0, 0, 0, 1, 1, 0])
+    with pytest.raises(FormatError):
+        semantickitti(labels, invalid[:3])
+
+
+def test_masks_that_can_hold_nothing_are_refused():
+    with pytest.raises(ArgumentError):
+        distance_band(SPEC, 5, 5)
+    with pytest.raises(ArgumentError):
+        field_of_view(SPEC, 0.0)
+
+
+def test_known_is_a_count_above_zero():
+    np.testing.assert_array_equal(known(np.array([0.0, 1.0, 7.0])), [False, True, True])
+
+
+def test_truth_is_scored_over_voxels_known_to_both():
+    spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
+
+    def grid(labels, counts):
+        return Grid(spec, np.array(labels, np.uint8).reshape(4, 1, 1), np.array(counts, np.float32).reshape(4, 1, 1))
+
+    score = score_truth(grid([1, 2, 0, 2], [1, 1, 0, 3]), grid([1, 1, 0, 2], [1, 2, 5, 0]), 3)
+    assert (score.known, score.known_reference, score.known_both) == (3, 3, 2)
+    assert score.coverage == pytest.approx(2 / 3)
+    assert score.accuracy == pytest.approx(1 / 2)
+    np.testing.assert_array_equal(score.matrix.false_positives, [0, 0, 1])
+    total = score + score
+    assert (total.known_both, total.matrix.total) == (4, 4)
+    assert total.coverage == score.coverage
+
+
+def test_truth_of_another_grid_is_refused():
+    grid = Grid(SPEC, np.zeros(SPEC.size, np.uint8))
+    other = SPEC.with_size((4, 4, 2))
+    with pytest.raises(FormatError, match="expected the reference's"):
+        score_truth(grid, Grid(other, np.zeros(other.size, np.uint8)), 2)
