@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
+from carlasc.grids import GridSpec
 
 SPLITS = ("Train", "Val", "Test")
 COORDINATES = ("cartesian", "cylindrical")
@@ -184,9 +184,11 @@ def params_file(grid: str) -> str:
     return f"{grid}/{PARAMS}"
 
 
-def grid_folder(size: Sequence[int]) -> str:
-    """Return the folder of a grid by its size: `evaluation` for the published one, else with the size in its name."""
-    return EVALUATION if tuple(size) == (128, 128, 8) else f"{EVALUATION}_{'x'.join(map(str, size))}"
+def grid_folder(spec: GridSpec) -> str:
+    """Return a grid's folder: `evaluation` for the published one of its coordinates, else with the size in its name."""
+    return (
+        EVALUATION if spec == GridSpec.published(spec.coordinates) else f"{EVALUATION}_{'x'.join(map(str, spec.size))}"
+    )
 
 
 def frame_of(file_name: str, suffix: str) -> int | None:

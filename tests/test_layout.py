@@ -6,6 +6,7 @@ from hypothesis.extra.numpy import arrays
 
 from carlasc import layout
 from carlasc.errors import FormatError
+from carlasc.grids import GridSpec
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -57,8 +58,11 @@ def test_file_names_are_those_of_the_format():
     assert layout.field_named("flow").file(7) == "predictions/000007.bin"
     assert layout.field_named("evaluation_64x64x8/counts").file(12) == "evaluation_64x64x8/000012.bin"
     assert layout.field_named("evaluation/votes").file(1234567) == "evaluation/1234567.votes.npz"
-    assert layout.grid_folder((128, 128, 8)) == "evaluation"
-    assert layout.grid_folder((256, 256, 16)) == "evaluation_256x256x16"
+    assert layout.grid_folder(GridSpec.published()) == "evaluation"
+    assert layout.grid_folder(GridSpec.published("cylindrical")) == "evaluation"
+    assert layout.grid_folder(GridSpec.published("cartesian_fine")) == "evaluation_256x256x16"
+    # the published number of cells, but -2..1.2 m high: not the published grid
+    assert layout.grid_folder(GridSpec.published().with_resolution(0.4)) == "evaluation_128x128x8"
     assert layout.frame_of("000012.label", ".label") == 12
     assert [
         layout.frame_of(name, ".label") for name in ("12.label", "000012.bin", "x00012.label", ".000012.label.part")
