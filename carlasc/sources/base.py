@@ -71,7 +71,7 @@ class Metadata:
 
     def to_json(self) -> bytes:
         """Return the bytes of carlasc.json."""
-        values = {"frame": self.frame, "classes": self.classes.name, "sensor": self.sensor}
+        values: dict[str, Any] = {"frame": self.frame, "classes": self.classes.name, "sensor": self.sensor}
         values |= {"min_range_m": self.min_range_m, "max_range_m": self.max_range_m, "source": self.source}
         return to_json({key: value for key, value in values.items() if value is not None} | dict(self.extra))
 
