@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import layout
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.files import parse_json, to_json
 from carlasc.geometry import Transform
 from carlasc.grids import Coordinates, Grid, GridSpec
@@ -277,6 +277,18 @@ class SequenceWriter(ABC):
     @abstractmethod
     def read_document(self, name: str) -> bytes | None:
         """Return a text file's bytes, None if it is not there: how a second run finds what a first one left."""
+
+    def read(self, field: str, frame: int) -> NDArray[Any] | None:
+        """Return a field of a frame that is there, as the file's flat or (N, columns) rows; None where the store cannot tell."""
+        return None
+
+    def remove_grid(self, grid: str) -> None:
+        """Remove a grid, its params.json last, so that a removal that is cut short can be gone on with.
+
+        Raises:
+            ConflictError: the store cannot.
+        """
+        raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new one")
 
     def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)
         """Finish: a store that needs a last word (an index) says it here. Not called when the work failed."""
