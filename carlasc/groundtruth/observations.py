@@ -1,0 +1,43 @@
+"""What one voter saw: the points of one scan, what they are, and where its sensor stood."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError
+from carlasc.geometry import Transform, check_rigid
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One voter: the scan of one sensor at one instant. It says what its points hit, and that its rays passed freely.
+
+    Attributes:
+        points: (N, 3) float32, metres, the sensor's own frame. float32 is part of the rule (FORMAT section 4).
+        labels: (N,) unsigned integer class ids; points labelled 0 take no part, their rays neither.
+        grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's.
+
+    Raises:
+        FormatError: points and labels disagree, have another shape or type, or the transform is not rigid.
+    """
+
+    points: NDArray[np.float32]
+    labels: NDArray[np.unsignedinteger]
+    grid_T_sensor: Transform
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
+            found = f"{self.points.shape} {self.points.dtype}"
+            raise FormatError(f"observation points: expected shape (N, 3) float32, found {found}")
+        if self.labels.shape != (len(self.points),):
+            expected = f"shape ({len(self.points)},), one a point"
+            raise FormatError(f"observation labels: expected {expected}, found {self.labels.shape}")
+        if self.labels.dtype.kind != "u":
+            raise FormatError(f"observation labels: expected unsigned integers, found {self.labels.dtype}")
+        check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
+
+    def __len__(self) -> int:
+        return len(self.points)

@@ -1,0 +1,180 @@
+"""Votes of observations on the voxels of a grid, and what the votes decide.
+
+Every labelled point votes for its class in its voxel, and free samples on its ray vote for free (class 0) in theirs. A voxel takes the
+class with most votes, ties go to the lowest id, and a voxel without any vote is unknown (FORMAT section 4).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError
+from carlasc.grids import Grid, GridSpec
+from carlasc.groundtruth.observations import Observation
+from carlasc.labels import CARLA, ClassTable
+from carlasc.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
+
+VoteRule = Literal["sensor", "sample"]
+
+OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
+
+
+def count_votes(
+    observations: Iterable[Observation],
+    spec: GridSpec,
+    classes: ClassTable = CARLA,
+    *,
+    vote: VoteRule = "sensor",
+    free_step_m: float = 1.5,
+) -> Votes:
+    """Count the votes of observations, one at a time: memory does not grow with their number.
+
+    Args:
+        observations: the voters, all in one grid frame.
+        spec: the grid.
+        classes: table of the labels.
+        vote: "sensor": at most one vote an observation, voxel and class (the published files); "sample": every sample counts.
+        free_step_m: distance between the free samples of a ray, metres.
+
+    Raises:
+        ArgumentError: an unknown vote rule, or a step that is not a positive number.
+        FormatError: a label is not below `classes.num_channels`.
+    """
+    ballot = Ballot(spec, classes, vote=vote, free_step_m=free_step_m)
+    for observation in observations:
+        ballot.add(observation)
+    return ballot.votes()
+
+
+class Ballot:
+    """Votes as they come in: `add` observations one by one, read the `votes` at any time.
+
+    A ballot is used by one thread at a time; different ballots are independent, and `add` releases the GIL.
+
+    Args:
+        spec: the grid.
+        classes: table of the labels.
+        vote: "sensor" or "sample", as in `count_votes`.
+        free_step_m: distance between the free samples of a ray, metres.
+
+    Raises:
+        ArgumentError: an unknown vote rule, or a step that is not a positive number.
+    """
+
+    def __init__(
+        self, spec: GridSpec, classes: ClassTable = CARLA, *, vote: VoteRule = "sensor", free_step_m: float = 1.5
+    ) -> None:
+        from carlasc.groundtruth import kernel
+
+        if vote not in ("sensor", "sample"):
+            raise ArgumentError(f"vote rule: expected sensor or sample, found {vote!r}")
+        if not (math.isfinite(free_step_m) and free_step_m > 0):
+            raise ArgumentError(f"free step: expected a positive number of metres, found {free_step_m}")
+        self.spec, self.classes, self.vote, self.free_step_m = spec, classes, vote, float(free_step_m)
+        self.num_observations = 0
+        self._cells = kernel.Cells.of(spec)
+        self._free = np.zeros(spec.num_voxels, np.uint32 if vote == "sensor" else np.int64)
+        self._passed = np.zeros(spec.num_voxels if vote == "sensor" else 0, np.uint8)
+        self._heads = np.full(spec.num_voxels, kernel.NONE, np.int32)
+        self._candidates = np.empty(0, kernel.CANDIDATE_DTYPE)
+        self._used = 0
+
+    def add(self, observation: Observation) -> None:
+        """Add the votes of one observation.
+
+        Raises:
+            FormatError: a label is not below the class table's number of channels; no vote was added.
+        """
+        from carlasc.groundtruth import kernel
+
+        self.classes.check(observation.labels, "observation labels")
+        self._make_room(len(observation))
+        self._used = kernel.vote(
+            np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
+            np.require(observation.labels, np.uint16, ["C", "A", "W"]),
+            kernel.as_pose(observation.grid_T_sensor),
+            self._cells,
+            self.free_step_m,
+            self.num_observations,
+            self.vote == "sensor",
+            self._free,
+            self._passed,
+            self._heads,
+            self._candidates,
+            self._used,
+        )
+        self.num_observations += 1
+
+    def votes(self) -> Votes:
+        """Return the votes so far; later observations do not change them."""
+        used = self._candidates[: self._used]
+        occupied = np.empty(self._used, OCCUPIED_DTYPE)
+        for name in OCCUPIED_DTYPE.names or ():
+            occupied[name] = used[name]
+        return Votes(self.spec, self.classes, self._free.reshape(self.spec.size).copy(), occupied)
+
+    def _make_room(self, points: int) -> None:
+        """Let the candidates grow by as many as there are points: at worst each is the first of its kind."""
+        if self._used + points > len(self._candidates):
+            grown = np.empty(max(self._used + points, 3 * self._used // 2), self._candidates.dtype)
+            grown[: self._used] = self._candidates[: self._used]
+            self._candidates = grown
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """The votes of each voxel by class, free ones apart from occupied ones.
+
+    Attributes:
+        spec: the grid.
+        classes: table of the labels.
+        free: (X, Y, Z) unsigned integer, votes for free space.
+        occupied: (M,) structured `voxel` (int32 flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0); one row
+            a voxel and class, in no order.
+    """
+
+    spec: GridSpec
+    classes: ClassTable
+    free: NDArray[Any]
+    occupied: NDArray[Any]
+
+    def to_grid(self) -> Grid:
+        """Return the class with most votes of each voxel (ties to the lowest id; free is 0) and the sum of its votes."""
+        from carlasc.groundtruth import kernel
+
+        size = self.spec.num_voxels
+        labels, best = np.empty(size, self.classes.dtype), np.empty(size, self.free.dtype)
+        counts = np.empty(size, self.free.dtype)
+        kernel.elect(self.free.reshape(-1), self.occupied, labels, best, counts)
+        return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
+
+    def occupied_counts(self) -> NDArray[np.int64]:
+        """Return (X, Y, Z) int64: votes for any class but free."""
+        counts = np.bincount(self.occupied["voxel"], self.occupied["votes"], self.spec.num_voxels)
+        return counts.astype(np.int64).reshape(self.spec.size)
+
+    def to_sparse(self) -> NDArray[Any]:
+        """Return the votes as the layout stores them: only non-zero ones, sorted by voxel, then label; free is label 0.
+
+        Votes beyond 65535, the most that the layout holds, are kept as 65535.
+
+        Returns:
+            (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` where class ids do not fit 8 bits.
+        """
+        free = np.flatnonzero(self.free)
+        columns = {
+            "voxel": np.concatenate([free, self.occupied["voxel"]]),
+            "label": np.concatenate([np.zeros(len(free), np.uint16), self.occupied["label"]]),
+            "votes": np.minimum(np.concatenate([self.free.reshape(-1)[free], self.occupied["votes"]]), 65535),
+        }
+        order = np.lexsort((columns["label"], columns["voxel"]))
+        votes = np.empty(len(order), VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE)
+        for name, column in columns.items():
+            votes[name] = column[order]
+        return votes
