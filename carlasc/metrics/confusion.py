@@ -229,8 +229,9 @@ def _bincount_pairs(
     Most voxels are free and predicted free; four tables in turn spare the wait for the last store to the same bin.
     """
     tables = np.zeros((4, num_classes * num_classes), np.int64)
-    for i in range(pred.size):
-        tables[i & 3, target[i] * num_classes + pred[i]] += counted[i]
+    row = np.uint32(num_classes)  # unsigned: a signed index would be checked for counting from the end
+    for i in range(np.uint64(pred.size)):
+        tables[i & np.uint64(3), np.uint32(target[i]) * row + np.uint32(pred[i])] += counted[i]
     return tables.sum(axis=0).reshape(num_classes, num_classes)
 
 
