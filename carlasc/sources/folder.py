@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from carlasc import layout
 from carlasc.errors import MissingDataError
-from carlasc.files import write_atomic
+from carlasc.files import remove_stale, write_atomic
 from carlasc.sources.base import Sequence, SequenceWriter, Sink
 from carlasc.sources.published import PublishedSequence, PublishedSource
 from carlasc.sources.trees import LocalTree
@@ -65,7 +65,8 @@ class FolderSink(Sink):
         self.location = str(self.root)
 
     def sequence(self, path: str) -> FolderWriter:
-        """Start, or go on with, a sequence's folder."""
+        """Start, or go on with, a sequence's folder; what a killed run left half-written there is removed."""
+        remove_stale(self.root / path)
         return FolderWriter(self.root / path)
 
 
@@ -87,6 +88,20 @@ class FolderWriter(SequenceWriter):
         entry = layout.field_named(field)
         path = self.folder / entry.file(frame)
         write_atomic(path, entry.encode(array, str(path)))
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Return what is there."""
+        entry = layout.field_named(field)
+        path = self.folder / entry.file(frame)
+        return entry.decode(path.read_bytes(), str(path))
+
+    def remove_grid(self, grid: str) -> None:
+        """Remove a grid's frames, then its params.json; other files in its folder stay."""
+        parts = [layout.field_named(f"{grid}/{part}").suffix for part in layout.GRID_FIELDS]
+        for path in (self.folder / grid).iterdir():
+            if any(layout.frame_of(path.name, suffix) is not None for suffix in parts):
+                path.unlink()
+        (self.folder / layout.params_file(grid)).unlink()
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""

@@ -169,12 +169,13 @@ class RemoteTree(Tree):
             self._listed[folder] = listed
         return self._listed[folder]
 
-    def read(self, path: str) -> bytes:
+    def is_file(self, path: str) -> bool:
+        """Ask for the one file where folders cannot be listed (http), else look in its folder's listing."""
+        return self.size(path) is not None if self.location.startswith("http") else super().is_file(path)
+
+    def read(self, path: str) -> bytes | memoryview:
         """Fetch the file."""
-        try:
-            return bytes(self._fs.cat_file(self.where(path)))
-        except Exception as error:  # noqa: BLE001
-            _fail(self.where(path), error)
+        return self.read_many([path])[0]
 
     def read_range(self, path: str, start: int, end: int) -> bytes:
         """Fetch the range, and nothing else."""
@@ -182,15 +183,11 @@ class RemoteTree(Tree):
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
         """Fetch the files, several at a time."""
-        urls = {path: self.where(path) for path in paths}
-        fs = self._fs
+        urls = [self.where(path) for path in paths]
         try:
-            found = fs.cat([urls[path] for path in paths], on_error="raise") if len(urls) > 1 else None
+            return [bytes(data) for data in self._fs.cat_ranges(urls, None, None, on_error="raise")]
         except Exception as error:  # noqa: BLE001
-            _fail(f"{self.location} ({len(urls)} files)", error)
-        if found is None:
-            return [self.read(path) for path in paths]
-        return [found[fs._strip_protocol(urls[path])] for path in paths]
+            _fail(urls[0] if len(urls) == 1 else self.location, error)
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes]:  # type: ignore[override]
         """Fetch the ranges, several at a time."""
@@ -209,7 +206,7 @@ class RemoteTree(Tree):
         return [check_length(bytes(data), end - start, url) for data, start, end, url in parts]
 
     def size(self, path: str = "") -> int | None:
-        """Return a file's size in bytes, None where there is no such file.
+        """Return a file's size in bytes, None where there is no such file, or a folder (or a page that lists one).
 
         Raises:
             CarlascError: the server answers no range requests, without which nothing can be read in place.
@@ -221,7 +218,7 @@ class RemoteTree(Tree):
             return None
         except Exception as error:  # noqa: BLE001
             _fail(url, error)
-        if found.get("type") == "directory":
+        if found.get("type") == "directory" or found.get("mimetype") == "text/html":
             return None
         if url.startswith("http") and not found.get("partial"):
             raise CarlascError(

@@ -96,9 +96,10 @@ class ZipTree(Tree):
         last = first + columns["packed"]
         if last > len(data):  # a long extra field in the local header only
             data = memoryview(self.tree.read_range(self.path, columns["offset"], columns["offset"] + last))
-        content: bytes | memoryview = data[first:last]
+        packed = data[first:last]
+        content: bytes | memoryview = packed
         if columns["method"] == _DEFLATED:
-            content = _inflate(content, columns["size"], where)
+            content = _inflate(packed, columns["size"], where)
         if len(content) != columns["size"] or zlib.crc32(content) != columns["crc"]:
             raise FormatError(
                 f"{where}: expected {columns['size']} bytes with the zip's checksum, found others: damaged zip, fetch it again"
@@ -236,9 +237,10 @@ def _widen(columns: dict[str, NDArray[np.int64]], member: int, extra: bytes, whe
             names = [name for name in ("size", "packed", "offset") if columns[name][member] == 0xFFFFFFFF]
             if length < 8 * len(names) or position + 4 + 8 * len(names) > len(extra):
                 break
-            for name, value in zip(names, struct.unpack_from(f"<{len(names)}Q", extra, position + 4), strict=True):
-                if value >= 2**63:
-                    break
+            values = struct.unpack_from(f"<{len(names)}Q", extra, position + 4)
+            if max(values, default=0) >= 2**63:
+                break
+            for name, value in zip(names, values, strict=True):
                 columns[name][member] = value
             return
         position += 4 + length

@@ -1,0 +1,80 @@
+"""Finding out what a path or a URL holds, by looking at it, and opening it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.sources.base import Source
+from carlasc.sources.folder import FolderSource
+from carlasc.sources.published import PublishedSource
+from carlasc.sources.trees import LocalTree, RemoteTree, Tree
+from carlasc.sources.zipped import ZipTree
+
+_ZIP, _EMPTY_ZIP, _HDF5, _PARQUET = b"PK\x03\x04", b"PK\x05\x06", b"\x89HDF\r\n\x1a\n", b"PAR1"
+_SIGNATURE = 8  # bytes that tell them apart
+
+
+def open(path: str | os.PathLike[str], **storage_options: Any) -> Source:
+    """Open whatever holds sequences: it is looked at, not told by its ending.
+
+    Args:
+        path: a folder of the published layout (the data set, a split, a sequence, one `<coordinates>` folder), a zip of such a folder (read
+            in place), a packed store (zarr, HDF5, Parquet), or the URL of any of these (http, s3, and whatever fsspec knows).
+        **storage_options: what fsspec needs for the URL: `anon=True`, `endpoint_url=...`.
+
+    Returns:
+        The source. It holds no open handles, and pickles.
+
+    Raises:
+        MissingDataError: there is nothing.
+        FormatError: it is none of these, or damaged.
+        DependencyError: a package is missing; says which extra of carlasc brings it.
+    """
+    text = os.fspath(path)
+    if "://" in text and not text.startswith("file://"):
+        return _open_remote(RemoteTree(text, storage_options))
+    local = Path(text.removeprefix("file://"))
+    if local.is_dir():
+        return _open_store(LocalTree(local)) or FolderSource(local)
+    if local.is_file():
+        return _open_file(LocalTree(local.parent), local.name)
+    if (unfinished := local.with_name(f"{local.name}.part")).exists():
+        raise MissingDataError(
+            f"{local}: expected a finished store, found {unfinished.name}: run the same command again to finish it"
+        )
+    raise MissingDataError(f"{local}: expected a folder, a zip or a packed store, found nothing: check the path")
+
+
+def _open_remote(tree: RemoteTree) -> Source:
+    if tree.size() is not None:
+        return _open_file(tree, "")
+    source = _open_store(tree)
+    if source is None and not tree.entries():
+        raise MissingDataError(
+            f"{tree.location}: expected a folder, a zip or a packed store, found nothing (or a folder that cannot be listed)"
+        )
+    return source or PublishedSource(tree)
+
+
+def _open_store(tree: Tree) -> Source | None:
+    """Open a packed store that is a folder; None where the folder is none."""
+    return None
+
+
+def _open_file(tree: Tree, name: str) -> Source:
+    where = tree.where(name)
+    try:
+        signature = bytes(tree.read_range(name, 0, _SIGNATURE))
+    except FormatError as error:
+        raise FormatError(
+            f"{where}: expected a zip or a packed store, found a file of a few bytes: cut short?"
+        ) from error
+    if signature.startswith((_ZIP, _EMPTY_ZIP)):
+        inside = ZipTree(tree, name)
+        return _open_store(inside) or PublishedSource(inside)
+    if signature.startswith(_PARQUET):
+        raise FormatError(f"{where}: expected a packed store, found one of its files: give the folder that it is in")
+    raise FormatError(f"{where}: expected a folder, a zip, or a packed store, found a file that is none of these")
