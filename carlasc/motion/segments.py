@@ -1,0 +1,132 @@
+"""Segments: the points of one actor in one scan, told apart by flow or by instance numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.geometry import Transform, rotate_vectors, transform_points
+from carlasc.scans import Scan
+
+MIN_SPEED_M_S = 0.3  # slower is standing still: an estimated flow is never exactly zero
+_CELL_M = 0.4  # moving points are joined cell by cell of this size
+_REACH_M = 2.0  # cells of one actor are this near each other: a pole in front must not split a vehicle
+_SAME_VELOCITY_M_S = 0.5  # flow within one rigid actor differs by no more
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The points of one actor in one scan.
+
+    Attributes:
+        frame: frame number.
+        label: class of the actor: that of most of its points.
+        members: (M,) int64 indices into the scan's points.
+        points: (M, 3) float64 metres, world.
+        velocity: (3,) m/s over ground, world; None where the scan has no flow.
+        instance: number of the actor, 0 where actors have none.
+    """
+
+    frame: int
+    label: int
+    members: NDArray[np.int64]
+    points: NDArray[np.float64]
+    velocity: NDArray[np.float64] | None
+    instance: int = 0
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) middle of the points' bounding box, world."""
+        center: NDArray[np.float64] = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+        return center
+
+
+def segment_by_flow(
+    frame: int, scan: Scan, world_T_sensor: Transform, *, min_speed_m_s: float = MIN_SPEED_M_S
+) -> list[Segment]:
+    """Join the moving points of a scan into actors: near each other, of one class, of one velocity.
+
+    Two actors side by side at the same velocity may come out as one: they move as one, so nothing is lost.
+
+    Args:
+        frame: frame number.
+        scan: points with labels and flow; points whose flow is not finite count as standing.
+        world_T_sensor: (4, 4) pose of the scan.
+        min_speed_m_s: slower points stand still.
+
+    Returns:
+        Segments in the order of their first point.
+    """
+    if scan.flow is None or scan.labels is None:
+        return []
+    flow = np.nan_to_num(np.asarray(scan.flow, np.float64), posinf=0.0, neginf=0.0)
+    moving = np.flatnonzero((np.square(flow).sum(axis=1) > min_speed_m_s**2) & (scan.labels > 0))
+    if not len(moving):
+        return []
+    points = transform_points(world_T_sensor, scan.points[moving])
+    velocity = rotate_vectors(world_T_sensor, flow[moving])
+    labels = scan.labels[moving].astype(np.int64)
+    actor = _join(points, velocity, labels)
+    return [
+        Segment(frame, int(labels[own[0]]), moving[own], points[own], np.median(velocity[own], axis=0))
+        for own in _groups(actor)
+    ]
+
+
+def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> list[Segment]:
+    """Take the numbered actors of a scan, moving or not: which of them move, their tracks will tell.
+
+    Args:
+        frame: frame number.
+        scan: points with labels and instances.
+        world_T_sensor: (4, 4) pose of the scan.
+
+    Returns:
+        Segments in the order of their first point.
+    """
+    if scan.instances is None or scan.labels is None:
+        return []
+    numbered = np.flatnonzero((scan.instances > 0) & (scan.labels > 0))
+    points = transform_points(world_T_sensor, scan.points[numbered])
+    flow = None if scan.flow is None else rotate_vectors(world_T_sensor, scan.flow[numbered])
+    segments = []
+    for own in _groups(scan.instances[numbered].astype(np.int64)):
+        members = numbered[own]
+        label = int(np.bincount(scan.labels[members]).argmax())
+        velocity = None if flow is None else np.median(flow[own], axis=0)
+        segments.append(Segment(frame, label, members, points[own], velocity, int(scan.instances[members[0]])))
+    return segments
+
+
+def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the indices of each value of `key`, in the order in which the values first stand."""
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    order = np.argsort(inverse, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(inverse))[:-1])
+    return [parts[i] for i in np.argsort(first)]
+
+
+def _join(points: NDArray[np.float64], velocity: NDArray[np.float64], labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a component number a point: cells of one class and velocity that reach each other are joined."""
+    keys = np.concatenate(
+        [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S), labels[:, None]], axis=1
+    ).astype(np.int64)
+    _, cell = np.unique(keys, axis=0, return_inverse=True)
+    count = np.bincount(cell)
+    center = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], axis=1) / count[:, None]
+    speed = np.stack([np.bincount(cell, velocity[:, a]) for a in range(3)], axis=1) / count[:, None]
+    kind = labels[np.unique(cell, return_index=True)[1]]
+    joined = (
+        (kind[:, None] == kind[None])
+        & (np.square(center[:, None] - center[None]).sum(axis=2) < _REACH_M**2)
+        & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
+    )
+    component = np.arange(len(count))
+    while True:  # each cell takes the lowest number it reaches, until nothing changes
+        lowest = np.where(joined, component[None], len(count)).min(axis=1)
+        lowest = lowest[lowest]
+        if (lowest == component).all():
+            return component[cell]
+        component = lowest

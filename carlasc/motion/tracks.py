@@ -1,0 +1,235 @@
+"""Tracks: the segments of one actor over time, and where the actor was at any moment of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.motion.registration import register
+from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+
+_GATE_M = 1.5  # a segment is where its track predicts it, to this
+_SAME_VELOCITY_M_S = 2.0  # an actor's velocity changes by no more between two sightings
+_MAX_GAP = 15  # frames that an actor may be hidden and still be the same
+_EXTRAPOLATE = 5  # frames that a track goes on before its first and after its last sighting
+_HEADING_SPEED_M_S = 1.0  # faster actors look where they go
+_TRIM = 0.01  # share of points that may stick out of an actor's box: flying pixels, a neighbour's
+_MARGIN_M = 0.1
+
+
+@dataclass(frozen=True)
+class Track:
+    """One actor over time.
+
+    Attributes:
+        label: class of the actor: that of most of its points.
+        instance: number of the actor, 0 where actors have none.
+        segments: what was seen of it, by frame.
+        first: frame of `world_T_actor[0]`.
+        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x forward, origin in the middle of its box.
+        velocity: (F, 3) m/s over ground, world.
+        lower: (3,) metres, lower corner of the actor's box, actor frame.
+        upper: (3,) metres, upper corner.
+    """
+
+    label: int
+    instance: int
+    segments: Mapping[int, Segment]
+    first: int
+    world_T_actor: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+    def pose(self, frame: int) -> Transform | None:
+        """Return (4, 4) world_T_actor at a frame, None where the track does not reach."""
+        row = frame - self.first
+        return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
+
+    def velocity_at(self, frame: int) -> NDArray[np.float64] | None:
+        """Return (3,) m/s, world, at a frame, None where the track does not reach."""
+        row = frame - self.first
+        return self.velocity[row] if 0 <= row < len(self.velocity) else None
+
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """(3,) metres: length, width, height of the box."""
+        return self.upper - self.lower
+
+    @property
+    def moves(self) -> bool:
+        """Whether the actor ever moves faster than standing actors seem to."""
+        return bool((np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any())
+
+
+def link_segments(segments: Iterable[Segment], times: Mapping[int, float]) -> list[Track]:
+    """Link the segments of several scans into tracks.
+
+    Numbered actors are linked by their numbers. Others by prediction: a segment goes on with the track of its class that is
+    expected nearest to it at its velocity, hidden times bridged.
+
+    Args:
+        segments: of all scans, in any order.
+        times: seconds by frame, for every frame of a segment.
+
+    Returns:
+        Tracks in the order of their first sighting.
+    """
+    ordered = sorted(segments, key=lambda segment: segment.frame)
+    return [_make_track(chain, times) for chain in _chains(ordered, times)]
+
+
+def _chains(segments: list[Segment], times: Mapping[int, float]) -> list[list[Segment]]:
+    chains: list[list[Segment]] = []
+    by_instance: dict[int, list[Segment]] = {}
+    by_frame: dict[int, list[Segment]] = {}
+    for segment in segments:
+        if segment.instance:
+            if segment.instance not in by_instance:
+                chains.append(by_instance.setdefault(segment.instance, []))
+            by_instance[segment.instance].append(segment)
+        else:
+            by_frame.setdefault(segment.frame, []).append(segment)
+    for frame, found in by_frame.items():
+        alive = [c for c in chains if not c[-1].instance and frame - _MAX_GAP <= c[-1].frame < frame]
+        for segment, chain in _match(found, alive, times):
+            if chain is None:
+                chains.append([segment])
+            else:
+                chain.append(segment)
+    return chains
+
+
+def _match(
+    found: list[Segment], alive: list[list[Segment]], times: Mapping[int, float]
+) -> list[tuple[Segment, list[Segment] | None]]:
+    """Pair the segments of one scan with the chains that go on: nearest prediction first, each chain once."""
+    candidates = []
+    for i, segment in enumerate(found):
+        for j, chain in enumerate(alive):
+            cost = _cost(chain[-1], segment, times[segment.frame] - times[chain[-1].frame])
+            if cost is not None:
+                candidates.append((cost, i, j))
+    taken: dict[int, int] = {}
+    for _, i, j in sorted(candidates):
+        if i not in taken and j not in taken.values():
+            taken[i] = j
+    return [(segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)]
+
+
+def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
+    """Return how far a segment is from where its predecessor would be, None if it cannot be the same actor."""
+    if last.label != segment.label or last.velocity is None or segment.velocity is None:
+        return None
+    change = float(np.linalg.norm(segment.velocity - last.velocity))
+    predicted = last.points + (last.velocity + segment.velocity) / 2 * elapsed_s
+    # What is seen of an actor changes, so boxes are compared, not their centres: the gap between them, then the centres.
+    gap = np.maximum(
+        predicted.min(axis=0) - segment.points.max(axis=0), segment.points.min(axis=0) - predicted.max(axis=0)
+    )
+    distance = float(np.linalg.norm(np.maximum(gap, 0.0)))
+    if distance > _GATE_M or change > _SAME_VELOCITY_M_S:
+        return None
+    offset = float(np.linalg.norm(predicted.mean(axis=0) - segment.center))
+    return distance + change + 0.1 * offset
+
+
+def _make_track(chain: list[Segment], times: Mapping[int, float]) -> Track:
+    """Turn linked segments into a path, then into poses with the box around everything that was seen."""
+    seconds = np.array([times[segment.frame] for segment in chain])
+    if any(segment.velocity is None for segment in chain):
+        positions, headings = register([segment.points for segment in chain], seconds)
+        velocities = _derivative(positions, seconds)
+    else:
+        velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
+        positions = _integrate(velocities, seconds, chain)
+        headings = _headings(velocities)
+    positions, lower, upper = _fit_box(chain, positions, headings)
+    first, last = chain[0].frame - _EXTRAPOLATE, chain[-1].frame + _EXTRAPOLATE
+    frames = np.arange(first, last + 1)
+    at = _frame_times(frames, times)
+    path, speed, angle = _resample(at, seconds, positions, velocities, headings)
+    poses = np.stack([rotation_z(a) for a in angle])
+    poses[:, :3, 3] = path
+    labels = np.bincount([s.label for s in chain], [len(s.members) for s in chain])
+    return Track(
+        int(labels.argmax()), chain[0].instance, {s.frame: s for s in chain}, first, poses, speed, lower, upper
+    )
+
+
+def _integrate(
+    velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: list[Segment]
+) -> NDArray[np.float64]:
+    """Integrate velocities by trapezoids, through the centre of the sighting with most points."""
+    steps = (velocities[1:] + velocities[:-1]) / 2 * np.diff(seconds)[:, None]
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    best = int(np.argmax([len(segment.members) for segment in chain]))
+    return path - path[best] + chain[best].center
+
+
+def _headings(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (F,) headings in radians, unwrapped: the direction of motion, held while the actor is slow."""
+    fast = np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
+    if not len(fast):
+        mean = velocities.mean(axis=0)
+        return np.full(len(velocities), np.arctan2(mean[1], mean[0]))
+    angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
+    return np.interp(np.arange(len(velocities)), fast, angles)
+
+
+def _fit_box(
+    chain: list[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Move the path into the middle of the actor and return it with the box's corners.
+
+    The path of the actor's origin is known but for a constant offset in the world. While the actor turns, only the right
+    offset lays all sightings over each other; it is the one that puts the origin in the middle of them.
+    """
+    best = int(np.argmax([len(segment.members) for segment in chain]))
+    for _ in range(3):
+        body = []
+        for segment, position, heading in zip(chain, positions, headings, strict=True):
+            pose = rotation_z(heading)
+            pose[:3, 3] = position
+            body.append(transform_points(invert(pose), segment.points))
+        points = np.concatenate(body)
+        lower, upper = np.quantile(points, _TRIM, axis=0), np.quantile(points, 1 - _TRIM, axis=0)
+        middle = (lower + upper) / 2
+        positions = positions + rotation_z(headings[best])[:3, :3] @ middle
+        lower, upper = lower - middle, upper - middle
+    return positions, lower - _MARGIN_M, upper + _MARGIN_M
+
+
+def _frame_times(frames: NDArray[np.int64], times: Mapping[int, float]) -> NDArray[np.float64]:
+    """Return the seconds of frames, those without a scan by the mean period."""
+    known = np.array(sorted(times))
+    seconds = np.array([times[int(frame)] for frame in known])
+    period = (seconds[-1] - seconds[0]) / (known[-1] - known[0]) if len(known) > 1 else 0.1
+    inside = np.interp(frames, known, seconds)
+    before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
+    return inside + (before + after) * period
+
+
+def _resample(
+    at: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    velocities: NDArray[np.float64],
+    headings: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return positions, velocities and headings at the times `at`: linear between sightings, straight on beyond them."""
+    path = np.stack([np.interp(at, seconds, positions[:, a]) for a in range(3)], axis=1)
+    speed = np.stack([np.interp(at, seconds, velocities[:, a]) for a in range(3)], axis=1)
+    beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
+    return path + speed * beyond[:, None], speed, np.interp(at, seconds, headings)
+
+
+def _derivative(positions: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return velocities by central differences; zero for a single sighting."""
+    if len(seconds) < 2:
+        return np.zeros_like(positions)
+    return np.gradient(positions, seconds, axis=0)
