@@ -1,0 +1,1 @@
+"""SSCNet: semantic scene completion from a single view (Song et al., CVPR 2017)."""

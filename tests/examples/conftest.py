@@ -1,0 +1,17 @@
+"""The examples are scripts and the packages beside them, not an installed package: they are found by their folder."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+sys.path.insert(0, str(EXAMPLES))
+pytest.importorskip("torch", reason="the examples need carlasc[torch]")
+
+
+@pytest.fixture(scope="session")
+def examples() -> Path:
+    return EXAMPLES
