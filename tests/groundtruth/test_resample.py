@@ -1,0 +1,55 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from carlasc.errors import ArgumentError
+from carlasc.grids import Grid, GridSpec
+from carlasc.groundtruth.resample import resample
+from carlasc.labels import CARLA
+
+
+def random_grid(seed, size=(8, 8, 4)):
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 4, size).astype(np.uint8)
+    counts = rng.integers(0, 3, size).astype(np.float32)
+    spec = GridSpec("cartesian", size, (0, 0, 0), (8, 8, 4))
+    return Grid(spec, np.where(counts > 0, labels, 0).astype(np.uint8), counts)
+
+
+@given(st.integers(0, 1000))
+def test_where_sizes_divide_it_is_the_exact_majority_of_the_known_cells(seed):
+    fine = random_grid(seed)
+    coarse = resample(fine, fine.spec.with_size((4, 4, 2)), CARLA)
+    for cell in np.ndindex(4, 4, 2):
+        block = tuple(slice(2 * i, 2 * i + 2) for i in cell)
+        known = fine.counts[block] > 0
+        labels = fine.labels[block][known]
+        assert coarse.counts[cell] == fine.counts[block].sum()
+        assert coarse.labels[cell] == (np.bincount(labels).argmax() if len(labels) else 0)
+
+
+def test_sizes_that_do_not_divide_go_by_the_centres_of_cells():
+    fine = random_grid(1)
+    coarse = resample(fine, fine.spec.with_size((3, 8, 4)), CARLA)
+    assert coarse.counts.sum() == fine.counts.sum()
+
+
+def test_cylindrical_grids_resample_too():
+    spec = GridSpec.published("cylindrical")
+    fine = Grid(spec.with_size((16, 16, 4)), np.full((16, 16, 4), 7, np.uint8), np.ones((16, 16, 4), np.float32))
+    coarse = resample(fine, spec.with_size((8, 8, 2)), CARLA)
+    assert (coarse.labels == 7).all()
+    assert (coarse.counts == 8).all()
+
+
+def test_what_was_never_measured_is_not_made_up():
+    fine = random_grid(2)
+    with pytest.raises(ArgumentError, match="never measured cannot be made up"):
+        resample(fine, fine.spec.with_size((16, 8, 4)), CARLA)
+    with pytest.raises(ArgumentError, match="expected a cartesian grid"):
+        resample(fine, GridSpec("cylindrical", (2, 2, 2), (0, -math.pi, 0), (8, math.pi, 4)), CARLA)
+    with pytest.raises(ArgumentError, match="expected bounds within"):
+        resample(fine, GridSpec("cartesian", (4, 4, 2), (-8, 0, 0), (8, 8, 4)), CARLA)
