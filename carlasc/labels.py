@@ -27,6 +27,7 @@ class ClassTable:
         names: id -> name.
         colors: id -> RGB 0..255.
         moving: ids whose label itself says that the thing moves.
+        deformable: ids of things that change their shape as they move: people.
         num_channels: number of vote channels: ids are below it. More than the ids need where the format says so.
     """
 
@@ -34,6 +35,7 @@ class ClassTable:
     names: Mapping[int, str]
     colors: Mapping[int, Color]
     moving: frozenset[int] = field(default=frozenset())
+    deformable: frozenset[int] = field(default=frozenset())
     num_channels: int = 0
 
     def __post_init__(self) -> None:
@@ -171,6 +173,7 @@ CARLA = ClassTable(
     "carla",
     {i: name for i, (name, _, _) in enumerate(_CARLA)},
     {i: color for i, (_, color, _) in enumerate(_CARLA)},
+    deformable=frozenset({4}),
     num_channels=25,  # as every published params.json says, although 23 classes exist
 )
 CARLASC11 = ClassTable(
@@ -225,6 +228,7 @@ SEMANTICKITTI = ClassTable(
     {i: name for i, name, _, _ in _KITTI},
     {i: color for i, _, color, _ in _KITTI},
     moving=frozenset(range(252, 260)),
+    deformable=frozenset({30, 254}),
 )
 _KITTI19 = {0: "unlabeled"} | {k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)}
 SEMANTICKITTI19 = ClassTable(
