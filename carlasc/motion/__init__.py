@@ -3,7 +3,15 @@
 World is the frame of the poses: the first scan's sensor.
 """
 
-from carlasc.motion.segments import Segment, segment_by_flow, segment_by_instances
+from carlasc.motion.segments import Segment, Standing, segment_by_flow, segment_by_instances, standing_points
 from carlasc.motion.tracks import Track, link_segments
 
-__all__ = ["Segment", "Track", "link_segments", "segment_by_flow", "segment_by_instances"]
+__all__ = [
+    "Segment",
+    "Standing",
+    "Track",
+    "link_segments",
+    "segment_by_flow",
+    "segment_by_instances",
+    "standing_points",
+]

@@ -100,6 +100,45 @@ def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> l
     return segments
 
 
+@dataclass(frozen=True)
+class Standing:
+    """The points of a scan that stand still and might belong to an actor that moves at other times.
+
+    Attributes:
+        frame: frame number.
+        members: (M,) int64 indices into the scan's points.
+        labels: (M,) class of each.
+        points: (M, 3) float64 metres, world.
+    """
+
+    frame: int
+    members: NDArray[np.int64]
+    labels: NDArray[np.int64]
+    points: NDArray[np.float64]
+
+    def in_place_of(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
+        """Return the standing points of a segment's class where the segment was, None where there are hardly any."""
+        lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
+        own = np.flatnonzero(
+            (self.labels == segment.label) & ((self.points > lower) & (self.points < upper)).all(axis=1)
+        )
+        if len(own) < max(5, len(segment.members) // 5):
+            return None
+        return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3))
+
+
+def standing_points(
+    frame: int, scan: Scan, world_T_sensor: Transform, labels: set[int], *, min_speed_m_s: float = MIN_SPEED_M_S
+) -> Standing:
+    """Return the points of classes that move elsewhere, but not here."""
+    if scan.flow is None or scan.labels is None:
+        return Standing(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
+    slow = ~(np.square(np.nan_to_num(scan.flow)).sum(axis=1) > min_speed_m_s**2)
+    members = np.flatnonzero(slow & np.isin(scan.labels, sorted(labels)))
+    points = transform_points(world_T_sensor, scan.points[members])
+    return Standing(frame, members, scan.labels[members].astype(np.int64), points)
+
+
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Return the indices of each value of `key`, in the order in which the values first stand."""
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from carlasc.geometry import Transform, invert, rotation_z, transform_points
 from carlasc.motion.registration import register
-from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.segments import MIN_SPEED_M_S, Segment, Standing
 
+_REACH_M, _FASTEST_M_S = 15.0, 40.0  # a quick look first: nothing is longer or faster
 _GATE_M = 1.5  # a segment is where its track predicts it, to this
 _SAME_VELOCITY_M_S = 2.0  # an actor's velocity changes by no more between two sightings
+_STOPPING_M_S = 1.5  # slower actors may stand still in the next scan, or have stood still in the last
 _MAX_GAP = 15  # frames that an actor may be hidden and still be the same
 _EXTRAPOLATE = 5  # frames that a track goes on before its first and after its last sighting
 _HEADING_SPEED_M_S = 1.0  # faster actors look where they go
@@ -66,7 +68,9 @@ class Track:
         return bool((np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any())
 
 
-def link_segments(segments: Iterable[Segment], times: Mapping[int, float]) -> list[Track]:
+def link_segments(
+    segments: Iterable[Segment], times: Mapping[int, float], standing: Mapping[int, Standing] | None = None
+) -> list[Track]:
     """Link the segments of several scans into tracks.
 
     Numbered actors are linked by their numbers. Others by prediction: a segment goes on with the track of its class that is
@@ -75,45 +79,74 @@ def link_segments(segments: Iterable[Segment], times: Mapping[int, float]) -> li
     Args:
         segments: of all scans, in any order.
         times: seconds by frame, for every frame of a segment.
+        standing: of each scan, points that stand still: an actor that stops at a crossing is found among them, until it goes on.
 
     Returns:
         Tracks in the order of their first sighting.
     """
     ordered = sorted(segments, key=lambda segment: segment.frame)
-    return [_make_track(chain, times) for chain in _chains(ordered, times)]
+    chains = _chains(ordered, times, standing or {})
+    for chain in chains:
+        _look_back(chain, standing or {})
+    return [_make_track(chain, times) for chain in chains]
 
 
-def _chains(segments: list[Segment], times: Mapping[int, float]) -> list[list[Segment]]:
-    chains: list[list[Segment]] = []
+def _chains(
+    segments: list[Segment], times: Mapping[int, float], standing: Mapping[int, Standing]
+) -> list[list[Segment]]:
     by_instance: dict[int, list[Segment]] = {}
     by_frame: dict[int, list[Segment]] = {}
     for segment in segments:
         if segment.instance:
-            if segment.instance not in by_instance:
-                chains.append(by_instance.setdefault(segment.instance, []))
-            by_instance[segment.instance].append(segment)
+            by_instance.setdefault(segment.instance, []).append(segment)
         else:
             by_frame.setdefault(segment.frame, []).append(segment)
-    for frame, found in by_frame.items():
-        alive = [c for c in chains if not c[-1].instance and frame - _MAX_GAP <= c[-1].frame < frame]
-        for segment, chain in _match(found, alive, times):
+    chains: list[list[Segment]] = []
+    for frame in sorted(by_frame.keys() | (standing.keys() if by_frame else set())):
+        alive = [chain for chain in chains if frame - _MAX_GAP <= chain[-1].frame < frame]
+        for segment, chain in _match(by_frame.get(frame, []), alive, times):
             if chain is None:
                 chains.append([segment])
             else:
                 chain.append(segment)
-    return chains
+        for chain in alive:  # whoever was slow and did not go on may have stopped
+            if chain[-1].frame < frame and frame in standing and _is_slow(chain[-1]):
+                rest = standing[frame].in_place_of(chain[-1])
+                if rest is not None:
+                    chain.append(rest)
+    return [*by_instance.values(), *chains]
+
+
+def _look_back(chain: list[Segment], standing: Mapping[int, Standing]) -> None:
+    """Put before a chain the scans in which its actor stood where the chain starts."""
+    if chain[0].instance:
+        return
+    for frame in sorted((frame for frame in standing if frame < chain[0].frame), reverse=True):
+        rest = standing[frame].in_place_of(chain[0]) if _is_slow(chain[0]) else None
+        if rest is None:
+            return
+        chain.insert(0, rest)
+
+
+def _is_slow(segment: Segment) -> bool:
+    return segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
 
 
 def _match(
     found: list[Segment], alive: list[list[Segment]], times: Mapping[int, float]
 ) -> list[tuple[Segment, list[Segment] | None]]:
     """Pair the segments of one scan with the chains that go on: nearest prediction first, each chain once."""
+    if not found or not alive:
+        return [(segment, None) for segment in found]
     candidates = []
+    ends = np.stack([chain[-1].center for chain in alive])
     for i, segment in enumerate(found):
-        for j, chain in enumerate(alive):
-            cost = _cost(chain[-1], segment, times[segment.frame] - times[chain[-1].frame])
+        reach = _REACH_M + _FASTEST_M_S * np.array([times[segment.frame] - times[chain[-1].frame] for chain in alive])
+        for j in np.flatnonzero(np.linalg.norm(ends - segment.center, axis=1) < reach):
+            last = alive[j][-1]
+            cost = _cost(last, segment, times[segment.frame] - times[last.frame])
             if cost is not None:
-                candidates.append((cost, i, j))
+                candidates.append((cost, i, int(j)))
     taken: dict[int, int] = {}
     for _, i, j in sorted(candidates):
         if i not in taken and j not in taken.values():
