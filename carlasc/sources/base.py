@@ -152,6 +152,12 @@ class Sequence(ABC):
         name = layout.params_file(grid)
         return parse_json(self.read_document(name), f"{self.location}/{name}")
 
+    def classes_of(self, grid: str) -> ClassTable:
+        """Return the class table of a grid's labels: the sequence's, unless its params.json names another under `carlasc` (predictions)."""
+        record = self.params(grid).get("carlasc")
+        name = record.get("classes") if isinstance(record, dict) else None
+        return self.metadata.classes if name is None else table_named(str(name))
+
     @cached_property
     def poses(self) -> NDArray[np.float64]:
         """(F, 4, 4) first_T_sensor, a line of poses.txt each; `read_pose` finds a frame's.
