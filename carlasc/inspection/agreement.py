@@ -1,0 +1,150 @@
+"""Do the scans lie in the voxels of their grid? And if not: which mistake, undone, would put them there?
+
+The share of labelled points that fall in voxels of their class is measured as things stand, with the points' axes changed in the ways in which they
+are commonly mistaken, and with the grid shifted by one cell each way. Only points in known voxels count, so that a grid with gaps is no worse
+than a full one, as long as enough of them are known.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.grids import Grid, GridSpec
+
+_MIN_POINTS = 100
+_MAX_POINTS = 20_000
+_INSIDE = 0.1  # a mistake undone must bring into known space at least this share of what stands there now
+_GAIN = 0.01  # a mistake undone must put this share of the points right, more than chance could,
+_MISSES = 1.5  # leave so many times fewer wrong,
+_WINS = 0.75  # and do better on this share of the frames
+_TIE = 0.005
+
+_AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # what the points look like; the matrix that undoes it
+    ("points with y mirrored against the grid", np.diag([1.0, -1, 1])),
+    ("points with x mirrored against the grid", np.diag([-1.0, 1, 1])),
+    ("points turned by half a turn against the grid", np.diag([-1.0, -1, 1])),
+    ("points with x and y exchanged against the grid", np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])),
+    ("points turned by a quarter turn against the grid", np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])),
+    ("points turned by a quarter turn against the grid", np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])),
+    ("points upside down (z mirrored) against the grid", np.diag([1.0, 1, -1])),
+    ("points upside down (y and z mirrored) against the grid", np.diag([1.0, -1, -1])),
+    ("points in camera axes (x right, y down, z forward)", np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]])),
+    ("points in camera axes (x right, y down, z forward)", np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])),
+)
+_SHIFTS = tuple(sorted((s for s in itertools.product((-1, 0, 1), repeat=3) if any(s)), key=lambda s: np.abs(s).sum()))
+
+
+@dataclass(frozen=True)
+class GridDiagnosis:
+    """What a grid's scans say of it.
+
+    Attributes:
+        share: mean share of points in known space that lie in a voxel of their class; NaN where no frame had enough points.
+        occupied_share: the same for voxels of any class but free.
+        frames: number of frames with enough points.
+        mistake: what it looks like, None where the scans fit best as they stand.
+        corrected_share: the share with the mistake undone.
+    """
+
+    share: float
+    occupied_share: float
+    frames: int
+    mistake: str | None = None
+    corrected_share: float = 0.0
+
+
+@dataclass
+class GridEvidence:
+    """Gathers, frame by frame, how well scans lie in a grid as they stand and with each mistake undone."""
+
+    spec: GridSpec
+    _shares: list[NDArray[np.float64]] = field(default_factory=list)
+    _occupied: list[float] = field(default_factory=list)
+    _points: int = 0
+
+    def add(self, points: NDArray[np.floating], labels: NDArray[np.integer] | None, grid: Grid) -> None:
+        """Measure one frame.
+
+        Args:
+            points: (N, 3) metres, finite.
+            labels: (N,) classes, 0 is unlabelled and left out; None compares with any class but free.
+            grid: of this frame, of `spec`.
+        """
+        if labels is not None:
+            points, labels = points[labels != 0], labels[labels != 0]
+        step = max(1, len(points) // _MAX_POINTS)
+        points, labels = points[::step], None if labels is None else labels[::step]
+        as_is = _score(points, labels, grid, (0, 0, 0))
+        if as_is.known < _MIN_POINTS and all(
+            _score(points @ matrix.T, labels, grid, (0, 0, 0)).known < _MIN_POINTS for _, matrix in _AXES
+        ):
+            return
+        candidates = [
+            as_is,
+            *(_score(points @ matrix.T, labels, grid, (0, 0, 0)) for _, matrix in _AXES),
+            *(_score(points, labels, grid, shift) for shift in _SHIFTS),
+        ]
+        enough = max(_MIN_POINTS, _INSIDE * as_is.known)
+        self._points += as_is.known
+        self._shares.append(np.array([score.share if score.known >= enough else 0.0 for score in candidates]))
+        self._occupied.append(as_is.share if labels is None else _score(points, None, grid, (0, 0, 0)).share)
+
+    def diagnose(self) -> GridDiagnosis:
+        """Say which mistake, if any, explains the frames seen so far."""
+        if not self._shares:
+            return GridDiagnosis(float("nan"), float("nan"), 0)
+        shares = np.stack(self._shares)
+        own, means = shares[:, 0], shares.mean(axis=0)
+        chance = 3 * float(np.sqrt(max(means[0] * (1 - means[0]), 1e-4) / max(self._points, 1)))
+        best = 0
+        for column in range(1, shares.shape[1]):
+            clear = means[column] - means[0] > max(_GAIN, chance) and 1 - means[0] > _MISSES * (1 - means[column])
+            better = best == 0 or means[column] > means[best] + _TIE
+            if clear and better and (shares[:, column] > own).mean() >= _WINS:
+                best = column
+        own_share, occupied = float(means[0]), float(np.mean(self._occupied))
+        if best == 0:
+            return GridDiagnosis(own_share, occupied, len(shares))
+        return GridDiagnosis(own_share, occupied, len(shares), _mistake(best, self.spec), float(means[best]))
+
+
+@dataclass(frozen=True)
+class _Score:
+    known: int  # points in known voxels
+    right: int  # of these, those in a voxel of their class
+
+    @property
+    def share(self) -> float:
+        return self.right / self.known if self.known else 0.0
+
+
+def _score(
+    points: NDArray[np.floating], labels: NDArray[np.integer] | None, grid: Grid, shift: Sequence[int]
+) -> _Score:
+    """Look the points up in the grid as if its content stood `shift` cells too far along its axes."""
+    cells, inside = grid.spec.index(grid.spec.to_axes(points))
+    cells = cells[inside] + np.array(shift, np.int32)
+    if grid.spec.coordinates == "cylindrical" and grid.spec.upper[1] - grid.spec.lower[1] > 2 * np.pi - 1e-3:
+        cells[:, 1] %= grid.spec.size[1]  # the azimuth goes round
+    within = ((cells >= 0) & (cells < np.array(grid.spec.size))).all(axis=1)
+    index = np.ravel_multi_index(tuple(cells[within].T), grid.spec.size)
+    voxels = grid.labels.reshape(-1)[index]
+    known = np.ones(len(voxels), np.bool_) if grid.counts is None else grid.counts.reshape(-1)[index] > 0
+    right = voxels != 0 if labels is None else voxels == labels[inside][within]
+    return _Score(int(known.sum()), int((right & known).sum()))
+
+
+def _mistake(column: int, spec: GridSpec) -> str:
+    if column <= len(_AXES):
+        return _AXES[column - 1][0]
+    shift = _SHIFTS[column - 1 - len(_AXES)]
+    names = ("x", "y", "z") if spec.coordinates == "cartesian" else ("radius", "azimuth", "z")
+    steps = " and ".join(
+        f"one cell towards {'+' if s > 0 else '-'}{name}" for s, name in zip(shift, names, strict=True) if s
+    )
+    return f"a grid shifted by {steps}"

@@ -1,0 +1,269 @@
+"""Do the poses put the scans on each other? And if not: which mistake, undone, would?
+
+A later scan's structure, moved by the poses, must land on an earlier scan's. The share of its points that do is measured for the poses as they
+stand and for the poses with each known mistake undone. Poses are wrong when a mistake undone puts clearly more points in
+place, over most of the pairs of scans on which the two differ at all: a drive straight on cannot tell a mirrored y, and is not
+made worse by one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.geometry import Transform, invert, transform_points
+from carlasc.inspection.structure import MAX_RANGE_M
+
+Poses: TypeAlias = NDArray[np.float64]
+
+_VOXEL_M = 0.4
+_LEVER_M = 15.0  # how far away a turn is felt when two motions are compared
+_DIFFERENT_M = 0.3
+_MIN_POINTS = 150
+_MAX_POINTS = 6000
+_OFFSET_POINTS = 1500
+_OFFSET_PAIRS = 8
+_GOOD = 0.8  # poses that put this much of the structure in place are not searched for an offset
+_STRIDE_M = 2.0  # scans of a pair are this far apart, in metres or
+_STRIDE_RAD = np.deg2rad(10.0)  # in angle: enough to tell, not so far that they see different things
+_REACH = 10  # frames that a pair may be apart
+_GAIN = 0.05  # how much more of the structure a correction must put in place
+_WINS = 0.75  # on which share of the pairs
+_TIE = 0.01
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A way in which poses are commonly wrong, with its undoing.
+
+    Attributes:
+        name: what the poses look like, to be read after "they look like".
+        advice: what to do.
+        undo: takes (F, 4, 4) poses as they stand to what they would be without the mistake.
+    """
+
+    name: str
+    advice: str
+    undo: Callable[[Poses], Poses]
+
+
+@dataclass(frozen=True)
+class PoseDiagnosis:
+    """What the scans say of the poses.
+
+    Attributes:
+        share: mean share of structure that the poses as they stand put in place.
+        pairs: number of pairs of scans with enough structure; 0 means that nothing can be said.
+        correction: the mistake that, undone, puts clearly more of it in place; None where the poses stand.
+        corrected_share: the share with it undone, over the pairs on which it differs.
+        share_there: the share of the poses as they stand, over the same pairs.
+        offset_m: (3,) where no known mistake explains it: how far, about, the poses put a scan beside its place a pair; None otherwise.
+    """
+
+    share: float
+    pairs: int
+    correction: Correction | None = None
+    corrected_share: float = 0.0
+    share_there: float = 0.0
+    offset_m: tuple[float, float, float] | None = None
+
+
+def diagnose_poses(
+    structure: Callable[[int], NDArray[np.float64]], poses: Poses, *, max_pairs: int = 24
+) -> PoseDiagnosis:
+    """Align scans under their poses, and under the poses with each known mistake undone.
+
+    Args:
+        structure: returns the (M, 3) static structure of the i-th scan, metres, sensor frame (see `static_structure`).
+        poses: (F, 4, 4) float64 first_T_sensor of each scan, in order of time; rigid.
+        max_pairs: how many pairs of scans to look at.
+    """
+    corrections = known_corrections()
+    corrected = [poses, *(correction.undo(poses) for correction in corrections)]
+    pairs, shares, differs = [], [], []
+    for earlier, later in choose_pairs(poses, max_pairs):
+        target, moved = structure(earlier), _thin(structure(later), _MAX_POINTS)
+        if min(len(target), len(moved)) < _MIN_POINTS:
+            continue
+        occupied = _occupancy(target)
+        motions = [relative(candidate, earlier, later) for candidate in corrected]
+        pairs.append((earlier, later))
+        shares.append([_share(occupied, transform_points(motion, moved)) for motion in motions])
+        differs.append([_distance(motion, motions[0]) > _DIFFERENT_M for motion in motions])
+    if not pairs:
+        return PoseDiagnosis(float("nan"), 0)
+    own = float(np.mean([row[0] for row in shares]))
+    best = _best_correction(np.array(shares), np.array(differs))
+    if best is not None:
+        index, share_there, corrected_share = best
+        return PoseDiagnosis(own, len(pairs), corrections[index - 1], corrected_share, share_there)
+    return PoseDiagnosis(own, len(pairs), offset_m=_common_offset(structure, poses, pairs) if own < _GOOD else None)
+
+
+def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
+    """Choose pairs of scans a stride apart: half of them spread over the drive, half where it turns most."""
+    if len(poses) < 2:
+        return []
+    candidates = [(first, _partner(poses, first)) for first in range(len(poses) - 1)]
+    spread = {candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)}
+    turns = [_angle(relative(poses, first, second)) for first, second in candidates]
+    turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
+    # neighbours see the same turn: take one in three of the sharpest
+    return sorted(spread | set(turning[: 3 * (max_pairs // 2) : 3]))
+
+
+def known_corrections() -> tuple[Correction, ...]:
+    """Return the mistakes that are looked for, the commoner ones first: a tie goes to the first."""
+    axes = [Correction(name, advice, _in_axes(matrix)) for name, advice, matrix in _axes_mistakes()]
+    others = [
+        Correction(
+            "transposed rotations", "write R, not its transpose (is the file read column by column?)", _transpose
+        ),
+        Correction(
+            "inverted transforms (first frame to sensor)",
+            "write sensor-to-first-frame: invert them",
+            invert,
+        ),
+        Correction(
+            "poses of a sensor that moves, with scans that do not",
+            "the scans are in one common frame already, or the poses are of another sequence",
+            lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
+        ),
+    ]
+    return (*axes[:1], *others[:2], *axes[1:], *others[2:])
+
+
+def relative(poses: Poses, earlier: int, later: int) -> Transform:
+    """Return earlier_T_later."""
+    return invert(poses[earlier]) @ poses[later]
+
+
+def _best_correction(shares: NDArray[np.float64], differs: NDArray[np.bool_]) -> tuple[int, float, float] | None:
+    """Weigh (P, 1 + C) shares, column 0 those of the poses as they stand; a correction counts on the pairs on which it differs.
+
+    Returns:
+        The column of the best correction, and the shares without and with it on those pairs; None if none is clearly better.
+    """
+    own, best, best_total = shares[:, 0], None, -1.0
+    for column in range(1, shares.shape[1]):
+        there = differs[:, column]
+        gain = (shares[:, column] - own)[there]
+        if not there.any() or gain.mean() < _GAIN or (gain > 0).mean() < _WINS:
+            continue
+        total = float(np.where(there, shares[:, column], own).mean())
+        if total > best_total + _TIE:
+            best, best_total = (column, float(own[there].mean()), float(shares[there, column].mean())), total
+    return best
+
+
+def _common_offset(
+    structure: Callable[[int], NDArray[np.float64]], poses: Poses, pairs: list[tuple[int, int]]
+) -> tuple[float, float, float] | None:
+    """Slide each later scan beside where the poses put it: where does most of it find structure, pair for pair?"""
+    steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * _VOXEL_M
+    offsets = []
+    for earlier, later in pairs[:: max(1, len(pairs) // _OFFSET_PAIRS)]:
+        occupied = _occupancy(structure(earlier))
+        moved = transform_points(relative(poses, earlier, later), _thin(structure(later), _OFFSET_POINTS))
+        shares = np.array([_share(occupied, moved + step) for step in steps])
+        if shares.max() > shares[len(steps) // 2] + 2 * _GAIN:
+            offsets.append(-steps[shares.argmax()])
+        else:
+            offsets.append(np.zeros(3))
+    x, y, z = np.median(offsets, axis=0).tolist()
+    return (x, y, z) if max(abs(x), abs(y), abs(z)) > 1.5 * _VOXEL_M else None
+
+
+def _partner(poses: Poses, first: int) -> int:
+    """The next scan a stride away, or the last within reach; the one after next where the sensor, says the pose, stands."""
+    last = min(first + _REACH, len(poses) - 1)
+    if _distance(poses[first], poses[last]) < _DIFFERENT_M:
+        return min(first + 2, last)
+    for second in range(first + 1, last):
+        motion = relative(poses, first, second)
+        if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or _angle(motion) >= _STRIDE_RAD:
+            return second
+    return last
+
+
+def _occupancy(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    cells = int(2 * MAX_RANGE_M / _VOXEL_M)
+    occupied = np.zeros((cells, cells, cells), np.bool_)
+    occupied[tuple(_cells(points)[0].T)] = True
+    return occupied
+
+
+def _cells(points: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    cells = np.floor((points + MAX_RANGE_M) / _VOXEL_M)
+    inside = np.all((cells >= 0) & (cells < int(2 * MAX_RANGE_M / _VOXEL_M)), axis=1)
+    return cells[inside].astype(np.int32), inside
+
+
+def _share(occupied: NDArray[np.bool_], points: NDArray[np.float64]) -> float:
+    cells, _ = _cells(points)
+    return float(np.count_nonzero(occupied[tuple(cells.T)])) / len(points)
+
+
+def _thin(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    return points[:: max(1, len(points) // count)]
+
+
+def _angle(motion: Transform) -> float:
+    return float(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1.0, 1.0)))
+
+
+def _distance(a: Transform, b: Transform) -> float:
+    """How far apart two motions put a point 15 m away."""
+    between = invert(a) @ b
+    return float(np.linalg.norm(between[:3, 3]) + _LEVER_M * _angle(between))
+
+
+def _transpose(poses: Poses) -> Poses:
+    undone = poses.copy()
+    undone[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    return undone
+
+
+def _in_axes(stored_T_sensor: NDArray[np.float64]) -> Callable[[Poses], Poses]:
+    """Undo a change of axes: the poses were written in axes that `stored_T_sensor` (3, 3) takes the sensor's to."""
+    change = np.eye(4)
+    change[:3, :3] = stored_T_sensor
+    return lambda poses: change.T @ poses @ change
+
+
+def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
+    """All 47 other ways to call the axes, signs included; the ones with a name in the field first."""
+    mirrored = np.diag([1.0, -1.0, 1.0])
+    camera_of_kitti = np.array(
+        [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    )  # x right, y down, z forward from x forward, y left
+    camera_advice = "take them to the LiDAR's frame: inv(Tr) @ P @ Tr, Tr from calib.txt"
+    mistakes = [
+        (
+            "poses with y mirrored against the scans",
+            "scans and poses must share one handedness: mirror y in both (S @ P @ S with S = diag(1, -1, 1, 1)) or in neither",
+            mirrored,
+        ),
+        ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti),
+        ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti @ mirrored),
+        ("camera-frame poses with their y mirrored", camera_advice, mirrored @ camera_of_kitti),
+        ("camera-frame poses with their y mirrored", camera_advice, mirrored @ camera_of_kitti @ mirrored),
+    ]
+    known = [np.eye(3), *(matrix for _, _, matrix in mistakes)]
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if not any(np.array_equal(matrix, other) for other in known):
+                names = ", ".join(
+                    f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for sign, axis in zip(signs, order, strict=True)
+                )
+                kind = "camera-frame poses" if order[2] == 0 else "poses in other axes than the scans"
+                advice = camera_advice if order[2] == 0 else "take them to the scans' axes"
+                mistakes.append((f"{kind} (their x, y, z are {names})", advice, matrix))
+    return mistakes

@@ -1,0 +1,221 @@
+"""Checks of a sequence's files, one by one and against each other: sizes, counts of frames, values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import layout
+from carlasc.errors import CarlascError
+from carlasc.inspection.findings import Finding, Severity
+from carlasc.labels import ClassTable
+from carlasc.sources.base import Sequence
+from carlasc.sources.folder import FolderSequence
+
+_FASTEST_M_S = 100.0
+_PER_POINT = ("labels", "flow", "instances")
+
+
+def check_documents(sequence: Sequence) -> Iterator[Finding]:
+    """Check carlasc.json and each grid's params.json, and that there is something to read at all."""
+    where = sequence.location
+    try:
+        classes: ClassTable | None = sequence.metadata.classes
+    except CarlascError as error:
+        yield Finding.from_error("metadata", sequence.path, f"{where}/{layout.METADATA}", error)
+        classes = None
+    try:
+        grids = sequence.grids
+    except CarlascError as error:
+        yield Finding.from_error("params", sequence.path, where, error)
+        return
+    if not sequence.fields():
+        advice = "is the sequence whole? Copy it again, or give another folder"
+        yield Finding("error", "empty", sequence.path, where, "scans or grids", "none", advice)
+    elif not grids:
+        advice = "scans only: `carlasc regrid` makes grids, or give eval_*.zip as the grids' root"
+        yield Finding("note", "no-grids", sequence.path, where, "an evaluation folder", "no grid", advice)
+    if isinstance(sequence, FolderSequence):
+        yield from _check_grid_folders(sequence, set(grids))
+    for name, spec in grids.items():
+        file, params = f"{where}/{layout.params_file(name)}", sequence.params(name)
+        channels = params.get("num_channels")
+        if not isinstance(channels, int | float) or (classes is not None and channels < max(classes.names) + 1):
+            expected = f"num_channels of at least {max(classes.names) + 1}" if classes else "a number in num_channels"
+            yield Finding("warning", "params", sequence.path, file, expected, repr(channels))
+        if sequence.path.split("/")[-1] in layout.COORDINATES and spec.coordinates != sequence.coordinates:
+            expected = f"a {sequence.coordinates} grid, as the folder says"
+            yield Finding("warning", "params", sequence.path, file, expected, f"a {spec.coordinates} one")
+
+
+def _check_grid_folders(sequence: FolderSequence, grids: set[str]) -> Iterator[Finding]:
+    """A folder of grids without its params.json is no field of a sequence, and would go unseen."""
+    for folder in sorted(Path(sequence.location).glob(f"{layout.EVALUATION}*/")):
+        if folder.name not in grids and folder.is_dir():
+            file, advice = str(folder / layout.PARAMS), "readers pass the folder over: copy the file"
+            yield Finding("error", "params", sequence.path, file, "the grid's geometry", "no file", advice)
+
+
+def check_frames(sequence: Sequence) -> Iterator[Finding]:
+    """Check that frames follow each other, and that every field has the frames that it must."""
+    fields, frames = sequence.fields(), sequence.scan_frames()
+    gaps = np.flatnonzero(np.diff(frames) > 1)
+    if len(gaps):
+        missing = int((np.diff(frames)[gaps] - 1).sum())
+        first, then = int(frames[gaps[0]]), int(frames[gaps[0] + 1])
+        found = f"{len(gaps)} gaps, {missing} frames missing; the first after {first}, before {then}"
+        advice = "history does not cross a gap; if the frames were not left out on purpose, copy them again"
+        # a grid every fifth frame is a choice, a hole in the scans seldom is
+        severity: Severity = "warning" if "points" in fields else "note"
+        yield Finding(
+            severity, "frame-gaps", sequence.path, sequence.location, "frames that follow each other", found, advice
+        )
+    if "points" in fields:
+        for name in (*_PER_POINT, "bev"):
+            if name in fields:
+                yield from _compare_frames(sequence, name, "points", "note" if name == "bev" else "error")
+    for grid in sorted({name.rpartition("/")[0] for name in fields if "/" in name}):
+        parts = [part for part in ("labels", "counts", "votes") if f"{grid}/{part}" in fields]
+        if "labels" not in parts:
+            where = f"{sequence.location}/{grid}"
+            yield Finding("error", "frame-counts", sequence.path, where, "labels of a grid", f"only {', '.join(parts)}")
+            continue
+        for part in parts[1:]:
+            yield from _compare_frames(sequence, f"{grid}/{part}", f"{grid}/labels", "error")
+        if "counts" not in parts:
+            where, advice = f"{sequence.location}/{grid}", "every voxel will be taken for known"
+            yield Finding("warning", "frame-counts", sequence.path, where, "counts beside the labels", "none", advice)
+        if "points" in fields:
+            yield from _compare_frames(sequence, f"{grid}/labels", "points", "note", orphans="warning")
+
+
+def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Iterator[Finding]:
+    """Check that each of a frame's files has a size that fits params.json and the others; values are left alone."""
+    fields = [name for name in sequence.fields() if _has(sequence, name, frame) and (with_grids or "/" not in name)]
+    count: int | None = None
+    for name in sorted(fields, key=lambda name: (name != "points", name)):
+        where = _file(sequence, name, frame)
+        try:
+            array = sequence.read(name, frame)
+        except CarlascError as error:
+            yield Finding.from_error("file-size", sequence.path, where, error, "copy or make the file again")
+            continue
+        if name == "points":
+            count = len(array)
+            if count == 0:
+                yield Finding("warning", "empty-scan", sequence.path, where, "points", "an empty scan")
+        elif name in _PER_POINT and count is not None and len(array) != count:
+            expected = f"{count} rows, one a point of {_file(sequence, 'points', frame)}"
+            yield Finding(
+                "error", "point-counts", sequence.path, where, expected, f"{len(array)}", "copy or make both again"
+            )
+
+
+def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
+    """Check what is in a frame's files; those that cannot be read are `check_shapes`'s to report."""
+    arrays = _read_all(sequence, frame)
+    classes = sequence.metadata.classes
+    for name in ("points", "flow"):
+        if name in arrays:
+            rows = np.isfinite(arrays[name]).all(axis=1)
+            if not rows.all():
+                found = f"NaN or infinity in {int((~rows).sum())} rows, the first {int(np.argmin(rows))}"
+                yield Finding(
+                    "error", "not-finite", sequence.path, _file(sequence, name, frame), "finite numbers", found
+                )
+            elif name == "flow" and len(rows) and float(np.abs(arrays[name]).max()) > _FASTEST_M_S:
+                found = f"{float(np.abs(arrays[name]).max()):.0f} m/s"
+                expected = f"velocities below {_FASTEST_M_S:.0f} m/s"
+                yield Finding("warning", "flow", sequence.path, _file(sequence, name, frame), expected, found)
+    if "labels" in arrays:
+        yield from _check_classes(sequence, arrays["labels"], classes, _file(sequence, "labels", frame))
+    if "bev" in arrays and arrays["bev"][:2].tobytes() != b"\xff\xd8":
+        yield Finding("warning", "bev", sequence.path, _file(sequence, "bev", frame), "a JPEG picture", "other bytes")
+    for grid in sequence.grids:
+        if f"{grid}/labels" in arrays:
+            yield from _check_grid(sequence, grid, frame, arrays, classes)
+
+
+def _check_grid(
+    sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]], classes: ClassTable
+) -> Iterator[Finding]:
+    labels, where = arrays[f"{grid}/labels"], _file(sequence, f"{grid}/labels", frame)
+    yield from _check_classes(sequence, labels, classes, where)
+    if f"{grid}/counts" not in arrays:
+        return
+    counts, file = arrays[f"{grid}/counts"], _file(sequence, f"{grid}/counts", frame)
+    whole = (counts >= 0) & (counts == np.floor(counts)) & np.isfinite(counts)
+    if not whole.all():
+        found = f"{counts[~whole][0]:g} and {int((~whole).sum()) - 1} more such"
+        yield Finding("error", "counts", sequence.path, file, "whole numbers of votes, 0 or more", found)
+    unfounded = int(np.count_nonzero((labels != 0) & ~(counts > 0)))
+    if unfounded:
+        found = f"{unfounded} voxels with a label and no vote"
+        advice = "labels and counts are of different frames or runs: make the grid again"
+        yield Finding("error", "counts", sequence.path, file, "a vote in each voxel that has a label", found, advice)
+    if not (counts > 0).any():
+        yield Finding("warning", "counts", sequence.path, file, "known voxels", "a grid without any vote")
+
+
+def _check_classes(
+    sequence: Sequence, labels: NDArray[np.integer], classes: ClassTable, where: str
+) -> Iterator[Finding]:
+    known = np.zeros(classes.num_channels, np.bool_)
+    known[list(classes.names)] = True
+    inside = labels < len(known)
+    if inside.all() and known[labels].all():
+        return
+    ids, counts = np.unique(labels, return_counts=True)
+    unknown = [(int(i), int(n)) for i, n in zip(ids, counts, strict=True) if int(i) not in classes.names]
+    found = ", ".join(f"{i} ({n} times)" for i, n in unknown[:5]) + (" and more" if len(unknown) > 5 else "")
+    advice = f"wrong file, or wrong `classes` in {layout.METADATA}"
+    yield Finding("error", "class-ids", sequence.path, where, f"ids of the classes of {classes.name}", found, advice)
+
+
+def _compare_frames(
+    sequence: Sequence, field: str, reference: str, severity: Severity, orphans: Severity | None = None
+) -> Iterator[Finding]:
+    """Compare the frames of a field with those of the one that it belongs to."""
+    have, wanted = _frame_set(sequence, field), _frame_set(sequence, reference)
+    missing, extra = sorted(wanted - have), sorted(have - wanted)
+    where = f"{sequence.location}/{layout.field_named(field).folder}"
+    if missing:
+        expected = f"{field} for each of the {len(wanted)} frames of {reference}"
+        yield Finding(severity, "frame-counts", sequence.path, where, expected, f"none for {_some(missing)}")
+    if extra:
+        found = f"{len(extra)} more: {_some(extra)}"
+        yield Finding(orphans or severity, "frame-counts", sequence.path, where, f"only frames of {reference}", found)
+
+
+def _some(frames: list[int]) -> str:
+    shown = ", ".join(f"{frame:06d}" for frame in frames[:3])
+    return f"{shown}{f' and {len(frames) - 3} more' if len(frames) > 3 else ''}"
+
+
+def _read_all(sequence: Sequence, frame: int) -> dict[str, NDArray[Any]]:
+    arrays = {}
+    for name in sequence.fields():
+        if _has(sequence, name, frame):
+            try:
+                arrays[name] = sequence.read(name, frame)
+            except CarlascError:
+                continue  # reported by check_shapes
+    return arrays
+
+
+def _frame_set(sequence: Sequence, field: str) -> frozenset[int]:
+    return frozenset(sequence.frames(field).tolist())
+
+
+def _has(sequence: Sequence, field: str, frame: int) -> bool:
+    frames = sequence.frames(field)
+    place = int(np.searchsorted(frames, frame))
+    return place < len(frames) and int(frames[place]) == frame
+
+
+def _file(sequence: Sequence, field: str, frame: int) -> str:
+    return f"{sequence.location}/{layout.field_named(field).file(frame)}"

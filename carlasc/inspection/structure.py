@@ -1,0 +1,84 @@
+"""The points of a scan that tell where the sensor is: things that stand still and stand up.
+
+Ground is left out because its rings move with the sensor: they look the same from everywhere, and would speak for a sensor
+that never moved. So is what moves by itself, and what is so near that it may be the own car.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import CarlascError
+from carlasc.labels import ClassTable
+from carlasc.sources.base import Sequence
+
+MIN_RANGE_M = 3.0
+MAX_RANGE_M = 30.0
+_COLUMN_M = 0.4
+_UPRIGHT_M = 0.6  # a column of points that spans less is ground
+_FOOT_M = 0.3  # the lowest part of an upright column, where it stands in the ground
+
+_GROUND = frozenset(
+    "free unlabeled outlier sky road roadline sidewalk ground terrain water bridge parking other-ground lane-marking railtrack".split()
+)
+_MOVERS = frozenset("pedestrian vehicle dynamic person people rider bicyclist motorcyclist".split())
+
+
+def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
+    """Read the structure of a scan.
+
+    Args:
+        sequence: has the field `points`; `labels` and `flow` are used where they are there and fit.
+        frame: frame number.
+
+    Returns:
+        (M, 3) float64 metres, sensor frame.
+
+    Raises:
+        CarlascError: the points cannot be read.
+    """
+    points = np.asarray(sequence.read("points", frame))[:, :3]
+    keep = np.isfinite(points).all(axis=1)
+    distance = np.linalg.norm(np.where(keep[:, None], points, 0.0), axis=1)
+    keep &= (distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)
+    labels = _per_point(sequence, "labels", frame, len(points))
+    if labels is not None and bool(labels.any()):
+        keep &= _static_classes(sequence.metadata.classes)[np.minimum(labels, np.iinfo(np.uint16).max)]
+    else:
+        keep[keep] = _upright(points[keep])
+    flow = _per_point(sequence, "flow", frame, len(points))
+    if flow is not None:
+        keep &= np.abs(flow).max(axis=1, initial=0.0) < 0.1
+    return points[keep].astype(np.float64)
+
+
+def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[np.generic] | None:
+    """A field of the points, or None where it is missing or broken: the check of the files reports that, not this one."""
+    if field not in sequence.fields():
+        return None
+    try:
+        array = sequence.read(field, frame)
+    except CarlascError:
+        return None
+    return array if len(array) == count else None
+
+
+def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
+    static = np.zeros(np.iinfo(np.uint16).max + 1, np.bool_)
+    for index, name in table.names.items():
+        static[index] = index not in table.moving and name.lower() not in _GROUND | _MOVERS
+    return static
+
+
+def _upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points belong to something that stands up, found from the heights in columns of 0.4 m."""
+    columns = np.floor((points[:, :2] + MAX_RANGE_M) / _COLUMN_M).astype(np.int64)
+    width = int(2 * MAX_RANGE_M / _COLUMN_M) + 1
+    column = columns[:, 0] * width + columns[:, 1]
+    lowest = np.full(width * width, np.inf)
+    highest = np.full(width * width, -np.inf)
+    np.minimum.at(lowest, column, points[:, 2])
+    np.maximum.at(highest, column, points[:, 2])
+    upright: NDArray[np.bool_] = (highest - lowest)[column] > _UPRIGHT_M
+    return upright & (points[:, 2] > lowest[column] + _FOOT_M)

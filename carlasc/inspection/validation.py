@@ -1,0 +1,229 @@
+"""The doctor: looks at everything that can be wrong with a data set, and says what it looks like."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import layout
+from carlasc.errors import ArgumentError, CarlascError
+from carlasc.geometry import check_rigid
+from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
+from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
+from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
+from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
+from carlasc.inspection.structure import static_structure
+from carlasc.inspection.trajectory import check_poses, check_times
+from carlasc.sources.base import Sequence, Source
+from carlasc.sources.folder import FolderSequence
+
+_SAMPLES = 40  # frames of a sequence whose contents are read, if not told otherwise
+_POOR_SHARE = 0.5
+_DOUBTFUL_SHARE = 0.7
+_NO_OVERLAP = 0.3
+
+Progress = Callable[[int, int], None]
+
+
+def validate(
+    source: str | os.PathLike[str] | Source, *, every: int | None = None, progress: Progress | None = None
+) -> ValidationResult:
+    """Check a data set: files against each other, values, poses, times, and scans against poses and grids.
+
+    Names, numbers of frames, poses and times are always checked whole, and so are the sizes of local files. What has to be read is sampled.
+    A bad file is a finding, and the rest is looked at all the same.
+
+    Args:
+        source: a path or URL that `carlasc.open` knows, or a Source.
+        every: read the contents of every so many frames; 1 reads all, None about forty of each sequence.
+        progress: called with the steps done and their total.
+
+    Returns:
+        What was found; `ok` says whether there is no error among it.
+
+    Raises:
+        ArgumentError: `every` is less than 1.
+        MissingDataError: there is no data set to look at.
+    """
+    if every is not None and every < 1:
+        raise ArgumentError(f"every: expected 1 or more, found {every}")
+    opened = open_source(source)
+    plans = [_plan(sequence, every) for sequence in opened.sequences().values()]
+    total, done = sum(plan.steps for plan in plans), 0
+    findings: list[Finding] = []
+    reports = []
+    for plan in plans:
+        found: list[Finding] = []
+        examination = _examine(plan, found)
+        try:
+            while True:
+                next(examination)
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+        except StopIteration as end:
+            reports.append(end.value)
+        findings += sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+    return ValidationResult(opened.location, tuple(findings), tuple(reports))
+
+
+def open_source(source: str | os.PathLike[str] | Source) -> Source:
+    """Return the Source itself, or what `carlasc.open` makes of a path."""
+    if isinstance(source, Source):
+        return source
+    from carlasc import sources
+
+    return sources.open(source)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Which frames of a sequence are looked at, and how closely."""
+
+    sequence: Sequence
+    frames: tuple[int, ...]  # those of any field
+    opened: tuple[int, ...]  # those whose files are opened, for their sizes
+    read: tuple[int, ...]  # those whose contents are read
+
+    @property
+    def steps(self) -> int:
+        return len(self.opened) + len(self.read) + 1
+
+
+def _plan(sequence: Sequence, every: int | None) -> _Plan:
+    found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
+    frames = tuple(found.tolist())
+    read = frames[:: every or max(1, len(frames) // _SAMPLES)]
+    # a local file is mapped, and opening it costs nothing; a packed one is decoded, and its size cannot be wrong
+    return _Plan(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
+
+
+def _fields(sequence: Sequence) -> list[str]:
+    try:
+        return sorted(sequence.fields())
+    except CarlascError:
+        return []
+
+
+def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, SequenceReport]:
+    """Run all checks of a sequence; yields after each step."""
+    sequence = plan.sequence
+    found.extend(check_documents(sequence))
+    described = _is_described(sequence)
+    found.extend(check_frames(sequence))
+    found.extend(check_poses(sequence))
+    found.extend(check_times(sequence))
+    for frame in plan.opened:
+        found.extend(check_shapes(sequence, frame, with_grids=described))
+        yield
+    evidence: dict[str, GridEvidence] = {}
+    for frame in plan.read:
+        if described:
+            found.extend(check_values(sequence, frame))
+            _gather(sequence, frame, evidence)
+        yield
+    diagnoses = {name: grid.diagnose() for name, grid in evidence.items()}
+    for name, diagnosis in diagnoses.items():
+        found.extend(_judge_grid(sequence, name, diagnosis))
+    poses = _diagnose_poses(sequence)
+    if poses is not None:
+        found.extend(_judge_poses(sequence, poses))
+    yield
+    shares = {name: diagnosis.share for name, diagnosis in diagnoses.items() if not math.isnan(diagnosis.share)}
+    pose_share = poses.share if poses is not None and poses.pairs else None
+    return SequenceReport(sequence.path, len(plan.frames), len(plan.read), shares, pose_share)
+
+
+def _is_described(sequence: Sequence) -> bool:
+    """Whether classes and geometry are known, without which values mean nothing."""
+    try:
+        return sequence.metadata is not None and sequence.grids is not None
+    except CarlascError:
+        return False
+
+
+def _gather(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -> None:
+    """Look a frame's points up in its grids; what cannot be read has been reported already."""
+    if "points" not in sequence.fields():
+        return
+    try:
+        points, labels = _points(sequence, frame)
+    except CarlascError:
+        return
+    for name in sequence.grids:
+        try:
+            grid = sequence.grid(name, frame)
+        except CarlascError:
+            continue
+        evidence.setdefault(name, GridEvidence(grid.spec)).add(points, labels, grid)
+
+
+def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
+    """Read the points that a grid may know of: finite, and within the ranges of carlasc.json."""
+    scan = sequence.scan(frame, ("labels",))
+    distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    keep = np.isfinite(distance) & (distance >= (sequence.metadata.min_range_m or 0.0))
+    keep &= distance <= (sequence.metadata.max_range_m or np.inf)
+    labels = None if scan.labels is None or not scan.labels.any() else scan.labels[keep]
+    return scan.points[keep], labels
+
+
+def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
+    """Align scans under their poses; None where there are no scans, or no poses that could be used."""
+    if "points" not in sequence.fields() or layout.POSES not in sequence.documents():
+        return None
+    frames = sequence.frames("points").tolist()
+    try:
+        poses = check_rigid(np.stack([sequence.read_pose(frame) for frame in frames]), layout.POSES)
+    except CarlascError:
+        return None
+
+    def structure(index: int) -> NDArray[np.float64]:
+        try:
+            return static_structure(sequence, frames[index])
+        except CarlascError:
+            return np.empty((0, 3))
+
+    return diagnose_poses(structure, poses)
+
+
+def _judge_grid(sequence: Sequence, grid: str, diagnosis: GridDiagnosis) -> Iterator[Finding]:
+    where = f"{sequence.location}/{grid}"
+    expected = "scans that lie in voxels of their class"
+    share = f"{diagnosis.share:.1%} of the points in known space do, over {diagnosis.frames} frames"
+    if not diagnosis.frames:
+        return
+    if diagnosis.mistake is not None:
+        found = f"{share}; this looks like {diagnosis.mistake}: with it undone, {diagnosis.corrected_share:.1%}"
+        advice = "mend what writes the points or the grid, or make the grid again (carlasc regrid)"
+        yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
+    elif diagnosis.share < _DOUBTFUL_SHARE:
+        if diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2):
+            found = f"{share}, but {diagnosis.occupied_share:.1%} in voxels of some class: this looks like labels of another class table, or out of order"
+        else:
+            found = f"{share}, and no known mistake undone makes it better: this looks like scans and grids of different frames"
+        severity: Severity = "error" if diagnosis.share < _POOR_SHARE else "warning"
+        advice = "look at both with `carlasc render`, or make the grid again"
+        yield Finding(severity, "scan-in-voxels", sequence.path, where, expected, found, advice)
+
+
+def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
+    where = f"{sequence.location}/{layout.POSES}"
+    expected = "poses that put scans on each other"
+    if diagnosis.correction is not None:
+        found = f"{diagnosis.share_there:.1%} of a scan's structure on an earlier scan's; they look like {diagnosis.correction.name}: with that undone, {diagnosis.corrected_share:.1%}"
+        yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, diagnosis.correction.advice)
+    elif diagnosis.offset_m is not None:
+        x, y, z = diagnosis.offset_m
+        found = f"{diagnosis.share:.1%} of a scan's structure on an earlier scan's; they put scans about ({x:.1f}, {y:.1f}, {z:.1f}) m beside their place"
+        advice = "are the poses of this sequence, and of these frames?"
+        yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, advice)
+    elif diagnosis.pairs and diagnosis.share < _NO_OVERLAP:
+        found = f"{diagnosis.share:.1%} of a scan's structure on an earlier scan's, and no known mistake undone makes it better"
+        advice = "are the poses of this sequence? `carlasc convert --poses kiss-icp` estimates them from the scans"
+        yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)
