@@ -18,8 +18,8 @@ from carlasc.geometry import Transform, rotate_vectors, transform_points
 
 Floats = NDArray[np.float64]
 
-DEFAULT_ELEVATION_RAD = np.deg2rad(38.0)
-DEFAULT_FOV_RAD = np.deg2rad(36.0)
+DEFAULT_ELEVATION_RAD = np.deg2rad(42.0)
+DEFAULT_FOV_RAD = np.deg2rad(32.0)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ class QuadMesh:
         colors: (Q, 3) uint8 RGB.
         openness: (Q, 4) float32 0..1: how much of the sky the immediate neighbours leave to each corner.
         edges: (Q, 4) bool: whether the edge from corner i to i + 1 is drawn.
+        open_sky: (Q,) bool: the face counts as seeing the whole sky (one too large for one value all over it).
     """
 
     corners: NDArray[np.float32]
@@ -31,6 +32,7 @@ class QuadMesh:
     colors: NDArray[np.uint8]
     openness: NDArray[np.float32]
     edges: NDArray[np.bool_]
+    open_sky: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -46,19 +48,25 @@ def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
     return QuadMesh(
         *(
             np.concatenate([getattr(mesh, name) for mesh in meshes])
-            for name in ("corners", "normals", "colors", "openness", "edges")
+            for name in ("corners", "normals", "colors", "openness", "edges", "open_sky")
         )
     )
 
 
-def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False) -> QuadMesh:
+def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky: bool = False) -> QuadMesh:
     """Return a mesh of (Q, 4, 3) faces of one colour or (Q, 3) colours; normals by the order of their corners."""
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
     normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     count = len(points)
-    colors = np.broadcast_to(np.asarray(color, np.uint8), (count, 3))
-    return QuadMesh(points, normals, colors, np.ones((count, 4), np.float32), np.full((count, 4), edges))
+    return QuadMesh(
+        points,
+        normals,
+        np.broadcast_to(np.asarray(color, np.uint8), (count, 3)),
+        np.ones((count, 4), np.float32),
+        np.full((count, 4), edges),
+        np.full(count, open_sky),
+    )
 
 
 def grid_mesh(spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bool_]) -> QuadMesh:
@@ -119,6 +127,7 @@ def _faces(
         colors[tuple(cells.T)],
         openness,
         _drawn_edges(cells, across, along, pieces),
+        np.zeros(len(cells), np.bool_),
     )
 
 
@@ -150,7 +159,9 @@ def _drawn_edges(cells: NDArray[np.int64], across: int, along: int, pieces: int)
 
 def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
     """Return (Q, 4, 3) faces, upwards, of the ground plan of a grid at a height, metres."""
-    pieces = (1, 1) if spec.coordinates == "cartesian" else (1, int(np.ceil((spec.upper[1] - spec.lower[1]) / 0.05)))
+    pieces = (1, 1)
+    if spec.coordinates == "cylindrical":  # several along the radius too: slivers cost Embree dear
+        pieces = (16, int(np.ceil((spec.upper[1] - spec.lower[1]) / _WIDEST_ARC_RAD)))
     first, second = (np.linspace(spec.lower[a], spec.upper[a], pieces[a] + 1) for a in range(2))
     corners = [
         [(first[i + di], second[j + dj], height) for di, dj in _SQUARE]
@@ -160,9 +171,10 @@ def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
     return spec.from_axes(np.array(corners)).astype(np.float32)
 
 
-def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike) -> QuadMesh:
-    """Return an axis-aligned box."""
+def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 0.0) -> QuadMesh:
+    """Return an axis-aligned box, its top drawn in by `taper` metres on every side."""
     low_high = np.array([lower, upper], np.float32)
+    inwards = np.array([[taper, taper, 0.0], [-taper, -taper, 0.0]], np.float32)
     faces = []
     for axis in range(3):
         for side in (0, 1):
@@ -170,9 +182,9 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike) -> QuadMesh:
             for number, (first, second) in enumerate(_SQUARE):
                 pick = np.zeros(3, np.int64)
                 pick[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, first, second
-                face[number] = low_high[pick, np.arange(3)]
+                face[number] = low_high[pick, np.arange(3)] + pick[2] * inwards[pick, np.arange(3)]
             faces.append(face if side else face[::-1])
-    return quads(np.array(faces), color, edges=True)
+    return quads(np.array(faces), color, edges=True, open_sky=True)
 
 
 def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: ArrayLike, width: float) -> QuadMesh:
@@ -204,8 +216,4 @@ def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: Ar
             (tails, tails, tails + thin * b, tails + thin * a),
         ]
     corners = np.array(faces).transpose(2, 0, 1, 3).reshape(-1, 4, 3)
-    mesh = quads(corners, color)
-    middle = np.repeat((tails + vectors / 2), len(faces), axis=0)
-    outward = np.einsum("qc,qc->q", mesh.normals, corners.mean(1) - middle) < 0
-    mesh.normals[outward] *= -1
-    return mesh
+    return quads(corners[:, ::-1], color)

@@ -22,7 +22,7 @@ SAMPLES = 2  # samples a pixel, each way
 
 _SKY_RAYS = 12
 _SKY_RANGE_M = 6.0  # what stands farther away darkens no sky
-_AMBIENT, _SUN = 0.56, 0.60
+_AMBIENT, _SUN = 0.62, 0.52
 _EDGE_DARKNESS = 0.34
 _BAND = 1 << 19  # rays at a time: keeps memory bounded
 
@@ -41,10 +41,11 @@ class Frame:
 
     def resolve(self) -> NDArray[np.uint8]:
         """Return (H, W, 3) uint8: the mean of each pixel's samples."""
-        height, width = self.depth.shape
-        blocks = self.colors.reshape(height // SAMPLES, SAMPLES, width // SAMPLES, SAMPLES, 3)
-        total = blocks.astype(np.uint16).sum(axis=(1, 3))
-        return ((total + SAMPLES * SAMPLES // 2) // (SAMPLES * SAMPLES)).astype(np.uint8)
+        total = np.full((self.depth.shape[0] // SAMPLES, self.depth.shape[1] // SAMPLES, 3), SAMPLES, np.uint16)
+        for row in range(SAMPLES):
+            for column in range(SAMPLES):
+                total += self.colors[row::SAMPLES, column::SAMPLES]
+        return (total // SAMPLES**2).astype(np.uint8)
 
 
 def empty_frame(width: int, height: int) -> Frame:
@@ -67,13 +68,14 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = Tr
     scene, geometry = _embree_scene(mesh)
     sky = _sky_visibility(scene, mesh)
     suns = _suns(left_handed)
+    extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
     height, width = frame.depth.shape
     band = max(1, _BAND // width)
     for top in range(0, height, band):
         rows = slice(top, min(top + band, height))
         origins, directions = camera.rays(width, height, rows)
         hits = scene.run(origins, directions, output=True)
-        quad, depth = np.maximum(hits["primID"], -1), hits["tfar"]
+        quad, depth = hits["primID"], hits["tfar"]
         # Each sample of a pixel sees another point of the sun's disc: shadows are soft without a further ray.
         columns = np.arange(width) % SAMPLES
         which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
@@ -82,7 +84,7 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = Tr
         if len(facing):
             shadowed[facing] = scene.run(starts, towards, query="OCCLUDED") >= 0
         _shade(
-            mesh.corners,
+            extents,
             mesh.normals,
             mesh.colors,
             mesh.openness,
@@ -128,13 +130,13 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
     tangent = np.cross(helper, mesh.normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     frames = np.stack([tangent, np.cross(mesh.normals, tangent), mesh.normals], axis=1)
-    starts = mesh.corners.mean(1) + 1e-3 * mesh.normals
+    starts = np.ascontiguousarray(mesh.corners.mean(1) + np.float32(1e-3) * mesh.normals)
     visible = np.zeros(len(mesh), np.float32)
     for ray in local:
         directions = np.ascontiguousarray(np.einsum("a,qac->qc", ray, frames), np.float32)
         distances = scene.run(starts, directions, query="DISTANCE")
         visible += np.minimum(distances / _SKY_RANGE_M, 1.0)
-    return visible / _SKY_RAYS
+    return np.where(mesh.open_sky, np.float32(1), visible / _SKY_RAYS)
 
 
 @numba.njit(cache=True)
@@ -162,7 +164,7 @@ def _shadow_rays(normals, quad, origins, directions, depth, suns, which):  # typ
 
 @numba.njit(cache=True, fastmath=True)
 def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    corners, normals, colors, openness, edges, sky, suns, which, quad, u, v, depth, shadowed, footprint, flat, out, out_depth
+    extents, normals, colors, openness, edges, sky, suns, which, quad, u, v, depth, shadowed, footprint, flat, out, out_depth
 ):
     """Light every sample that a ray found, and write it where it is nearer than what is there."""
     for i in range(len(quad)):
@@ -181,7 +183,7 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
         direct = np.float32(0.0)
         if not shadowed[i]:
             direct = max(np.float32(0.0), n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2])
-        light = _AMBIENT * (0.25 + 0.75 * ambient) + _SUN * direct
+        light = _AMBIENT * (0.3 + 0.7 * ambient) + _SUN * direct
 
         pixel = footprint if flat else footprint * depth[i]
         line = np.float32(0.0)
@@ -189,10 +191,10 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
             if not edges[q, e]:
                 continue
             if e == 0 or e == 2:
-                other = np.linalg.norm(corners[q, 3] - corners[q, 0] if e == 0 else corners[q, 2] - corners[q, 1])
+                other = extents[q, 1]
                 distance = (t if e == 0 else 1 - t) * other
             else:
-                other = np.linalg.norm(corners[q, 1] - corners[q, 0] if e == 3 else corners[q, 2] - corners[q, 3])
+                other = extents[q, 0]
                 distance = (s if e == 3 else 1 - s) * other
             wide = other / pixel  # of the voxel, in pixels
             strength = min(np.float32(1.0), max(np.float32(0.0), (wide - 2.5) / 7.5))
