@@ -142,11 +142,11 @@ def _match(
     ends = np.stack([chain[-1].center for chain in alive])
     for i, segment in enumerate(found):
         reach = _REACH_M + _FASTEST_M_S * np.array([times[segment.frame] - times[chain[-1].frame] for chain in alive])
-        for j in np.flatnonzero(np.linalg.norm(ends - segment.center, axis=1) < reach):
+        for j in np.flatnonzero(np.linalg.norm(ends - segment.center, axis=1) < reach).tolist():
             last = alive[j][-1]
             cost = _cost(last, segment, times[segment.frame] - times[last.frame])
             if cost is not None:
-                candidates.append((cost, i, int(j)))
+                candidates.append((cost, i, j))
     taken: dict[int, int] = {}
     for _, i, j in sorted(candidates):
         if i not in taken and j not in taken.values():
