@@ -1,0 +1,91 @@
+"""Which land is taken: footprints as turned rectangles, and whether two of them overlap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A turned rectangle in the plane.
+
+    Attributes:
+        centre: (2,) metres.
+        size: (2,) extent along its own x and y.
+        yaw_rad: how it is turned, x towards y.
+    """
+
+    centre: Points
+    size: tuple[float, float]
+    yaw_rad: float
+
+    @property
+    def axes(self) -> Points:
+        """(2, 2) unit vectors of its own x and y, a row each."""
+        cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.array([[cos, sin], [-sin, cos]])
+
+    def local(self, points: Points) -> Points:
+        """Return points (..., 2) in its own axes, from its centre."""
+        return (points - self.centre) @ self.axes.T
+
+    def contains(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
+        """Return which points (..., 2) are inside, or within a margin outside."""
+        return (np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m).all(axis=-1)
+
+    @property
+    def corners(self) -> Points:
+        """(4, 2) corners."""
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+        return self.centre + (signs * self.size) @ self.axes
+
+    def overlaps(self, other: Rectangle, margin_m: float = 0.0) -> bool:
+        """Whether two rectangles are nearer than a margin: no axis of either separates them."""
+        for axis in np.concatenate([self.axes, other.axes]):
+            a, b = self.corners @ axis, other.corners @ axis
+            if a.max() + margin_m <= b.min() or b.max() + margin_m <= a.min():
+                return False
+        return True
+
+
+@dataclass
+class Land:
+    """A block's ground: where things may still be put.
+
+    Attributes:
+        boundary: (K, 2) loop around it, inside on the right.
+        taken: what stands there.
+    """
+
+    boundary: Points
+    taken: list[Rectangle] = field(default_factory=list)
+
+    def inside(self, points: Points, margin_m: float = 0.0) -> bool:
+        """Whether all points (N, 2) are inside the loop, at least a margin away from it."""
+        start, along = self.boundary, np.roll(self.boundary, -1, axis=0) - self.boundary
+        offsets = points[:, None, :] - start
+        share = (offsets * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12)
+        nearest = start + np.clip(share, 0, 1)[..., None] * along
+        far_enough = np.linalg.norm(points[:, None, :] - nearest, axis=-1).min(axis=1) >= margin_m
+        # A ray along +x crosses the loop an odd number of times.
+        above = self.boundary[:, 1] > points[:, 1:]
+        crossed = above != np.roll(above, -1, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = start[:, 0] + offsets[..., 1] / along[:, 1] * along[:, 0]
+        odd = (crossed & (x > points[:, :1])).sum(axis=1) % 2 == 1
+        return bool((odd & far_enough).all())
+
+    def claim(self, rectangle: Rectangle, margin_m: float = 0.3, edge_m: float = 0.0) -> bool:
+        """Take a rectangle if it is inside and free; say whether it was."""
+        corners = rectangle.corners
+        if not self.inside(np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2]), edge_m):
+            return False
+        if any(rectangle.overlaps(other, margin_m) for other in self.taken):
+            return False
+        self.taken.append(rectangle)
+        return True

@@ -1,0 +1,316 @@
+"""The street network: where streets run, the blocks between them, and the lanes that vehicles follow.
+
+Everything lies in the town's plane: x and y in metres, the left-handed frame of CarlaSC. For a direction d = (dx, dy) the
+vector (-dy, dx) points to the *right*, so blocks are traced with their inside on the right, and vehicles keep right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]
+
+LANE_WIDTH_M = 3.5
+HALF_ROAD_M = LANE_WIDTH_M  # two lanes, one each way
+SIDEWALK_M = 2.6
+CORNER_RADIUS_M = 6.0  # of the kerb at a crossing
+STOP_BACK_M = 4.5  # from the end of the kerb's corner to the stop line; the crosswalk lies between
+BAY_M = 2.2  # depth of a parking bay
+PATH_STEP_M = 0.5
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The edge of a block. At offset `o` from the streets' centre lines it runs through `anchor + o * normal`.
+
+    Attributes:
+        anchor: (K, 2) metres.
+        normal: (K, 2) unit vectors into the block.
+    """
+
+    anchor: Points
+    normal: Points
+
+    def at(self, offset_m: float) -> Points:
+        """Return the (K, 2) loop at an offset from the centre line; valid up to the corners' radius."""
+        return self.anchor + offset_m * self.normal
+
+
+@dataclass(frozen=True)
+class Side:
+    """One street along a block, walked with the block on the right.
+
+    Attributes:
+        start: (2,) where the street's straight part starts, on its centre line.
+        direction: (2,) unit vector.
+        length_m: length of the straight part.
+        bay: whether there is a parking bay.
+    """
+
+    start: Points
+    direction: Points
+    length_m: float
+    bay: bool
+
+    @property
+    def normal(self) -> Points:
+        """(2,) unit vector to the right: into the block."""
+        return right_of(self.direction)
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading of `direction`."""
+        return float(np.arctan2(self.direction[1], self.direction[0]))
+
+    def point(self, along_m: float, offset_m: float) -> Points:
+        """Return the (2,) point so far along the street and to the right of its centre line."""
+        return self.start + along_m * self.direction + offset_m * self.normal
+
+    def kerb_offset(self, along_m: float) -> float:
+        """Return how far the kerb is from the centre line there."""
+        ramp = min(along_m, self.length_m - along_m) / 3.0
+        return HALF_ROAD_M + (BAY_M * float(np.clip(ramp, 0, 1)) if self.bay else 0.0)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Land between streets (or all around them: the outside).
+
+    Attributes:
+        outline: its edge.
+        sides: its streets.
+        outside: whether it is the land around the town.
+    """
+
+    outline: Outline
+    sides: tuple[Side, ...]
+    outside: bool
+
+    @property
+    def centre(self) -> Points:
+        """(2,) mean of its corners."""
+        return self.outline.at(HALF_ROAD_M + SIDEWALK_M).mean(axis=0)
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A way for vehicles: a street's lane between two crossings, or a turn across a crossing.
+
+    Attributes:
+        path: (P, 2) metres, points about PATH_STEP_M apart.
+        start: crossing it comes from (a lane), or lies on (a turn).
+        end: crossing it leads to, or lies on.
+        turn: whether it lies on a crossing.
+        exits: lanes that follow on, by index.
+    """
+
+    path: Points
+    start: int
+    end: int
+    turn: bool
+    exits: tuple[int, ...] = ()
+
+    @cached_property
+    def stations(self) -> NDArray[np.float64]:
+        """(P,) distance of each point from the start, metres."""
+        steps = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @cached_property
+    def length_m(self) -> float:
+        """Length of the path."""
+        return float(self.stations[-1])
+
+    def point(self, along_m: float | NDArray[np.float64]) -> Points:
+        """Return the point (2,), or points (N, 2), so far along the path."""
+        x = np.interp(along_m, self.stations, self.path[:, 0])
+        y = np.interp(along_m, self.stations, self.path[:, 1])
+        return np.stack([x, y], axis=-1)
+
+    @cached_property
+    def turning_rad(self) -> float:
+        """How much the heading changes from start to end, without sign."""
+        first, last = self.path[1] - self.path[0], self.path[-1] - self.path[-2]
+        cosine = first @ last / (np.linalg.norm(first) * np.linalg.norm(last))
+        return float(np.arccos(np.clip(cosine, -1, 1)))
+
+
+@dataclass(frozen=True)
+class Streets:
+    """The network.
+
+    Attributes:
+        nodes: (N, 2) crossings, metres.
+        edges: (E, 2) streets, pairs of crossings.
+        blocks: land between the streets; the outside last.
+        lanes: lanes and turns.
+    """
+
+    nodes: Points
+    edges: NDArray[np.int64]
+    blocks: tuple[Block, ...]
+    lanes: tuple[Lane, ...]
+
+    def degree(self, node: int) -> int:
+        """Return how many streets meet at a crossing."""
+        return int((self.edges == node).sum())
+
+
+def right_of(direction: Points) -> Points:
+    """Return (..., 2) vectors turned a quarter to the right (x towards y)."""
+    return np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
+
+
+def lay_out(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> Streets:
+    """Draw a town's streets: a grid with uneven spacing, bent out of square, some streets left out."""
+    nodes, edges = _draw_grid(rng, rows, columns)
+    loops = _trace_faces(nodes, edges)
+    mouths = _mouths(nodes, loops)
+    blocks = [_block(rng, nodes, loop, mouths) for loop in loops]
+    blocks.sort(key=lambda block: block.outside)
+    return Streets(nodes, edges, tuple(blocks), _lanes(nodes, edges, mouths))
+
+
+def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Points, NDArray[np.int64]]:
+    xs = np.concatenate([[0.0], np.cumsum(rng.uniform(62, 88, rows - 1))])
+    ys = np.concatenate([[0.0], np.cumsum(rng.uniform(58, 80, columns - 1))])
+    nodes = np.stack(np.meshgrid(xs - xs.mean(), ys - ys.mean(), indexing="ij"), axis=-1).reshape(-1, 2)
+    nodes += rng.uniform(-5, 5, nodes.shape)
+    index = np.arange(rows * columns).reshape(rows, columns)
+    along = np.stack([index[:-1].ravel(), index[1:].ravel()], axis=1)
+    across = np.stack([index[:, :-1].ravel(), index[:, 1:].ravel()], axis=1)
+    inner = [(int(a), int(b)) for a, b in across if rows - 1 > a // columns > 0]
+    dropped: set[tuple[int, int]] = set()
+    touched: set[int] = set()
+    for pick in rng.permutation(len(inner)):  # a street left out leaves two T-crossings and one longer block
+        a, b = inner[pick]
+        around = {a, b, a + columns, b + columns, a - columns, b - columns}
+        inside = 0 < a % columns and b % columns < columns - 1
+        if inside and not touched & around and len(dropped) < (rows * columns) // 8:
+            dropped.add((a, b))
+            touched |= around
+    edges = [(int(a), int(b)) for a, b in np.concatenate([along, across]) if (int(a), int(b)) not in dropped]
+    return nodes, np.array(edges, np.int64)
+
+
+def _trace_faces(nodes: Points, edges: NDArray[np.int64]) -> list[list[int]]:
+    """Return the loops of nodes around each face, the face on the right."""
+    neighbours: dict[int, list[int]] = {node: [] for node in range(len(nodes))}
+    for a, b in edges.tolist():
+        neighbours[a].append(b)
+        neighbours[b].append(a)
+    for node, others in neighbours.items():
+        offsets = nodes[others] - nodes[node]
+        order = np.argsort(np.arctan2(offsets[:, 1], offsets[:, 0]))
+        neighbours[node] = [others[i] for i in order]
+    unused = {(a, b) for a in neighbours for b in neighbours[a]}
+    loops = []
+    for first in sorted(unused):
+        if first not in unused:
+            continue
+        loop, step = [], first
+        while step in unused:
+            unused.remove(step)
+            loop.append(step[0])
+            around = neighbours[step[1]]
+            step = (step[1], around[around.index(step[0]) - 1])
+        loops.append(loop)
+    return loops
+
+
+def _corner(nodes: Points, before: int, node: int, after: int) -> tuple[Points, Points, float]:
+    """Return the directions into and out of a corner, and by how much it turns to the right (radians)."""
+    arriving, leaving = nodes[node] - nodes[before], nodes[after] - nodes[node]
+    arriving, leaving = arriving / np.linalg.norm(arriving), leaving / np.linalg.norm(leaving)
+    turn = np.arctan2(arriving[0] * leaving[1] - arriving[1] * leaving[0], arriving @ leaving)
+    return arriving, leaving, float(turn)
+
+
+def _mouths(nodes: Points, loops: list[list[int]]) -> dict[tuple[int, int], float]:
+    """Return, for a crossing and a street's other end, how far from the crossing the stop line is."""
+    mouths: dict[tuple[int, int], float] = {}
+    for loop in loops:
+        for before, node, after in _corners_of(loop):
+            turn = _corner(nodes, before, node, after)[2]
+            tangent = (HALF_ROAD_M + CORNER_RADIUS_M) * np.tan(max(turn, 0.0) / 2)
+            for other in (before, after):
+                mouths[node, other] = max(mouths.get((node, other), 4.0), float(tangent) + STOP_BACK_M)
+    return mouths
+
+
+def _corners_of(loop: list[int]) -> list[tuple[int, int, int]]:
+    return [(loop[i - 1], loop[i], loop[(i + 1) % len(loop)]) for i in range(len(loop))]
+
+
+def _block(rng: np.random.Generator, nodes: Points, loop: list[int], mouths: dict[tuple[int, int], float]) -> Block:
+    corners = nodes[loop]
+    following = np.roll(corners, -1, axis=0)
+    outside = float((corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum()) < 0
+    anchors, normals, sides = [], [], []
+    for before, node, after in _corners_of(loop):
+        arriving, leaving, turn = _corner(nodes, before, node, after)
+        anchor, normal = _rounded_corner(nodes[node], arriving, leaving, turn)
+        anchors.append(anchor)
+        normals.append(normal)
+        near, far = mouths[node, after], mouths[after, node]
+        length = float(np.linalg.norm(nodes[after] - nodes[node])) - near - far
+        side = Side(nodes[node] + near * leaving, leaving, length, bool(not outside and rng.random() < 0.45))
+        sides.append(side)
+        stations = np.array([0.0, 3.0, length - 3.0, length])
+        depth = np.array([0.0, BAY_M, BAY_M, 0.0]) * side.bay
+        anchors.append(side.start + stations[:, None] * leaving + depth[:, None] * side.normal)
+        normals.append(np.tile(side.normal, (4, 1)))
+    return Block(Outline(np.concatenate(anchors), np.concatenate(normals)), tuple(sides), outside)
+
+
+def _rounded_corner(node: Points, arriving: Points, leaving: Points, turn: float) -> tuple[Points, Points]:
+    """Return anchors and normals of an outline around a corner."""
+    count = max(2, int(np.ceil(abs(turn) / 0.16)) + 1)
+    heading = np.arctan2(arriving[1], arriving[0]) + np.linspace(0, turn, count)
+    normal = right_of(np.stack([np.cos(heading), np.sin(heading)], axis=1))
+    if turn <= 0:  # the block goes round the crossing
+        return np.tile(node, (count, 1)), normal
+    bisector = right_of(arriving) + right_of(leaving)
+    centre = node + (HALF_ROAD_M + CORNER_RADIUS_M) * bisector / (1 + arriving @ leaving)
+    return centre - (HALF_ROAD_M + CORNER_RADIUS_M) * normal, normal
+
+
+def _lanes(nodes: Points, edges: NDArray[np.int64], mouths: dict[tuple[int, int], float]) -> tuple[Lane, ...]:
+    lanes: list[Lane] = []
+    for a, b in edges.tolist():
+        for start, end in ((a, b), (b, a)):
+            direction = (nodes[end] - nodes[start]) / np.linalg.norm(nodes[end] - nodes[start])
+            offset = LANE_WIDTH_M / 2 * right_of(direction)
+            first = nodes[start] + mouths[start, end] * direction + offset
+            last = nodes[end] - mouths[end, start] * direction + offset
+            lanes.append(Lane(_straight(first, last), start, end, turn=False))
+    streets = list(lanes)
+    for index, lane in enumerate(streets):
+        exits = []
+        for follow, other in enumerate(streets):
+            if other.start == lane.end and other.end != lane.start:
+                exits.append(len(lanes))
+                lanes.append(Lane(_curve(lane.path, other.path), lane.end, lane.end, turn=True, exits=(follow,)))
+        lanes[index] = Lane(lane.path, lane.start, lane.end, turn=False, exits=tuple(exits))
+    return tuple(lanes)
+
+
+def _straight(first: Points, last: Points) -> Points:
+    count = max(2, int(np.ceil(np.linalg.norm(last - first) / PATH_STEP_M)) + 1)
+    return first + np.linspace(0, 1, count)[:, None] * (last - first)
+
+
+def _curve(before: Points, after: Points) -> Points:
+    """Return the turn from the end of one lane to the start of another: a cubic Bezier curve, near a circle's arc."""
+    first, last = before[-1], after[0]
+    leaving = (before[-1] - before[-2]) / np.linalg.norm(before[-1] - before[-2])
+    arriving = (after[1] - after[0]) / np.linalg.norm(after[1] - after[0])
+    reach = 0.38 * float(np.linalg.norm(last - first))
+    control = np.stack([first, first + reach * leaving, last - reach * arriving, last])
+    t = np.linspace(0, 1, max(8, int(reach / 0.38 / PATH_STEP_M) + 1))[:, None]
+    weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
+    return weights @ control

@@ -1,0 +1,341 @@
+"""How vehicles and pedestrians move: vehicles follow each other along lanes and take turns at crossings, pedestrians walk round blocks.
+
+Car following is the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A crossing is given to the lanes that lead to it
+one at a time, and a vehicle enters it only where there is room behind it on the far side: so nobody meets anybody on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.geometry import Transform, rotation_z, translation
+from carlasc.layout import FRAME_PERIOD_S
+from carlasc.simulation.streets import Block, Streets
+
+ACCELERATION = 1.8  # m/s^2
+BRAKING = 2.5  # m/s^2, comfortable
+HEADWAY_S = 1.2
+STANDSTILL_GAP_M = 2.0
+LOOK_AHEAD_M = 60.0
+LATERAL_ACCELERATION = 2.4  # m/s^2, what a driver takes in a turn
+CONVOY = 4  # vehicles of one lane that a crossing lets through while others wait
+
+
+@dataclass
+class Vehicle:
+    """A vehicle under way.
+
+    Attributes:
+        length_m: bumper to bumper.
+        cruise_mps: the speed it would like to drive.
+        turns: random numbers in 0..1 that choose its way, one a crossing.
+        route: lanes it drives over, in order; the last one is where the way has been chosen to.
+        starts: distance along the route at which each of these lanes starts, metres.
+        along_m: distance of its middle along the route.
+        speed_mps: its speed.
+        leg: index in `route` of the lane its middle is on.
+        granted: index in `route` up to which it may drive.
+    """
+
+    length_m: float
+    cruise_mps: float
+    turns: NDArray[np.float64]
+    route: list[int]
+    starts: list[float]
+    along_m: float
+    speed_mps: float = 0.0
+    leg: int = 0
+    granted: int = 0
+
+
+@dataclass
+class _Crossing:
+    holder: int = -1  # lane that leads to it and has it now
+    served: int = 0  # vehicles let through since it got it
+    inside: list[int] = field(default_factory=list)
+    waiting: dict[int, int] = field(default_factory=dict)  # lane -> step at which its first vehicle came
+
+
+class Traffic:
+    """All vehicles, stepped at the frame rate from frame 0; what has been stepped is kept."""
+
+    def __init__(self, streets: Streets, vehicles: list[Vehicle], first_is_ego: bool = True) -> None:
+        self.streets = streets
+        self.vehicles = vehicles
+        self._ego = 0 if first_is_ego else -1
+        self._crossings = [_Crossing() for _ in streets.nodes]
+        self._exit_claims: dict[int, list[int]] = {}  # lane -> vehicles on a crossing that will drive onto it
+        self._limits = [_speed_limit(lane) for lane in streets.lanes]
+        for vehicle in vehicles:
+            self._extend(vehicle)
+        self._along = [np.array([vehicle.along_m for vehicle in vehicles])]
+        self._speed = [np.array([vehicle.speed_mps for vehicle in vehicles])]
+
+    def at(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return distance along the route and speed of every vehicle at a frame: (V,) metres, (V,) m/s."""
+        while len(self._along) <= frame:
+            self._step(len(self._along))
+            self._along.append(np.array([vehicle.along_m for vehicle in self.vehicles]))
+            self._speed.append(np.array([vehicle.speed_mps for vehicle in self.vehicles]))
+        return self._along[frame], self._speed[frame]
+
+    def pose(self, index: int, along_m: float, wheelbase_m: float) -> Transform:
+        """Return world_T_vehicle of a vehicle so far along its route: both axles' middles are on the route."""
+        vehicle = self.vehicles[index]
+        front = self._point(vehicle, along_m + wheelbase_m / 2)
+        rear = self._point(vehicle, along_m - wheelbase_m / 2)
+        middle, ahead = (front + rear) / 2, front - rear
+        return translation((*middle, 0.0)) @ rotation_z(float(np.arctan2(ahead[1], ahead[0])))
+
+    def _point(self, vehicle: Vehicle, along_m: float) -> NDArray[np.float64]:
+        leg = int(np.searchsorted(vehicle.starts, along_m, side="right")) - 1
+        leg = min(max(leg, 0), len(vehicle.route) - 1)
+        lane, local = self.streets.lanes[vehicle.route[leg]], along_m - vehicle.starts[leg]
+        if local < 0:  # behind the route's first lane: straight back
+            return lane.path[0] + local * (lane.path[1] - lane.path[0]) / np.linalg.norm(lane.path[1] - lane.path[0])
+        return lane.point(local)
+
+    def _step(self, step: int) -> None:
+        self._release_crossings()
+        queues = self._queues()
+        self._grant_crossings(step, queues)
+        accelerations = [self._acceleration(index, queues) for index in range(len(self.vehicles))]
+        for vehicle, acceleration in zip(self.vehicles, accelerations, strict=True):
+            speed = max(vehicle.speed_mps + acceleration * FRAME_PERIOD_S, 0.0)
+            vehicle.along_m += (vehicle.speed_mps + speed) / 2 * FRAME_PERIOD_S
+            vehicle.speed_mps = speed
+            while vehicle.along_m >= vehicle.starts[vehicle.leg + 1]:
+                vehicle.leg += 1
+            self._extend(vehicle)
+
+    def _extend(self, vehicle: Vehicle) -> None:
+        """Choose the way for at least two crossings ahead."""
+        while len(vehicle.route) < vehicle.leg + 6:
+            lane = self.streets.lanes[vehicle.route[-1]]
+            number = vehicle.turns[len(vehicle.route) % len(vehicle.turns)]
+            vehicle.route.append(lane.exits[int(number * len(lane.exits))])
+            vehicle.starts.append(vehicle.starts[-1] + lane.length_m)
+
+    def _queues(self) -> dict[int, list[int]]:
+        """Return the vehicles on each street's lane and on the turns that lead away from it, the foremost first."""
+        queues: dict[int, list[tuple[float, int]]] = {}
+        for index, vehicle in enumerate(self.vehicles):
+            leg = vehicle.leg
+            if self.streets.lanes[vehicle.route[leg]].turn:
+                leg -= 1
+            position = vehicle.along_m - vehicle.starts[leg]
+            queues.setdefault(vehicle.route[leg], []).append((-position, index))
+        return {lane: [index for _, index in sorted(queue)] for lane, queue in queues.items()}
+
+    def _release_crossings(self) -> None:
+        """Forget the vehicles that have left a crossing with their tails."""
+        for crossing in self._crossings:
+            crossing.inside = [index for index in crossing.inside if not self._has_left(index)]
+        for claims in self._exit_claims.values():
+            claims[:] = [index for index in claims if not self._has_left(index)]
+
+    def _has_left(self, index: int) -> bool:
+        vehicle = self.vehicles[index]
+        return vehicle.along_m - vehicle.length_m / 2 > vehicle.starts[vehicle.granted] + 0.5
+
+    def _grant_crossings(self, step: int, queues: dict[int, list[int]]) -> None:
+        wishes: dict[int, list[tuple[int, int]]] = {}
+        for lane, queue in queues.items():
+            index = next((i for i in queue if self.vehicles[i].route[self.vehicles[i].leg] == lane), None)
+            if index is None:
+                continue
+            vehicle, node = self.vehicles[index], self.streets.lanes[lane].end
+            if vehicle.granted > vehicle.leg:
+                continue  # it has its permission already
+            left = vehicle.starts[vehicle.leg + 1] - vehicle.along_m - vehicle.length_m / 2
+            if left < 10.0 + vehicle.speed_mps**2 / (2 * BRAKING):
+                self._crossings[node].waiting.setdefault(lane, step)
+                wishes.setdefault(node, []).append((lane, index))
+        for node in sorted(wishes):
+            self._grant(self._crossings[node], wishes[node], queues)
+
+    def _grant(self, crossing: _Crossing, wishes: list[tuple[int, int]], queues: dict[int, list[int]]) -> None:
+        others_wait = any(lane != crossing.holder for lane, _ in wishes)
+        if crossing.holder >= 0 and crossing.served >= CONVOY and others_wait and crossing.inside:
+            return  # let it empty: it is the others' turn
+        ego_lane = self._lane_of_ego(queues)
+        order = sorted(wishes, key=lambda wish: (wish[0] != ego_lane, crossing.waiting[wish[0]], wish[0]))
+        if crossing.served >= CONVOY and others_wait:
+            order.sort(key=lambda wish: wish[0] == crossing.holder)
+        for lane, index in order:
+            if crossing.inside and lane != crossing.holder:
+                continue
+            if not self._room_behind(index, queues):
+                continue
+            vehicle = self.vehicles[index]
+            crossing.served = crossing.served + 1 if lane == crossing.holder else 1
+            crossing.holder = lane
+            crossing.inside.append(index)
+            crossing.waiting.pop(lane)
+            vehicle.granted = vehicle.leg + 2
+            self._exit_claims.setdefault(vehicle.route[vehicle.granted], []).append(index)
+            return
+
+    def _lane_of_ego(self, queues: dict[int, list[int]]) -> int:
+        if self._ego < 0:
+            return -1
+        return next(lane for lane, queue in queues.items() if self._ego in queue)
+
+    def _room_behind(self, index: int, queues: dict[int, list[int]]) -> bool:
+        """Whether the lane beyond the crossing has room for the vehicle and for those already bound there."""
+        vehicle = self.vehicles[index]
+        exit_lane = vehicle.route[vehicle.leg + 2]
+        claims = self._exit_claims.get(exit_lane, [])
+        needed = vehicle.length_m + 2 * STANDSTILL_GAP_M
+        needed += sum(self.vehicles[i].length_m + 2 * STANDSTILL_GAP_M for i in claims)
+        queue = [i for i in queues.get(exit_lane, []) if i not in claims]
+        if not queue:
+            return needed < self.streets.lanes[exit_lane].length_m
+        last = self.vehicles[queue[-1]]
+        leg = last.leg - 1 if self.streets.lanes[last.route[last.leg]].turn else last.leg
+        free = last.along_m - last.starts[leg] - last.length_m / 2 + 0.5 * last.speed_mps
+        return free > needed
+
+    def _acceleration(self, index: int, queues: dict[int, list[int]]) -> float:
+        vehicle = self.vehicles[index]
+        wish = min(vehicle.cruise_mps, self._limits[vehicle.route[vehicle.leg]])
+        free = ACCELERATION * (1 - (vehicle.speed_mps / wish) ** 4)
+        accelerations = [free, self._ahead_of_turn(vehicle)]
+        gap, speed = self._leader(index, queues)
+        if gap < LOOK_AHEAD_M:
+            accelerations.append(_follow(vehicle.speed_mps, wish, gap, speed))
+        if vehicle.granted <= vehicle.leg:
+            stop = vehicle.starts[vehicle.leg + 1] - vehicle.along_m - vehicle.length_m / 2
+            if stop < LOOK_AHEAD_M:
+                accelerations.append(_follow(vehicle.speed_mps, wish, stop + STANDSTILL_GAP_M - 0.3, 0.0))
+        return float(np.clip(min(accelerations), -9.0, ACCELERATION))
+
+    def _ahead_of_turn(self, vehicle: Vehicle) -> float:
+        """Return the braking that brings it down to the next lane's speed by the time it is there."""
+        limit = self._limits[vehicle.route[vehicle.leg + 1]]
+        left = max(vehicle.starts[vehicle.leg + 1] - vehicle.along_m, 0.1)
+        if vehicle.speed_mps <= limit:
+            return ACCELERATION
+        needed = (vehicle.speed_mps**2 - limit**2) / (2 * left)
+        return -needed if needed > 0.6 * BRAKING else ACCELERATION
+
+    def _leader(self, index: int, queues: dict[int, list[int]]) -> tuple[float, float]:
+        """Return gap (metres, bumper to bumper) and speed of the next vehicle ahead."""
+        vehicle = self.vehicles[index]
+        leg = vehicle.leg - 1 if self.streets.lanes[vehicle.route[vehicle.leg]].turn else vehicle.leg
+        nearest, speed = np.inf, 0.0
+        for ahead in range(leg, min(leg + 3, len(vehicle.route))):
+            lane = vehicle.route[ahead]
+            if self.streets.lanes[lane].turn:
+                continue
+            for other in queues.get(lane, ()):
+                leader = self.vehicles[other]
+                other_leg = leader.leg - 1 if self.streets.lanes[leader.route[leader.leg]].turn else leader.leg
+                position = vehicle.starts[ahead] + leader.along_m - leader.starts[other_leg]
+                # One behind on the same lane, or on a turn of another lane's, is no leader.
+                if other == index or (position, -other) <= (vehicle.along_m, -index):
+                    continue
+                gap = position - vehicle.along_m - (leader.length_m + vehicle.length_m) / 2
+                if gap < nearest:
+                    nearest, speed = gap, leader.speed_mps
+            if nearest < np.inf:
+                break
+        return float(nearest), speed
+
+
+def _follow(speed: float, wish: float, gap: float, leader_speed: float) -> float:
+    """Return the intelligent driver model's acceleration behind a leader."""
+    approach = speed * (speed - leader_speed) / (2 * np.sqrt(ACCELERATION * BRAKING))
+    desired = STANDSTILL_GAP_M + max(0.0, speed * HEADWAY_S + approach)
+    return ACCELERATION * (1 - (speed / wish) ** 4 - (desired / max(gap, 0.1)) ** 2)
+
+
+def _speed_limit(lane: object) -> float:
+    length, turning = lane.length_m, lane.turning_rad  # type: ignore[attr-defined]
+    if not lane.turn or turning < 0.2:  # type: ignore[attr-defined]
+        return 14.0
+    return float(np.sqrt(LATERAL_ACCELERATION * length / turning))
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A pedestrian's way round a block.
+
+    Attributes:
+        loop: (P, 2) closed way, metres, the first point repeated at the end.
+        start_m: where on the loop it is at frame 0.
+        speed_mps: along the loop; negative walks it backwards, 0 stands.
+        heading_rad: which way one who stands looks.
+    """
+
+    loop: NDArray[np.float64]
+    start_m: float
+    speed_mps: float
+    heading_rad: float = 0.0
+
+    def pose(self, time_s: float, height_m: float) -> Transform:
+        """Return world_T_pedestrian at a time, feet at a height."""
+        stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.loop, axis=0), axis=1))])
+        along = (self.start_m + self.speed_mps * time_s) % stations[-1]
+        point = [np.interp(along, stations, self.loop[:, axis]) for axis in (0, 1)]
+        heading = self.heading_rad
+        if self.speed_mps:
+            step = min(int(np.searchsorted(stations, along, side="right")), len(stations) - 1)
+            ahead = (self.loop[step] - self.loop[step - 1]) * np.sign(self.speed_mps)
+            heading = float(np.arctan2(ahead[1], ahead[0]))
+        return translation((*point, height_m)) @ rotation_z(heading)
+
+
+def place_vehicles(
+    rng: np.random.Generator, streets: Streets, lengths_m: list[float], ego_lane: int, ego_along_m: float
+) -> list[Vehicle]:
+    """Put vehicles on the lanes, clear of each other; the first, the ego vehicle, where it is told, at rest."""
+    lanes = [i for i, lane in enumerate(streets.lanes) if not lane.turn]
+    taken: dict[int, list[tuple[float, float]]] = {}
+    vehicles: list[Vehicle] = []
+    for length in lengths_m:
+        turns = rng.random(997)
+        cruise = float(rng.uniform(6.0, 12.0))
+        for _ in range(1000):
+            lane = ego_lane if not vehicles else lanes[int(rng.integers(len(lanes)))]
+            room = streets.lanes[lane].length_m
+            along = ego_along_m if not vehicles else float(rng.uniform(length, room - length / 2 - 1))
+            apart = all(abs(along - other) > (length + size) / 2 + 4.0 for other, size in taken.get(lane, []))
+            if apart:
+                break
+        else:
+            continue  # the town is full
+        taken.setdefault(lane, []).append((along, length))
+        speed = 0.0 if not vehicles else min(cruise, 6.0)
+        vehicles.append(Vehicle(length, 8.5 if not vehicles else cruise, turns, [lane], [0.0], along, speed))
+    return vehicles
+
+
+def draw_walks(rng: np.random.Generator, blocks: tuple[Block, ...], count: int) -> list[Walk]:
+    """Draw pedestrians: most walk round a block, the two directions each on their own half of the sidewalk, some stand.
+
+    Those who share a block and a direction walk at one speed, so nobody walks through anybody.
+    """
+    from carlasc.simulation.meshes import closed
+    from carlasc.simulation.streets import HALF_ROAD_M
+
+    inner = [block for block in blocks if not block.outside] + [blocks[-1]] * 2
+    speeds = rng.uniform(1.0, 1.8, (len(inner), 2))
+    walks: list[Walk] = []
+    taken: dict[tuple[int, int], list[float]] = {}
+    while len(walks) < count:
+        which, way = int(rng.integers(len(blocks))), int(rng.integers(3))
+        block = blocks[which]
+        offset = HALF_ROAD_M + (1.1, 1.75, 2.3)[way]
+        loop = closed(block.outline.at(offset))
+        length = float(np.linalg.norm(np.diff(loop, axis=0), axis=1).sum())
+        start = float(rng.uniform(0, length))
+        if any(min(abs(start - other), length - abs(start - other)) < 1.0 for other in taken.get((which, way), [])):
+            continue
+        taken.setdefault((which, way), []).append(start)
+        speed = float(speeds[which, way]) * (1, -1)[way] if way < 2 else 0.0
+        walks.append(Walk(loop, start, speed, float(rng.uniform(-np.pi, np.pi))))
+    return walks
