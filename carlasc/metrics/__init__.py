@@ -1,16 +1,23 @@
 """How good a grid is: confusion matrix, IoU, completeness, the masks that say where it counts, and scores over data sets."""
 
 from carlasc.metrics.confusion import Completeness, ConfusionMatrix
+from carlasc.metrics.evaluation import Evaluation, evaluate
 from carlasc.metrics.masks import distance_band, field_of_view, known, semantickitti
+from carlasc.metrics.tables import Table, geometric_table, semantic_table
 from carlasc.metrics.truth import TruthScore, score_truth
 
 __all__ = [
     "Completeness",
     "ConfusionMatrix",
+    "Evaluation",
+    "Table",
     "TruthScore",
     "distance_band",
+    "evaluate",
     "field_of_view",
+    "geometric_table",
     "known",
     "score_truth",
+    "semantic_table",
     "semantickitti",
 ]

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from carlasc import GridSpec, layout
+from carlasc.cli import app
+from carlasc.sources import FolderSink
+
+SPEC = GridSpec("cartesian", (4, 4, 2), (-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))
+PATH = "Test/Town10_Heavy/cartesian"
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+
+
+@pytest.fixture
+def data(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("pred", "truth"):
+        writer = FolderSink(tmp_path / name).sequence(PATH)
+        writer.write_document(layout.params_file("evaluation"), json.dumps(SPEC.to_params()).encode())
+        for frame in range(2):
+            writer.write("evaluation/labels", frame, rng.integers(0, 23, SPEC.size).astype(np.uint32))
+            writer.write("evaluation/counts", frame, np.ones(SPEC.size, np.float32))
+    return tmp_path / "pred", tmp_path / "truth"
+
+
+def test_both_tables_are_printed(data):
+    result = run(*data, "--name", "Mine")
+    assert result.exit_code == 0, result.output
+    assert "mIoU w/o free" in result.output
+    assert "Precision" in result.output
+    assert result.output.count("Mine") == 2
+
+
+def test_json_csv_and_latex_hold_the_same_figures(data):
+    figures = json.loads(run(*data, "--json").output)
+    assert figures["frames"] == 2
+    assert f",{100 * figures['accuracy']:.2f}\n" in run(*data, "--csv").output
+    assert f"& {100 * figures['accuracy']:.2f} \\\\" in run(*data, "--latex").output
+
+
+def test_bands_and_views_leave_voxels_out(data):
+    whole = json.loads(run(*data, "--json").output)["voxels"]
+    near = json.loads(run(*data, "--json", "--far", "1").output)["voxels"]
+    ahead = json.loads(run(*data, "--json", "--fov", "90").output)["voxels"]
+    assert (whole, near, ahead) == (64, 16, 24)
+
+
+def test_a_missing_prediction_is_named_and_exits_1_after_the_tables(data):
+    (data[0] / PATH / "evaluation" / "000001.label").unlink()
+    result = run(*data)
+    assert result.exit_code == 1
+    assert "prediction for frame 1" in result.output
+    assert "mIoU" in result.output
+    assert run(*data, "--frames", "0:1").exit_code == 0
+
+
+def test_mistakes_are_one_line(data):
+    result = run(data[0], data[1] / "nothing")
+    assert (result.exit_code, result.output.count("\n")) == (1, 1)
+    result = run(*data, "--remap", "nonsense")
+    assert (result.exit_code, result.output.count("\n")) == (2, 1)
+    assert run(*data, "--far", "0").exit_code == 2
