@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from carlasc.errors import CarlascError, FormatError
-from carlasc.files import parse_json, write_atomic, write_json
+from carlasc.files import parse_json, remove_stale, write_atomic, write_json
 
 
 def test_a_file_is_written_with_its_folders_and_nothing_beside_it(tmp_path):
@@ -65,3 +65,28 @@ def test_json_is_written_as_the_published_files_are(tmp_path):
 def test_what_is_no_json_object_is_refused_by_name(data):
     with pytest.raises(FormatError, match="here.json: expected"):
         parse_json(data, "here.json")
+
+
+def test_what_killed_writers_left_is_removed_and_what_others_write_now_is_not(tmp_path):
+    code = (
+        "import os, signal, sys; from pathlib import Path; from carlasc.files import write_atomic\n"
+        "write_atomic(Path(sys.argv[1]), lambda file: os.kill(os.getpid(), signal.SIGKILL))"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "velodyne/000000.bin")], check=False)
+    assert [path.suffix for path in (tmp_path / "velodyne").iterdir()] == [".part"]
+
+    def sweep(file):
+        remove_stale(tmp_path)
+        file.write(b"whole")
+
+    write_atomic(tmp_path / "velodyne" / "000001.bin", sweep)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "velodyne").iterdir()} == {"000001.bin": b"whole"}
+
+
+def test_what_other_machines_left_is_removed_when_it_is_a_day_old(tmp_path):
+    new, old = tmp_path / ".a.bin.elsewhere-1.x.part", tmp_path / ".b.bin.elsewhere-1.x.part"
+    for path in (new, old):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    remove_stale(tmp_path)
+    assert list(tmp_path.iterdir()) == [new]

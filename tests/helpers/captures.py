@@ -1,0 +1,42 @@
+"""Small captures made on the spot, and folders as dictionaries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from carlasc.capture import Capture, CaptureWriter, Recording
+from carlasc.geometry import rotation_z, translation
+from carlasc.scans import Scan
+
+
+def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> Recording:
+    """Return a scan of random points around the sensor, some on actors that move, at a random level pose."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform((-20, -20, -2), (20, 20, 1), (points, 3)).astype(np.float32)
+    instances = rng.integers(0, actors + 1, points).astype(np.uint32)
+    labels = np.where(instances > 0, 10, rng.integers(0, 23, points)).astype(np.uint32)
+    velocities = np.column_stack([np.arange(1, actors + 1), rng.normal(size=(actors, 3))])
+    pose = translation(rng.uniform(-5, 5, 3)) @ rotation_z(rng.uniform(-np.pi, np.pi))
+    return Recording(Scan(xyz, labels, None, instances), pose, velocities)
+
+
+def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 100, points: int = 300) -> Capture:
+    """Write a capture of random recordings below `root` and return it; frame f has a picture that says so."""
+    writer = CaptureWriter(root)
+    for frame in range(first, first + frames):
+        for sensor in range(sensors):
+            writer.write(sensor, frame, make_recording(points, seed=1000 * sensor + frame))
+            writer.write_time(sensor, frame, frame * 0.1)
+        writer.write_bev(frame, f"picture {frame}".encode())
+    return Capture(root)
+
+
+def read_tree(folder: Path, leave_out: str = "raw") -> dict[str, bytes]:
+    """Return every file below a folder by its path, hidden ones included, a folder of that name left out."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and leave_out not in path.relative_to(folder).parts
+    }
