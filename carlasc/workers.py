@@ -45,9 +45,7 @@ def run_all(
         ArgumentError: no positive number of workers.
         CarlascError: a worker died.
     """
-    if workers is not None and workers < 1:
-        raise ArgumentError(f"workers: expected at least 1, found {workers}")
-    workers = workers or count_cores()
+    workers = count_workers(workers)
     if executor is not None:
         yield from _submit_all(executor, function, items, 2 * workers)
     elif min(workers, len(items)) <= 1:
@@ -57,9 +55,17 @@ def run_all(
             yield from _submit_all(pool, _Task(function), items, 2 * workers)
 
 
-def count_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+def count_workers(workers: int | None) -> int:
+    """Return the number of workers that is asked for: as many as this process may use cores if None.
+
+    Raises:
+        ArgumentError: no positive number.
+    """
+    if workers is None:
+        return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if workers < 1:
+        raise ArgumentError(f"workers: expected at least 1, found {workers}")
+    return workers
 
 
 def _submit_all(

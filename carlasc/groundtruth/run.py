@@ -31,7 +31,7 @@ from carlasc.groundtruth.voting import Ballot, VoteRule, count_votes
 from carlasc.labels import ClassTable
 from carlasc.sources.base import SequenceWriter, Sink
 from carlasc.sources.folder import FolderSink
-from carlasc.workers import run_all
+from carlasc.workers import count_workers, run_all
 
 Outputs = dict[str, NDArray[Any]]
 
@@ -176,7 +176,7 @@ def regrid(
         ConflictError: what is there is published data, or of other settings, or of other scans: nothing of it is touched.
         StorageError: the disk is full or the output cannot be written to. What was written is whole.
     """
-    start = time.perf_counter()
+    start, workers = time.perf_counter(), count_workers(workers)
     sink = sink if isinstance(sink, Sink) else FolderSink(default_sink(source) if sink is None else sink)
     Ballot(
         GridSpec(spec.coordinates, (1, 1, 1), spec.lower, spec.upper), vote=vote, free_step_m=free_step_m
