@@ -252,7 +252,9 @@ class Source(ABC):
 
 
 class SequenceWriter(ABC):
-    """Takes one sequence. What `write` has returned from is there whole, whatever happens next.
+    """Takes one sequence. In a folder, what `write` has returned from is there whole, whatever happens next.
+
+    A packed store is there whole once its sink is closed, and not before.
 
     Attributes:
         location: what to call it in errors.
@@ -317,6 +319,18 @@ class Sink(ABC):
     @abstractmethod
     def sequence(self, path: str) -> SequenceWriter:
         """Start, or go on with, the sequence at a path such as "Train/Town01_Light/cartesian"."""
+
+    def close(self) -> None:  # noqa: B027 (a folder has nothing to finish)
+        """Finish: a packed store stands in its place from here on. Not called when the work failed."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
 
 
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:

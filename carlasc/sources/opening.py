@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.sources.base import Source
 from carlasc.sources.folder import FolderSource
+from carlasc.sources.packed import Options, PackedSink
 from carlasc.sources.published import PublishedSource
 from carlasc.sources.trees import LocalTree, RemoteTree, Tree
 from carlasc.sources.zipped import ZipTree
@@ -48,6 +49,23 @@ def open(path: str | os.PathLike[str], **storage_options: Any) -> Source:
     raise MissingDataError(f"{local}: expected a folder, a zip or a packed store, found nothing: check the path")
 
 
+def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
+    """Start a packed store, of the kind that its ending says: `.zarr`, `.h5` (`.hdf5`), `.parquet`.
+
+    Raises:
+        ArgumentError: another ending, or an option that the store does not have.
+        ConflictError: something is in its place, and `overwrite` is not given.
+        DependencyError: a package is missing.
+    """
+    if path.suffix == ".zarr":
+        from carlasc.sources.zarr_store import ZarrSink
+
+        return ZarrSink(path, options, overwrite)
+    raise ArgumentError(
+        f"{path}: expected a store ending in .zarr, .h5 or .parquet, found {path.suffix or 'no ending'}"
+    )
+
+
 def _open_remote(tree: RemoteTree) -> Source:
     if tree.size() is not None:
         return _open_file(tree, "")
@@ -61,6 +79,10 @@ def _open_remote(tree: RemoteTree) -> Source:
 
 def _open_store(tree: Tree) -> Source | None:
     """Open a packed store that is a folder; None where the folder is none."""
+    if tree.is_file("zarr.json"):
+        from carlasc.sources.zarr_store import ZarrSource
+
+        return ZarrSource(tree)
     return None
 
 
