@@ -217,4 +217,3 @@ def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[floa
         distances.append((above + below) / (2 * tangent))
         shifts.append((above - below) / 2)
     return float(max(*distances, 0.1)), (float(shifts[0]), float(shifts[1]))
-

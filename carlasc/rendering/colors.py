@@ -45,10 +45,20 @@ _RAMP = np.array(  # viridis at five places: lightness rises throughout
 
 
 class Entry(NamedTuple):
-    """A line of the legend."""
+    """A line of the legend.
+
+    Attributes:
+        name: what the colour stands for.
+        color: RGB.
+        order: where it stands: a class's id; what is no class comes before (below 0) or after (`AFTER_CLASSES` and more).
+    """
 
     name: str
     color: Color
+    order: int = 0
+
+
+AFTER_CLASSES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,9 @@ class ClassColors:
         """Return the legend of some classes, sorted by id; free (0) has none."""
         colors = self.by_id
         return [
-            Entry(self.table.names.get(i, f"class {i}"), as_color(colors[i])) for i in sorted(ids) if i and i < len(colors)
+            Entry(self.table.names.get(i, f"class {i}"), as_color(colors[i]), i)
+            for i in sorted(ids)
+            if i and i < len(colors)
         ]
 
 
@@ -88,7 +100,7 @@ def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
         family = CARLASC11.names[group].lower()
         members = sorted(
             (i for i in table.names if groups.get(i, 3) == group),
-            key=lambda i: (table.names[i].lower() not in (family, family.removesuffix("s")), i),  # noqa: B023 (used at once)
+            key=lambda i: (table.names[i].lower() not in (family, family.removesuffix("s")), i),
         )
         for number, member in enumerate(members):
             # the one of the group's name, or the first, has its colour; the others come ever nearer to white (to black where that is light)
@@ -109,8 +121,8 @@ def height_entries(lower: float, upper: float) -> list[Entry]:
     """Return the legend of `height_colors`."""
     heights = np.linspace(lower, upper, len(_RAMP))
     return [
-        Entry(f"{height:+.1f} m", as_color(color))
-        for height, color in zip(heights, height_colors(heights, lower, upper), strict=True)
+        Entry(f"{height:+.1f} m", as_color(color), number - len(_RAMP))
+        for number, (height, color) in enumerate(zip(heights, height_colors(heights, lower, upper), strict=True))
     ]
 
 
@@ -135,3 +147,8 @@ def _groups(table: ClassTable) -> dict[int, int]:
     if to_carla is None:
         return {i: 0 if i == 0 else 1 + (i - 1) % 10 for i in table.names}
     return {i: (eleven[to_carla.mapping[i]] or 3) if i else 0 for i in table.names}
+
+
+def merge_legends(legends: Iterable[Iterable[Entry]]) -> list[Entry]:
+    """Return the entries of several legends, each once, in their order."""
+    return sorted(dict.fromkeys(entry for legend in legends for entry in legend), key=lambda entry: entry.order)

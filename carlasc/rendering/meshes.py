@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -109,7 +110,7 @@ def _faces(
 
     across, along = (axis + 1) % 3, (axis + 2) % 3
     edges = [spec.edges(a) for a in range(3)]
-    corners = np.empty((len(cells), 4, 3))
+    corners: NDArray[np.floating] = np.empty((len(cells), 4, 3))
     openness = np.empty((len(cells), 4), np.float32)
     for number, (first, second) in enumerate(_SQUARE):
         offset = np.zeros(3, np.int64)
@@ -206,7 +207,7 @@ def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: Ar
     neck, tip = tails + vectors - head * forward, tails + vectors
     angles = np.arange(7) * (np.pi / 3)
     faces = []
-    for one, two in zip(angles[:-1], angles[1:], strict=True):
+    for one, two in pairwise(angles):
         a, b = (np.cos(angle) * right + np.sin(angle) * up for angle in (one, two))
         thin, thick = width / 2, np.minimum(1.5 * width, head / 2)
         faces += [

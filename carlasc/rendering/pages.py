@@ -124,7 +124,9 @@ def _draw_entry(draw: Any, font: Any, size: int, entry: Entry, x: int, y: int) -
     middle = y + _line(size) / 2
     top = round(middle - swatch / 2)
     if entry.color != _NO_SWATCH:
-        draw.rounded_rectangle((x, top, x + swatch, top + swatch), max(2, size // 6), entry.color, _outline(entry.color))
+        draw.rounded_rectangle(
+            (x, top, x + swatch, top + swatch), max(2, size // 6), entry.color, _outline(entry.color)
+        )
     draw.text((x + swatch + round(size * 0.45), middle), entry.name, _INK, font, anchor="lm")
 
 
@@ -210,7 +212,9 @@ def _wrap(widths: list[int], room: int, gap: int) -> list[list[int]]:
     """Break entries into as few rows as they need, and these about equally long."""
     fewest = len(_fill(widths, room, gap))
     limits = range(max(widths), room, 4)
-    return next((rows for limit in limits if len(rows := _fill(widths, limit, gap)) == fewest), _fill(widths, room, gap))
+    return next(
+        (rows for limit in limits if len(rows := _fill(widths, limit, gap)) == fewest), _fill(widths, room, gap)
+    )
 
 
 def _fill(widths: list[int], limit: int, gap: int) -> list[list[int]]:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
+from carlasc.geometry import Transform
 from carlasc.grids import Grid
 from carlasc.labels import CARLA, ClassTable
-from carlasc.rendering.cameras import Camera, Viewpoint, birdseye_camera, perspective_camera
-from carlasc.rendering.colors import ClassColors, Entry, PaletteName
+from carlasc.rendering.cameras import Viewpoint, birdseye_camera, perspective_camera
+from carlasc.rendering.colors import ClassColors, Entry, PaletteName, merge_legends
 from carlasc.rendering.pages import Page, draw_page, plan_page
 from carlasc.rendering.scenes import Extent, Scene, error_scene, flow_scene, grid_scene, scan_scene
 from carlasc.scans import Scan
@@ -31,13 +32,13 @@ class Panel:
         scene: what is drawn.
         view: "perspective" or "bev".
         title: what stands above it.
-        camera: a camera that stands fast; None places it by the viewpoint.
+        standpoint: for a camera that does not move with the scene: what it shows, and scene_T_standpoint from there.
     """
 
     scene: Scene
     view: View = "perspective"
     title: str = ""
-    camera: Camera | None = None
+    standpoint: tuple[Extent, Transform] | None = None
 
 
 def draw_panels(
@@ -68,7 +69,9 @@ def draw_panels(
     for panel in panels:
         if panel.view not in VIEWS:
             raise ArgumentError(f"view {panel.view!r}: expected one of {', '.join(VIEWS)}")
-    entries = (merge_legends([p.scene.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
+    entries = (
+        (merge_legends([p.scene.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
+    )
     page = plan_page(
         size,
         len(panels),
@@ -76,7 +79,9 @@ def draw_panels(
         legend=entries,
         aspect=float(np.mean([1.0 if panel.view == "bev" else 16 / 9 for panel in panels])),
     )
-    pictures = [_draw(panel, page, number, viewpoint or Viewpoint(), left_handed) for number, panel in enumerate(panels)]
+    pictures = [
+        _draw(panel, page, number, viewpoint or Viewpoint(), left_handed) for number, panel in enumerate(panels)
+    ]
     return draw_page(page, pictures, [panel.title for panel in panels], [panel.scene.note for panel in panels])
 
 
@@ -211,18 +216,14 @@ def render_comparison(
     return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed)
 
 
-def merge_legends(legends: Sequence[Sequence[Entry]]) -> list[Entry]:
-    """Return the entries of several legends, each once, in the order in which they first stand in one."""
-    return list(dict.fromkeys(entry for legend in legends for entry in legend))
-
-
 def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, left_handed: bool) -> NDArray[np.uint8]:
     box = page.panels[number]
     aspect = box.width / box.height
-    if panel.camera is not None:
-        camera = panel.camera
-    elif panel.view == "bev":
-        camera = birdseye_camera(panel.scene.extent, aspect, left_handed=left_handed)
+    extent = panel.scene.extent if panel.standpoint is None else panel.standpoint[0]
+    if panel.view == "bev":
+        camera = birdseye_camera(extent, aspect, left_handed=left_handed)
     else:
-        camera = perspective_camera(panel.scene.extent, viewpoint, aspect, left_handed=left_handed)
+        camera = perspective_camera(extent, viewpoint, aspect, left_handed=left_handed)
+    if panel.standpoint is not None:
+        camera = camera.moved(panel.standpoint[1])
     return panel.scene.draw(camera, box.width, box.height, left_handed=left_handed)

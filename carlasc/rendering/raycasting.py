@@ -164,7 +164,23 @@ def _shadow_rays(normals, quad, origins, directions, depth, suns, which):  # typ
 
 @numba.njit(cache=True, fastmath=True)
 def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    extents, normals, colors, openness, edges, sky, suns, which, quad, u, v, depth, shadowed, footprint, flat, out, out_depth
+    extents,
+    normals,
+    colors,
+    openness,
+    edges,
+    sky,
+    suns,
+    which,
+    quad,
+    u,
+    v,
+    depth,
+    shadowed,
+    footprint,
+    flat,
+    out,
+    out_depth,
 ):
     """Light every sample that a ray found, and write it where it is nearer than what is there."""
     for i in range(len(quad)):
@@ -190,7 +206,7 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
         for e in range(4):
             if not edges[q, e]:
                 continue
-            if e == 0 or e == 2:
+            if e % 2 == 0:
                 other = extents[q, 1]
                 distance = (t if e == 0 else 1 - t) * other
             else:

@@ -11,7 +11,7 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.grids import Grid, GridSpec
 from carlasc.rendering import colors as palette
 from carlasc.rendering.cameras import Camera
-from carlasc.rendering.colors import ClassColors, Entry
+from carlasc.rendering.colors import AFTER_CLASSES, ClassColors, Entry
 from carlasc.rendering.meshes import QuadMesh, arrows, box, footprint, grid_mesh, join, quads
 from carlasc.rendering.raycasting import cast, empty_frame
 from carlasc.rendering.splats import splat
@@ -106,7 +106,7 @@ def error_scene(prediction: Grid, truth: Grid, *, ego: bool = True) -> Scene:
     for _, color, where in kinds:
         voxel_colors[where & truth.known] = color
         drawn |= where & truth.known
-    legend = [Entry(name, color) for name, color, _ in kinds]
+    legend = [Entry(name, color, AFTER_CLASSES + number) for number, (name, color, _) in enumerate(kinds)]
     return _voxel_scene(truth.spec, voxel_colors, drawn, legend, "no known voxel is occupied in either", ego)
 
 
@@ -122,7 +122,7 @@ def scan_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
         by_id = colors.by_id.copy()
         by_id[0] = palette.UNLABELLED
         ids = np.flatnonzero(np.bincount(points.labels, minlength=1)).tolist()
-        unlabelled = [Entry("unlabelled", palette.UNLABELLED)] if 0 in ids else []
+        unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
         point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids)
     note = None if len(points) else "the scan has no point"
     return Scene(extent, _ego_vehicle() if ego else None, points.points, point_colors, legend, note)
@@ -140,7 +140,7 @@ def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
     flow = np.asarray(points.flow)
     moving = np.linalg.norm(flow, axis=1) > _MOVING_M_S
     point_colors = np.full((len(points), 3), palette.STATIC, np.uint8)
-    legend = [Entry("standing", palette.STATIC)]
+    legend = [Entry("standing", palette.STATIC, -1)]
     if points.labels is not None:
         colors.table.check(points.labels, "scan labels")
         point_colors[moving] = colors.by_id[points.labels[moving]]
@@ -149,7 +149,7 @@ def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
     meshes = [_ego_vehicle()] if ego else []
     if len(tails):
         meshes.append(arrows(tails, vectors, palette.ARROW, 0.28))
-        legend.append(Entry("velocity (way of 1 s)", palette.ARROW))
+        legend.append(Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES))
     note = None if len(tails) else "nothing moves"
     return Scene(extent, join(meshes) if meshes else None, points.points, point_colors, legend, note)
 
@@ -211,5 +211,5 @@ def _ego_vehicle() -> QuadMesh:
 
 
 def _finite(scan: Scan) -> Scan:
-    keep = np.isfinite(scan.points).all(axis=1)
+    keep = np.asarray(np.isfinite(scan.points).all(axis=1))
     return scan if keep.all() else scan.select(keep)

@@ -73,7 +73,9 @@ def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma
             behind = np.float32(0.0)
             for dy in (-reach, 0, reach):
                 for dx in (-reach, 0, reach):
-                    behind += min(np.float32(1.5), max(np.float32(0.0), depth[y, x] - depth[y + dy, x + dx] - np.float32(0.15)))
+                    behind += min(
+                        np.float32(1.5), max(np.float32(0.0), depth[y, x] - depth[y + dy, x + dx] - np.float32(0.15))
+                    )
             light = np.exp(-0.12 * behind)
             for c in range(3):
                 out[y, x, c] = np.uint8(out[y, x, c] * light)
