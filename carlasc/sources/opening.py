@@ -61,6 +61,10 @@ def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
         from carlasc.sources.zarr_store import ZarrSink
 
         return ZarrSink(path, options, overwrite)
+    if path.suffix in (".h5", ".hdf5"):
+        from carlasc.sources.hdf5_store import HDF5Sink
+
+        return HDF5Sink(path, options, overwrite)
     raise ArgumentError(
         f"{path}: expected a store ending in .zarr, .h5 or .parquet, found {path.suffix or 'no ending'}"
     )
@@ -97,6 +101,10 @@ def _open_file(tree: Tree, name: str) -> Source:
     if signature.startswith((_ZIP, _EMPTY_ZIP)):
         inside = ZipTree(tree, name)
         return _open_store(inside) or PublishedSource(inside)
+    if signature.startswith(_HDF5):
+        from carlasc.sources.hdf5_store import HDF5Source
+
+        return HDF5Source(tree, name)
     if signature.startswith(_PARQUET):
         raise FormatError(f"{where}: expected a packed store, found one of its files: give the folder that it is in")
     raise FormatError(f"{where}: expected a folder, a zip, or a packed store, found a file that is none of these")

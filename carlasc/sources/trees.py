@@ -205,6 +205,13 @@ class RemoteTree(Tree):
         parts = zip(found, starts, ends, urls, strict=True)
         return [check_length(bytes(data), end - start, url) for data, start, end, url in parts]
 
+    def open(self, path: str) -> Any:
+        """Open a file for reading, as an object for libraries that want one: it reads blocks as they are needed."""
+        try:
+            return self._fs.open(self.where(path), "rb", cache_type="blockcache", block_size=1 << 18)
+        except Exception as error:  # noqa: BLE001
+            _fail(self.where(path), error)
+
     def size(self, path: str = "") -> int | None:
         """Return a file's size in bytes, None where there is no such file, or a folder (or a page that lists one).
 

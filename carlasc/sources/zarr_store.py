@@ -29,7 +29,7 @@ from carlasc.sources.trees import LocalTree, Tree
 
 METADATA = "zarr.json"
 _SHARD = 32 << 20  # bytes of a shard before compression: held back while one is filled
-_MOST_CHUNKS = 1024  # of a shard: its index is read whole
+_MOST_CHUNKS = 256  # of a shard: its index is read whole
 _CHECKSUM = 4
 _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}
 
