@@ -1,0 +1,134 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from helpers.captures import read_tree, write_capture
+from typer.testing import CliRunner
+
+from carlasc.cli import app
+from carlasc.cli.regrid import Coordinates, Preset, parse_grid
+from carlasc.errors import ArgumentError
+from carlasc.grids import GridSpec
+
+
+@pytest.fixture
+def capture(tmp_path, monkeypatch):
+    write_capture(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def _regrid(*options):
+    return CliRunner().invoke(app, ["regrid", "--workers", "1", *map(str, options)])
+
+
+def test_inside_a_sequences_folder_res_is_all_it_needs(capture):
+    result = _regrid("--res", 0.2)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.splitlines()[0] == "cartesian/evaluation_256x256x15"
+    assert "cartesian 256 x 256 x 15: 3 frames made in" in result.stdout
+    assert result.stderr == ""  # no bar where there is no terminal
+    assert (capture / "cartesian/evaluation_256x256x15/000002.bin").stat().st_size == 256 * 256 * 15 * 4
+    assert "0 frames made (3 were there)" in _regrid("--res", 0.2).stdout
+
+
+def test_the_published_cartesian_grid_is_called_evaluation_and_another_of_its_size_is_not(capture):
+    assert _regrid("--preset", "coarse", "-o", "out").exit_code == 0
+    assert _regrid("--res", 0.4, "-o", "out").exit_code == 0
+    grids = {path.parent.name for path in (capture / "out/cartesian").glob("*/params.json")}
+    assert grids == {"evaluation", "evaluation_128x128x8"}
+
+
+def test_every_option_reaches_the_run(capture):
+    options = ["--size", "16,12,4", "--bounds", "-8,8,-6,6,-2,1", "--free-step", 0.5, "--vote", "sample"]
+    result = _regrid(capture, "-o", "out", *options, "--frames", "101:", "--keep-votes", "--name", "mine", "--json")
+    assert result.exit_code == 0, result.stderr
+    printed = json.loads(result.stdout)
+    assert (printed["made"], printed["skipped"], printed["failures"]) == (2, 0, [])
+    assert printed["grids"] == ["out/cartesian/mine"]
+    params = json.loads((capture / "out/cartesian/mine/params.json").read_bytes())
+    record = params.pop("carlasc")
+    assert params == GridSpec("cartesian", (16, 12, 4), (-8, -6, -2), (8, 6, 1)).to_params()
+    assert (record["free_step_m"], record["vote"], record["frames"]) == (0.5, "sample", "101:")
+    assert sorted(name.split("/")[-1] for name in read_tree(capture / "out/cartesian/mine")) == [
+        *("000000.bin", "000000.label", "000000.votes.npz", "000001.bin", "000001.label", "000001.votes.npz"),
+        "params.json",
+    ]
+
+
+def test_other_settings_need_overwrite_or_another_name(capture):
+    assert _regrid("--preset", "coarse").exit_code == 0
+    refused = _regrid("--preset", "coarse", "--free-step", 1)
+    assert refused.exit_code == 1
+    (line,) = refused.stderr.splitlines()
+    assert "free_step_m 1.5 where this run has 1.0" in line and "--overwrite" in line
+    assert _regrid("--preset", "coarse", "--free-step", 1, "--name", "other").exit_code == 0
+    assert _regrid("--preset", "coarse", "--free-step", 1, "--overwrite").exit_code == 0
+
+
+def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
+    np.save(capture / "raw/velodyne1/101.npy", np.zeros((300, 3)))
+    result = _regrid("--preset", "coarse")
+    assert result.exit_code == 1
+    assert "2 frames made" in result.stdout
+    first, last = result.stderr.splitlines()
+    assert "velodyne1/101.npy: expected float32 values, found float64" in first
+    assert "1 of 3 frames failed" in last
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "expected one of --res, --size and --preset, found none of them"),
+        (["--res", 0.2, "--preset", "fine"], "found --res and --preset"),
+        (["--res", 0], "expected one or three positive numbers, found 0.0"),
+        (["--res", -0.2], "expected one or three positive numbers, found -0.2"),
+        (["--res", "nan"], "expected one or three positive numbers, found nan"),
+        (["--res", "0.2,0.2"], "--res: expected 1 or 3 numbers"),
+        (["--res", "fine"], "--res: expected 1 or 3 numbers"),
+        (["--res", 1e-4], "expected fewer than 2^31 cells"),
+        (["--size", "0,10,10"], "expected at least one cell an axis"),
+        (["--size", "1.5,10,10"], "--size: expected 3 whole numbers"),
+        (["--res", 0.2, "--bounds", "1,-1,0,1,0,1"], "expected lower < upper on every axis"),
+        (["--res", 0.2, "--bounds", "1,2,3"], "--bounds: expected 6 numbers"),
+        (["--preset", "coarse", "--bounds", "0,1,0,1,0,1"], "--bounds: expected --res or --size with it"),
+        (["--preset", "cylindrical", "--coordinates", "cartesian"], "expected no --coordinates, or cylindrical"),
+        (["--preset", "huge"], "'huge'"),
+        (["--preset", "coarse", "--vote", "twice"], "'twice'"),
+        (["--preset", "coarse", "--free-step", 0], "free step: expected a positive number"),
+        (["--preset", "coarse", "--frames", "9:3"], "--frames: expected a range that holds a frame"),
+        (["--preset", "coarse", "--frames", "-3:"], "frames: expected a half-open range of frame numbers from 0"),
+        (["--preset", "coarse", "--name", "a/b"], "name: expected letters"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_2(capture, options, message):
+    result = _regrid(*options)
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.split())
+    assert not (capture / "cartesian").exists()
+
+
+def test_a_folder_without_a_capture_is_1(tmp_path):
+    result = _regrid(tmp_path, "--res", 0.2)
+    assert result.exit_code == 1
+    assert "expected a capture" in result.stderr
+    assert "expected a folder, found nothing" in _regrid(tmp_path / "nowhere", "--res", 0.2).stderr
+
+
+def test_presets_are_the_published_grids_in_the_coordinates_asked_for():
+    published = GridSpec.published
+    assert parse_grid(None, None, Preset.coarse, None, None) == published("cartesian")
+    assert parse_grid(None, None, Preset.fine, None, None) == published("cartesian_fine")
+    assert parse_grid(None, None, Preset.cylindrical, None, None) == published("cylindrical")
+    assert parse_grid(None, None, Preset.coarse, Coordinates.cylindrical, None) == published("cylindrical")
+
+
+def test_degrees_end_at_the_command_line():
+    spec = parse_grid("0.5,3,0.5", None, None, Coordinates.cylindrical, "0,20,-90,90,-2,1")
+    assert spec.size == (40, 60, 6)
+    assert spec.lower[1] == np.float32(-math.pi / 2) and spec.upper[1] == np.float32(math.pi / 2)
+    whole = parse_grid(None, "8,8,4", None, Coordinates.cylindrical, "0,20,-180,180,-2,1")
+    assert whole.lower[1] == GridSpec.published("cylindrical").lower[1]
+    with pytest.raises(ArgumentError, match="at most 2 pi"):
+        parse_grid(None, "8,8,4", None, Coordinates.cylindrical, "0,20,-190,180,-2,1")
