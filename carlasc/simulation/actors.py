@@ -11,6 +11,7 @@ from carlasc.errors import ArgumentError
 from carlasc.geometry import Transform
 from carlasc.layout import FRAME_PERIOD_S
 from carlasc.simulation.meshes import Mesh
+from carlasc.simulation.plan import KERB_M
 from carlasc.simulation.shapes import (
     EGO_KIND,
     GAIT_PHASES,
@@ -20,7 +21,7 @@ from carlasc.simulation.shapes import (
     two_wheeler_mesh,
     vehicle_mesh,
 )
-from carlasc.simulation.town import KERB_M, Town
+from carlasc.simulation.town import Town
 from carlasc.simulation.traffic import Traffic, Walk, draw_walks, place_vehicles
 
 TRAFFIC = {"light": 25, "medium": 50, "heavy": 100}

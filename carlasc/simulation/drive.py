@@ -17,7 +17,7 @@ from carlasc.errors import ArgumentError
 from carlasc.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.scans import Scan
 from carlasc.simulation.actors import EGO_ID, Actor, Population
-from carlasc.simulation.lidar import Lidar, RayScene
+from carlasc.simulation.lidar import Lidar, RayScene, turned
 from carlasc.simulation.meshes import Mesh
 from carlasc.simulation.town import Town, build_town
 
@@ -25,7 +25,7 @@ EGO_SENSOR_M = (-0.5, 0.0, 1.8)  # in the vehicle's frame (FORMAT section 3)
 SPREAD_M = 20.0  # the other sensors are within this of the vehicle, in x and y
 HEIGHTS_M = (1.0, 5.0)
 REFERENCE_SPREAD_M = 25.6  # half the width of the published grid
-CROP_MARGIN_M = 40.0  # sensors may be this far from the ego vehicle
+CROP_MARGIN_M = 37.0  # sensors may be this far from the ego vehicle
 
 # What each stream of random numbers is for: the seed's second word.
 _TOWN, _POPULATION, _SENSORS, _NOISE, _REFERENCE = range(5)
@@ -168,11 +168,13 @@ class Drive:
         ego = self.ego_pose(frame)
         reach = self.lidar.range_m + CROP_MARGIN_M
         actors = {actor.id: actor for actor in self._population.at(frame)}
-        near = [actor for actor in actors.values() if np.abs(actor.world_T_actor[:2, 3] - ego[:2, 3]).max() < reach]
+        near = [
+            actor for actor in actors.values() if np.hypot(*(actor.world_T_actor[:2, 3] - ego[:2, 3])) < reach + 6.0
+        ]
         low, high = self._extents
-        keep = ((low <= ego[:2, 3] + reach) & (high >= ego[:2, 3] - reach)).all(axis=1)
-        static = self.town.mesh
-        meshes = [Mesh(static.vertices, static.faces[keep], static.labels[keep])]
+        nearest = np.clip(ego[:2, 3], low, high) - ego[:2, 3]
+        keep = (nearest**2).sum(axis=1) < reach**2
+        meshes = [self.town.mesh.select(keep)]
         meshes += [actor.mesh.moved(actor.world_T_actor) for actor in near]
         counts = [len(mesh.faces) for mesh in meshes]
         instances = np.repeat(np.array([0, *(actor.id for actor in near)], np.uint32), counts)
@@ -188,7 +190,7 @@ class Drive:
     def _observe(self, frame: int, world_T_sensor: Transform, rng: np.random.Generator) -> Recording:
         """Scan from a pose. Noise is drawn for every ray, so that what one ray hits changes no other's point."""
         snapshot, lidar = self.snapshot(frame), self.lidar
-        world_rays = rotate_vectors(world_T_sensor, lidar.directions)
+        world_rays = turned(world_T_sensor, lidar.directions)
         rays, triangles, distances = snapshot.scene.cast(world_T_sensor[:3, 3], world_rays, lidar.range_m)
         noise = rng.uniform(-lidar.noise_m, lidar.noise_m, lidar.directions.shape)
         labels, instances = snapshot.mesh.labels[triangles], snapshot.instances[triangles]

@@ -34,6 +34,14 @@ class Mesh:
         """Return the mesh in the frame `dst`."""
         return Mesh(transform_points(dst_T_src, self.vertices), self.faces, self.labels)
 
+    def select(self, keep: NDArray[np.bool_]) -> Mesh:
+        """Return the mesh of some triangles, chosen by a mask (F,), without the vertices that no other uses."""
+        faces = self.faces[keep]
+        used = np.zeros(len(self.vertices), np.bool_)
+        used[faces] = True
+        renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return Mesh(self.vertices[used], renumbered[faces], self.labels[keep])
+
     @property
     def triangles(self) -> NDArray[np.float64]:
         """(F, 3, 3) corners of each triangle."""
@@ -86,6 +94,22 @@ class MeshBuilder:
         moved = _turned(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,))) + base[:, None, :]
         offsets = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
         self.add(label, moved.reshape(-1, 3), (faces + offsets).reshape(-1, 3))
+
+    def decals(self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0) -> None:
+        """Add level rectangles: paint on a road.
+
+        Args:
+            label: class.
+            centre: (3,) or (N, 3).
+            size: (2,) or (N, 2), extent along the rectangle's own x and y.
+            yaw_rad: how they are turned.
+        """
+        centre, size = np.atleast_2d(np.asarray(centre, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
+        local = corners * lifted(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
+        moved = _turned(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
+        first = np.arange(len(centre), dtype=np.int32)[:, None, None] * np.int32(4)
+        self.add(label, moved.reshape(-1, 3), (np.array([[0, 1, 2], [0, 2, 3]]) + first).reshape(-1, 3))
 
     def cylinder(
         self, label: int, base: ArrayLike, radius: float, height: float, sections: int = 8, top: float = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ class Rectangle:
     size: tuple[float, float]
     yaw_rad: float
 
-    @property
+    @cached_property
     def axes(self) -> Points:
         """(2, 2) unit vectors of its own x and y, a row each."""
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
@@ -36,9 +37,10 @@ class Rectangle:
 
     def contains(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Return which points (..., 2) are inside, or within a margin outside."""
-        return (np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m).all(axis=-1)
+        inside: NDArray[np.bool_] = np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m
+        return np.asarray(inside.all(axis=-1))
 
-    @property
+    @cached_property
     def corners(self) -> Points:
         """(4, 2) corners."""
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
@@ -46,11 +48,13 @@ class Rectangle:
 
     def overlaps(self, other: Rectangle, margin_m: float = 0.0) -> bool:
         """Whether two rectangles are nearer than a margin: no axis of either separates them."""
-        for axis in np.concatenate([self.axes, other.axes]):
-            a, b = self.corners @ axis, other.corners @ axis
-            if a.max() + margin_m <= b.min() or b.max() + margin_m <= a.min():
-                return False
-        return True
+        reach = (float(np.hypot(*self.size)) + float(np.hypot(*other.size))) / 2 + margin_m
+        if float(np.hypot(*(self.centre - other.centre))) > reach:
+            return False
+        axes = np.concatenate([self.axes, other.axes])
+        a, b = self.corners @ axes.T, other.corners @ axes.T
+        apart = (a.max(axis=0) + margin_m <= b.min(axis=0)) | (b.max(axis=0) + margin_m <= a.min(axis=0))
+        return not bool(apart.any())
 
 
 @dataclass

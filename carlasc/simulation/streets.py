@@ -189,7 +189,7 @@ def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Point
     for pick in rng.permutation(len(inner)):  # a street left out leaves two T-crossings and one longer block
         a, b = inner[pick]
         around = {a, b, a + columns, b + columns, a - columns, b - columns}
-        inside = 0 < a % columns and b % columns < columns - 1
+        inside = a % columns > 0 and b % columns < columns - 1
         if inside and not touched & around and len(dropped) < (rows * columns) // 8:
             dropped.add((a, b))
             touched |= around

@@ -1,7 +1,7 @@
 """How vehicles and pedestrians move: vehicles follow each other along lanes and take turns at crossings, pedestrians walk round blocks.
 
-Car following is the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A crossing is given to the lanes that lead to it
-one at a time, and a vehicle enters it only where there is room behind it on the far side: so nobody meets anybody on it.
+Car following is the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A vehicle enters a crossing only while
+nobody on it drives a way that meets its own, and where there is room for it on the far side: so nobody is met or left standing there.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from carlasc.geometry import Transform, rotation_z, translation
 from carlasc.layout import FRAME_PERIOD_S
-from carlasc.simulation.streets import Block, Streets
+from carlasc.simulation.meshes import closed
+from carlasc.simulation.streets import HALF_ROAD_M, Block, Lane, Streets
 
 ACCELERATION = 1.8  # m/s^2
 BRAKING = 2.5  # m/s^2, comfortable
@@ -21,7 +22,10 @@ HEADWAY_S = 1.2
 STANDSTILL_GAP_M = 2.0
 LOOK_AHEAD_M = 60.0
 LATERAL_ACCELERATION = 2.4  # m/s^2, what a driver takes in a turn
-CONVOY = 4  # vehicles of one lane that a crossing lets through while others wait
+CLEARANCE_M = 3.1  # between the middle lines of two turns that may be driven at once
+
+Queues = dict[int, list[int]]
+"""Vehicles on each street's lane and on the turns that lead away from it, by lane, the foremost first."""
 
 
 @dataclass
@@ -53,19 +57,18 @@ class Vehicle:
 
 @dataclass
 class _Crossing:
-    holder: int = -1  # lane that leads to it and has it now
-    served: int = 0  # vehicles let through since it got it
-    inside: list[int] = field(default_factory=list)
+    inside: list[int] = field(default_factory=list)  # vehicles that may drive over it and have not left it yet
     waiting: dict[int, int] = field(default_factory=dict)  # lane -> step at which its first vehicle came
 
 
 class Traffic:
     """All vehicles, stepped at the frame rate from frame 0; what has been stepped is kept."""
 
-    def __init__(self, streets: Streets, vehicles: list[Vehicle], first_is_ego: bool = True) -> None:
+    def __init__(self, streets: Streets, vehicles: list[Vehicle]) -> None:
+        """Start with the vehicles where they are; the first one is the ego vehicle."""
         self.streets = streets
         self.vehicles = vehicles
-        self._ego = 0 if first_is_ego else -1
+        self._conflicts = _find_conflicts(streets)
         self._crossings = [_Crossing() for _ in streets.nodes]
         self._exit_claims: dict[int, list[int]] = {}  # lane -> vehicles on a crossing that will drive onto it
         self._limits = [_speed_limit(lane) for lane in streets.lanes]
@@ -119,16 +122,18 @@ class Traffic:
             vehicle.route.append(lane.exits[int(number * len(lane.exits))])
             vehicle.starts.append(vehicle.starts[-1] + lane.length_m)
 
-    def _queues(self) -> dict[int, list[int]]:
+    def _queues(self) -> Queues:
         """Return the vehicles on each street's lane and on the turns that lead away from it, the foremost first."""
         queues: dict[int, list[tuple[float, int]]] = {}
         for index, vehicle in enumerate(self.vehicles):
-            leg = vehicle.leg
-            if self.streets.lanes[vehicle.route[leg]].turn:
-                leg -= 1
+            leg = self._street_leg(vehicle)
             position = vehicle.along_m - vehicle.starts[leg]
             queues.setdefault(vehicle.route[leg], []).append((-position, index))
         return {lane: [index for _, index in sorted(queue)] for lane, queue in queues.items()}
+
+    def _street_leg(self, vehicle: Vehicle) -> int:
+        """Return which leg of its route is the street's lane it is on or, on a crossing, has come from."""
+        return vehicle.leg - self.streets.lanes[vehicle.route[vehicle.leg]].turn
 
     def _release_crossings(self) -> None:
         """Forget the vehicles that have left a crossing with their tails."""
@@ -141,7 +146,7 @@ class Traffic:
         vehicle = self.vehicles[index]
         return vehicle.along_m - vehicle.length_m / 2 > vehicle.starts[vehicle.granted] + 0.5
 
-    def _grant_crossings(self, step: int, queues: dict[int, list[int]]) -> None:
+    def _grant_crossings(self, step: int, queues: Queues) -> None:
         wishes: dict[int, list[tuple[int, int]]] = {}
         for lane, queue in queues.items():
             index = next((i for i in queue if self.vehicles[i].route[self.vehicles[i].leg] == lane), None)
@@ -154,37 +159,32 @@ class Traffic:
             if left < 10.0 + vehicle.speed_mps**2 / (2 * BRAKING):
                 self._crossings[node].waiting.setdefault(lane, step)
                 wishes.setdefault(node, []).append((lane, index))
-        for node in sorted(wishes):
-            self._grant(self._crossings[node], wishes[node], queues)
-
-    def _grant(self, crossing: _Crossing, wishes: list[tuple[int, int]], queues: dict[int, list[int]]) -> None:
-        others_wait = any(lane != crossing.holder for lane, _ in wishes)
-        if crossing.holder >= 0 and crossing.served >= CONVOY and others_wait and crossing.inside:
-            return  # let it empty: it is the others' turn
         ego_lane = self._lane_of_ego(queues)
-        order = sorted(wishes, key=lambda wish: (wish[0] != ego_lane, crossing.waiting[wish[0]], wish[0]))
-        if crossing.served >= CONVOY and others_wait:
-            order.sort(key=lambda wish: wish[0] == crossing.holder)
-        for lane, index in order:
-            if crossing.inside and lane != crossing.holder:
-                continue
+        for node in sorted(wishes):
+            self._grant(self._crossings[node], wishes[node], ego_lane, queues)
+
+    def _grant(self, crossing: _Crossing, wishes: list[tuple[int, int]], ego_lane: int, queues: Queues) -> None:
+        """Let in those whose way is clear: first come, first served, but the ego vehicle's lane before the others."""
+        held: list[int] = []  # turns of those who came earlier and must still wait
+        for lane, index in sorted(wishes, key=lambda wish: (wish[0] != ego_lane, crossing.waiting[wish[0]], wish[0])):
+            vehicle = self.vehicles[index]
+            turn = vehicle.route[vehicle.leg + 1]
             if not self._room_behind(index, queues):
                 continue
-            vehicle = self.vehicles[index]
-            crossing.served = crossing.served + 1 if lane == crossing.holder else 1
-            crossing.holder = lane
+            others = [self.vehicles[i] for i in crossing.inside]
+            crossed = [other.route[other.granted - 1] for other in others if other.route[other.granted - 2] != lane]
+            if any(self._conflicts[turn, other] for other in crossed + held):
+                held.append(turn)
+                continue
             crossing.inside.append(index)
             crossing.waiting.pop(lane)
             vehicle.granted = vehicle.leg + 2
             self._exit_claims.setdefault(vehicle.route[vehicle.granted], []).append(index)
-            return
 
-    def _lane_of_ego(self, queues: dict[int, list[int]]) -> int:
-        if self._ego < 0:
-            return -1
-        return next(lane for lane, queue in queues.items() if self._ego in queue)
+    def _lane_of_ego(self, queues: Queues) -> int:
+        return next((lane for lane, queue in queues.items() if 0 in queue), -1)
 
-    def _room_behind(self, index: int, queues: dict[int, list[int]]) -> bool:
+    def _room_behind(self, index: int, queues: Queues) -> bool:
         """Whether the lane beyond the crossing has room for the vehicle and for those already bound there."""
         vehicle = self.vehicles[index]
         exit_lane = vehicle.route[vehicle.leg + 2]
@@ -195,11 +195,10 @@ class Traffic:
         if not queue:
             return needed < self.streets.lanes[exit_lane].length_m
         last = self.vehicles[queue[-1]]
-        leg = last.leg - 1 if self.streets.lanes[last.route[last.leg]].turn else last.leg
-        free = last.along_m - last.starts[leg] - last.length_m / 2 + 0.5 * last.speed_mps
+        free = last.along_m - last.starts[self._street_leg(last)] - last.length_m / 2 + 0.5 * last.speed_mps
         return free > needed
 
-    def _acceleration(self, index: int, queues: dict[int, list[int]]) -> float:
+    def _acceleration(self, index: int, queues: Queues) -> float:
         vehicle = self.vehicles[index]
         wish = min(vehicle.cruise_mps, self._limits[vehicle.route[vehicle.leg]])
         free = ACCELERATION * (1 - (vehicle.speed_mps / wish) ** 4)
@@ -222,10 +221,10 @@ class Traffic:
         needed = (vehicle.speed_mps**2 - limit**2) / (2 * left)
         return -needed if needed > 0.6 * BRAKING else ACCELERATION
 
-    def _leader(self, index: int, queues: dict[int, list[int]]) -> tuple[float, float]:
+    def _leader(self, index: int, queues: Queues) -> tuple[float, float]:
         """Return gap (metres, bumper to bumper) and speed of the next vehicle ahead."""
         vehicle = self.vehicles[index]
-        leg = vehicle.leg - 1 if self.streets.lanes[vehicle.route[vehicle.leg]].turn else vehicle.leg
+        leg = self._street_leg(vehicle)
         nearest, speed = np.inf, 0.0
         for ahead in range(leg, min(leg + 3, len(vehicle.route))):
             lane = vehicle.route[ahead]
@@ -233,8 +232,7 @@ class Traffic:
                 continue
             for other in queues.get(lane, ()):
                 leader = self.vehicles[other]
-                other_leg = leader.leg - 1 if self.streets.lanes[leader.route[leader.leg]].turn else leader.leg
-                position = vehicle.starts[ahead] + leader.along_m - leader.starts[other_leg]
+                position = vehicle.starts[ahead] + leader.along_m - leader.starts[self._street_leg(leader)]
                 # One behind on the same lane, or on a turn of another lane's, is no leader.
                 if other == index or (position, -other) <= (vehicle.along_m, -index):
                     continue
@@ -253,11 +251,23 @@ def _follow(speed: float, wish: float, gap: float, leader_speed: float) -> float
     return ACCELERATION * (1 - (speed / wish) ** 4 - (desired / max(gap, 0.1)) ** 2)
 
 
-def _speed_limit(lane: object) -> float:
-    length, turning = lane.length_m, lane.turning_rad  # type: ignore[attr-defined]
-    if not lane.turn or turning < 0.2:  # type: ignore[attr-defined]
+def _speed_limit(lane: Lane) -> float:
+    """Return the speed that a lane can be driven at, m/s."""
+    if not lane.turn or lane.turning_rad < 0.2:
         return 14.0
-    return float(np.sqrt(LATERAL_ACCELERATION * length / turning))
+    return float(np.sqrt(LATERAL_ACCELERATION * lane.length_m / lane.turning_rad))
+
+
+def _find_conflicts(streets: Streets) -> NDArray[np.bool_]:
+    """Return (L, L) which turns of one crossing come nearer to each other than CLEARANCE_M."""
+    conflicts = np.zeros((len(streets.lanes),) * 2, np.bool_)
+    turns = [(index, lane) for index, lane in enumerate(streets.lanes) if lane.turn]
+    for a, one in turns:
+        for b, other in turns:
+            if one.start == other.start:
+                apart = np.linalg.norm(one.path[:, None] - other.path[None], axis=-1).min()
+                conflicts[a, b] = apart < CLEARANCE_M
+    return conflicts
 
 
 @dataclass(frozen=True)
@@ -303,13 +313,14 @@ def place_vehicles(
             lane = ego_lane if not vehicles else lanes[int(rng.integers(len(lanes)))]
             room = streets.lanes[lane].length_m
             along = ego_along_m if not vehicles else float(rng.uniform(length, room - length / 2 - 1))
-            apart = all(abs(along - other) > (length + size) / 2 + 4.0 for other, size in taken.get(lane, []))
+            apart = all(abs(along - other) > (length + size) / 2 + 8.0 for other, size in taken.get(lane, []))
             if apart:
                 break
         else:
             continue  # the town is full
         taken.setdefault(lane, []).append((along, length))
-        speed = 0.0 if not vehicles else min(cruise, 6.0)
+        to_stop_line = max(streets.lanes[lane].length_m - along - length / 2 - 1.0, 0.0)
+        speed = 0.0 if not vehicles else min(cruise, 4.0, float(np.sqrt(0.8 * BRAKING * to_stop_line)))
         vehicles.append(Vehicle(length, 8.5 if not vehicles else cruise, turns, [lane], [0.0], along, speed))
     return vehicles
 
@@ -319,11 +330,7 @@ def draw_walks(rng: np.random.Generator, blocks: tuple[Block, ...], count: int) 
 
     Those who share a block and a direction walk at one speed, so nobody walks through anybody.
     """
-    from carlasc.simulation.meshes import closed
-    from carlasc.simulation.streets import HALF_ROAD_M
-
-    inner = [block for block in blocks if not block.outside] + [blocks[-1]] * 2
-    speeds = rng.uniform(1.0, 1.8, (len(inner), 2))
+    speeds = rng.uniform(1.0, 1.8, (len(blocks), 2))
     walks: list[Walk] = []
     taken: dict[tuple[int, int], list[float]] = {}
     while len(walks) < count:
