@@ -206,16 +206,20 @@ class Dataset:
         return _the_one(specs, "grid geometry") if specs else None
 
     def _labelling(self, remap: str | Remap | Mapping[int, int] | ArrayLike | None) -> _Labelling:
-        labelled = [part.scans for part in self._parts if "point_labels" in self.fields]
-        labelled += [part.grids for part in self._parts if "labels" in self.fields and part.grids is not None]
-        tables = {sequence.location: sequence.metadata.classes for sequence in labelled or self.sequences}
-        table = _the_one({where: table.name for where, table in tables.items()}, "class table")
-        classes = next(iter(tables.values()))
-        labelling = _Labelling(remap, classes)
-        if labelled and labelling.source != classes:
+        tables: dict[str, ClassTable] = {}
+        for part in self._parts:
+            if "point_labels" in self.fields:
+                tables[part.scans.location] = part.scans.metadata.classes
+            if "labels" in self.fields and part.grids is not None:
+                tables[f"{part.grids.location}/{part.grid}"] = part.grids.classes_of(part.grid)
+        where, found = next(iter(tables.items()), ("", self.sequences[0].metadata.classes))
+        labelling = _Labelling(remap, found)
+        if tables:
+            _the_one({place: table.name for place, table in tables.items()}, "class table")
+        if tables and labelling.source != found:
             raise ArgumentError(
-                f"{next(iter(tables))}: expected labels of the class table {labelling.source.name} for the remap"
-                f" {labelling.name}, found {table}: give another remap=, or None to keep the ids"
+                f"{where}: expected labels of the class table {labelling.source.name} for the remap {labelling.name},"
+                f" found {found.name}: give another remap=, or None to keep the ids"
             )
         return labelling
 

@@ -47,7 +47,7 @@ def stack_scans(
     ranges = (min_range_m or 0.0, math.inf if max_range_m is None else float(max_range_m))
     for grid, points, grid_T_scan in zip(stack, scans, grid_T_scans, strict=True):
         if points is not None and len(points):
-            _bin_scan(_as_input(points), _rows(grid_T_scan), geometry, ranges, grid.reshape(-1))
+            _bin_scan(_as_words(points), _rows(grid_T_scan), geometry, ranges, grid.reshape(-1))
     return stack
 
 
@@ -68,9 +68,12 @@ def _rows(transform: Transform) -> tuple[float, ...]:
     return tuple(transform[:3].ravel().tolist())
 
 
-def _as_input(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the points as the one type that the kernel is compiled for: aligned, rows in order, read-only."""
-    return _read_only(np.require(points, np.float32, ("C", "A")))
+def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Return the bytes of the points as (2 N,) words, x and y in one, z and a fourth number in the next."""
+    if points.shape[1] != 4:
+        points = np.column_stack([points[:, :3], np.zeros(len(points), np.float32)])
+    words = np.require(points, np.float32, "C").reshape(-1).view(np.uint64)
+    return _read_only(np.require(words, requirements="A"))
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -83,11 +86,13 @@ _step = numba.njit(nogil=True, inline="always")  # pasted into the loop over blo
 
 
 @_step
-def _split_columns(block, x, y, z):  # type: ignore[no-untyped-def]
-    for n in range(len(block)):
-        x[n] = block[n, 0]
-        y[n] = block[n, 1]
-        z[n] = block[n, 2]
+def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
+    """Take x, y and z of each point apart: two 64-bit words a point vectorise, four floats do not."""
+    for n in range(len(words) // 2):
+        xy, zw = words[2 * n], words[2 * n + 1]
+        x[n] = np.uint32(xy).view(np.float32)
+        y[n] = np.uint32(xy >> np.uint64(32)).view(np.float32)
+        z[n] = np.uint32(zw).view(np.float32)
 
 
 @_step
@@ -164,20 +169,21 @@ def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _bin_scan(points, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+def _bin_scan(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
     x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     cells = np.empty(_BLOCK, np.int32)
     near, far = ranges
-    for start in range(0, len(points), _BLOCK):
-        block = points[start : start + _BLOCK]
+    for start in range(0, len(words), 2 * _BLOCK):
+        block = words[start : start + 2 * _BLOCK]
+        count = len(block) // 2
         _split_columns(block, x, y, z)
         if near > 0.0 or far < np.inf:
-            _leave_out(x, y, z, len(block), near * near, far * far)
-        _move(x, y, z, len(block), rows)
+            _leave_out(x, y, z, count, near * near, far * far)
+        _move(x, y, z, count, rows)
         if geometry[5]:
-            _to_cylindrical(x, y, len(block), geometry[0][1], geometry[1][1])
-        _find_cells(x, y, z, len(block), geometry, cells)
-        _mark(cells, len(block), grid)
+            _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1])
+        _find_cells(x, y, z, count, geometry, cells)
+        _mark(cells, count, grid)
 
 
 @numba.njit(nogil=True, cache=True)
