@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.sources.arraywriter import TABLES_MARK
 from carlasc.sources.base import Source
 from carlasc.sources.folder import FolderSource
 from carlasc.sources.packed import Options, PackedSink
@@ -65,6 +66,10 @@ def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
         from carlasc.sources.hdf5_store import HDF5Sink
 
         return HDF5Sink(path, options, overwrite)
+    if path.suffix == ".parquet":
+        from carlasc.sources.tablewriter import ParquetSink
+
+        return ParquetSink(path, options, overwrite)
     raise ArgumentError(
         f"{path}: expected a store ending in .zarr, .h5 or .parquet, found {path.suffix or 'no ending'}"
     )
@@ -87,6 +92,10 @@ def _open_store(tree: Tree) -> Source | None:
         from carlasc.sources.zarr_store import ZarrSource
 
         return ZarrSource(tree)
+    if tree.is_file(TABLES_MARK):
+        from carlasc.sources.tables import ParquetSource
+
+        return ParquetSource(tree)
     return None
 
 

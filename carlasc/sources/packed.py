@@ -109,12 +109,7 @@ class Points(Packing):
         """Turn rows into columns, and leave zeros out."""
         xyz = array[:, :3].T
         if scale := self.attributes.get("scale_m"):
-            steps = np.rint(xyz.astype(np.float64) / scale)
-            if not (np.abs(steps) < 2**31).all():  # NaN is not less either
-                raise FormatError(
-                    f"expected finite coordinates within {2**31 * scale:.0f} m to quantise, found others: pack without loss"
-                )
-            xyz = steps.astype(np.int32)
+            xyz = quantise(xyz, scale)
         fourth = np.ascontiguousarray(array[:, 3], "<f4")
         return {"xyz": xyz} | ({"fourth": fourth} if fourth.view(np.uint32).any() else {})
 
@@ -260,6 +255,20 @@ def packing_of(
 
 
 _SCANS: dict[str, Callable[..., Packing]] = {"points": Points, "flow": Flow}
+
+
+def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
+    """Return whole steps of `scale_m`.
+
+    Raises:
+        FormatError: NaN, infinity, or too far away to count.
+    """
+    steps = np.rint(metres.astype(np.float64) / scale_m)
+    if not (np.abs(steps) < 2**31).all():  # NaN is not less either
+        raise FormatError(
+            f"expected finite coordinates within {2**31 * scale_m:.0f} m to quantise, found others: pack without loss"
+        )
+    return steps.astype(np.int32)
 
 
 def narrow(array: NDArray[Any]) -> NDArray[Any]:
