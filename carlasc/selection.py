@@ -13,6 +13,8 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.grids import Coordinates, GridSpec
 from carlasc.sources.base import Sequence, Source
 
+_RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -64,11 +66,12 @@ class Part:
         poses = self.scans.poses
         if len(self.frames):
             self.scans.read_pose(int(self.frames[-1]))  # the last frame has a line only if all have
-        determinants = np.linalg.det(poses[:, :3, :3])
-        bad = np.flatnonzero(~np.isfinite(poses).all((1, 2)) | ~(np.abs(determinants - 1) < 1e-2))
-        if len(bad):
+        rotations = np.nan_to_num(poses[:, :3, :3])
+        rigid = np.isfinite(poses).all((1, 2)) & (np.abs(np.linalg.det(rotations) - 1) < _RIGID)
+        if not rigid.all():
+            line = int(np.argmin(rigid))
             raise FormatError(
-                f"{where}: expected rigid transforms, found none in line {bad[0] + 1} (determinant {determinants[bad[0]]:.3g})"
+                f"{where}: expected rigid transforms, found none in line {line + 1}: {poses[line, :3].ravel().tolist()}"
             )
 
 
