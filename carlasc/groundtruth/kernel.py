@@ -1,23 +1,37 @@
 # ruff: noqa: PLR0917 (compiled functions take scalars and arrays, by position)
-"""The hot loop of the ground truth: samples along rays, the voxels they fall in, and the votes of those voxels.
+"""The hot loop of the ground truth: the votes of one observation, and what all votes of a voxel decide.
 
-The rule is FORMAT section 4, bit for bit: norm and unit ray in float32; distances, differences and the transform in float64; cells
-half-open, floor, clamp.
+Blocks of rays are clipped to the grid and their samples placed by the vectorised code of rays.py; whatever that is not sure of is
+placed by rule.py. Free votes are kept densely, occupied ones as chains of candidates, a few for each voxel that was hit.
 """
 
 from __future__ import annotations
 
 import math
+import zlib
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import Transform
-from carlasc.grids import GridSpec
+from carlasc.groundtruth.rays import (
+    CHUNK,
+    DOUBTFUL,
+    DROPPED,
+    MARGIN,
+    UNSURE,
+    Rays,
+    View,
+    clip,
+    empty_rays,
+    narrow,
+    place_points,
+    place_samples,
+)
+from carlasc.groundtruth.rule import Cells, Pose, cached, inlined, jit, sample_voxel, transform, unit_ray
 
-OUTSIDE = -1  # index of a sample that lies in no voxel
+BLOCK = 256  # rays: their coordinates stay in the first cache
 NONE = -1  # end of a voxel's chain of candidates
 
 CANDIDATE_DTYPE = np.dtype(
@@ -26,166 +40,132 @@ CANDIDATE_DTYPE = np.dtype(
 )
 """A class that a voxel may have: its votes, who voted last, and the voxel's next candidate."""
 
-_jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+class Tally(NamedTuple):
+    """The votes of V voxels.
+
+    Attributes:
+        once: whether an observation has at most one vote a voxel and class.
+        free: (V + 1,) votes for free space; the last one takes samples outside.
+        passed: (V + 1,) uint8, voxels that the current observation saw free; all zero between observations. Only if `once`.
+        heads: (V,) int32, first candidate of each voxel, or NONE.
+        candidates: CANDIDATE_DTYPE, those of all voxels.
+        used: (1,) int64, how many of them are in use.
+    """
+
+    once: bool
+    free: NDArray[Any]
+    passed: NDArray[np.uint8]
+    heads: NDArray[np.int32]
+    candidates: NDArray[Any]
+    used: NDArray[np.int64]
 
 
-class Cells(NamedTuple):
-    """A GridSpec as scalars that compiled code can keep in registers."""
-
-    cylindrical: bool
-    size: tuple[int, int, int]
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
-    voxel_size: tuple[float, float, float]
-
-    @classmethod
-    def of(cls, spec: GridSpec) -> Cells:
-        """Return the cells of a grid."""
-        x, y, z = spec.voxel_size.tolist()
-        return cls(spec.coordinates == "cylindrical", spec.size, spec.lower, spec.upper, (x, y, z))
-
-
-Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
-"""The upper 3 x 4 of a transform, row-major, as scalars."""
-
-
-def as_pose(dst_T_src: Transform) -> Pose:
-    """Return a (4, 4) transform as scalars."""
-    pose: Pose = tuple(np.asarray(dst_T_src, np.float64)[:3].ravel().tolist())  # type: ignore[assignment]
-    return pose
-
-
-@_jit
-def to_grid_frame(x: float, y: float, z: float, pose: Pose) -> tuple[float, float, float]:
-    """Return R @ p + t, summed from the left."""
-    return (
-        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
-        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
-        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
-    )
-
-
-@_jit
-def exact_voxel(x: float, y: float, z: float, cells: Cells) -> int:
-    """Return the flat index of the voxel of a point in the grid's frame, as GridSpec.flat_index does."""
-    first, second = x, y
-    if cells.cylindrical:
-        first, second = math.sqrt(x * x + y * y), math.atan2(y, x)
-        turned = second
-        if second < cells.lower[1]:
-            turned = second + 2 * math.pi
-        elif second >= cells.upper[1]:
-            turned = second - 2 * math.pi
-        if cells.lower[1] <= turned < cells.upper[1]:
-            second = turned
-    if not (
-        cells.lower[0] <= first < cells.upper[0]
-        and cells.lower[1] <= second < cells.upper[1]
-        and cells.lower[2] <= z < cells.upper[2]
-    ):
-        return OUTSIDE
-    i = min(int((first - cells.lower[0]) / cells.voxel_size[0]), cells.size[0] - 1)
-    j = min(int((second - cells.lower[1]) / cells.voxel_size[1]), cells.size[1] - 1)
-    k = min(int((z - cells.lower[2]) / cells.voxel_size[2]), cells.size[2] - 1)
-    return (i * cells.size[1] + j) * cells.size[2] + k
-
-
-@_jit
-def exact_sample(
-    x: np.float32, y: np.float32, z: np.float32, step: int, free_step_m: float, pose: Pose, cells: Cells
-) -> tuple[bool, int]:
-    """Return whether the sample `step` steps before the point (0: the point itself) is before the sensor, and its voxel."""
-    norm = np.sqrt(x * x + y * y + z * z)
-    ux, uy, uz = x / norm, y / norm, z / norm
-    back = step * free_step_m
-    sx, sy, sz = np.float64(x) - ux * back, np.float64(y) - uy * back, np.float64(z) - uz * back
-    if not (sx / ux > 0.0 and ux != 0.0):
-        return False, OUTSIDE
-    gx, gy, gz = to_grid_frame(sx, sy, sz, pose)
-    return True, exact_voxel(gx, gy, gz, cells)
-
-
-@_jit
+@jit
 def vote_occupied(
-    voxel: int, label: int, voter: int, once: bool, heads: NDArray[Any], candidates: NDArray[Any], used: int
-) -> int:
-    """Give a voxel a vote for a class, at most one a voter if `once`; returns how many candidates are in use."""
-    entry = heads[voxel]
+    points: NDArray[np.float32],
+    labels: NDArray[np.uint16],
+    rays: Rays,
+    hits: NDArray[np.int32],
+    pose: Pose,
+    cells: Cells,
+    voter: int,
+    tally: Tally,
+) -> None:
+    """Let the points of a block vote for their classes."""
+    for i in range(len(labels)):
+        if rays.state[i] == DROPPED:
+            continue
+        voxel = hits[i]
+        if voxel == DOUBTFUL or rays.state[i] == UNSURE:
+            _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
+        if voxel < len(tally.heads):
+            vote_for(voxel, labels[i], voter, tally)
+
+
+@inlined
+def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
+    """Give a voxel a vote for a class."""
+    candidates = tally.candidates
+    entry = tally.heads[voxel]
     while entry != NONE and candidates[entry].label != label:
         entry = candidates[entry].next
     if entry == NONE:
-        entry = used
+        entry = tally.used[0]
+        tally.used[0] += 1
         candidates[entry].votes = 0
         candidates[entry].voxel = voxel
-        candidates[entry].next = heads[voxel]
+        candidates[entry].next = tally.heads[voxel]
         candidates[entry].voter = NONE
         candidates[entry].label = label
-        heads[voxel] = entry
-        used += 1
-    if not once or candidates[entry].voter != voter:
+        tally.heads[voxel] = entry
+    if not tally.once or candidates[entry].voter != voter:
         candidates[entry].votes += 1
         candidates[entry].voter = voter
-    return used
 
 
-@_jit
-def vote(
+@jit
+def vote_free(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
+    rays: Rays,
     pose: Pose,
+    view: View,
     cells: Cells,
     free_step_m: float,
-    voter: int,
-    once: bool,
-    free: NDArray[Any],
-    passed: NDArray[np.uint8],
-    heads: NDArray[np.int32],
-    candidates: NDArray[Any],
-    used: int,
-) -> int:
-    """Add the votes of one observation.
-
-    Args:
-        points: (3 N,) float32 x, y, z of each point, sensor frame.
-        labels: (N,) uint16.
-        pose: grid_T_sensor.
-        cells: the grid.
-        free_step_m: distance between free samples.
-        voter: number of the observation.
-        once: at most one vote a voxel and class.
-        free: (V,) free votes, added to.
-        passed: (V,) uint8, all zero, and left so: voxels that this observation saw free.
-        heads: (V,) int32, first candidate of each voxel.
-        candidates: candidates of all voxels, with room for N more.
-        used: how many are in use.
-
-    Returns:
-        How many candidates are in use now.
-    """
+    tally: Tally,
+) -> None:
+    """Let the samples before the points of a block vote for free space."""
+    voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
-        if labels[i] == 0:
+        if rays.state[i] == UNSURE:
+            vote_free_by_rule(
+                points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, tally
+            )
+        if rays.state[i] != 0.0:
             continue
-        x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-        kept, voxel = exact_sample(x, y, z, 0, free_step_m, pose, cells)
-        if kept and voxel != OUTSIDE:
-            used = vote_occupied(voxel, labels[i], voter, once, heads, candidates, used)
-        step = 1
-        while kept:
-            kept, voxel = exact_sample(x, y, z, step, free_step_m, pose, cells)
-            if voxel != OUTSIDE:
-                if once:
-                    passed[voxel] = 1
-                else:
-                    free[voxel] += 1
-            step += 1
-    if once:
-        for v in range(len(free)):
-            free[v] += passed[v]
-            passed[v] = 0
-    return used
+        step = rays.first[i]
+        while step <= rays.last[i]:
+            place_samples(rays, i, step, rays.last[i], view, voxels)
+            for j in range(CHUNK):
+                if voxels[j] == DOUBTFUL:
+                    x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
+                    voxels[j] = sample_voxel(x, y, z, step + j, free_step_m, pose, cells)[1]
+            if tally.once:
+                for j in range(CHUNK):
+                    tally.passed[voxels[j]] = 1
+            else:
+                for j in range(CHUNK):
+                    tally.free[voxels[j]] += 1
+            step += CHUNK
 
 
-@_jit
+@jit
+def vote_free_by_rule(
+    x: np.float32, y: np.float32, z: np.float32, pose: Pose, view: View, cells: Cells, free_step_m: float, tally: Tally
+) -> None:
+    """Let the samples of one ray vote for free space by the rule alone, clipped with a wide margin."""
+    norm, ux, uy, uz = unit_ray(x, y, z)
+    starts = transform(view.pose, x, y, z)
+    units = transform(view.pose, ux, uy, uz)
+    # Rounding adds less than this, in cells or metres: it grows as the distance, and is below the margin within reach.
+    slack = 1.0 + MARGIN * norm / view.reach if view.reach > 0.0 else math.inf
+    step, last = 1.0, math.inf
+    for axis in range(3):
+        stride = (units[axis] - view.pose[4 * axis + 3]) * free_step_m
+        step, last = narrow(step, last, starts[axis], stride, view.low[axis] - slack, view.high[axis] + slack)
+    step = np.floor(step)
+    kept = step < 2.0**52  # beyond that one step more is no other number
+    while kept and step <= last + 1.0:
+        kept, voxel = sample_voxel(x, y, z, step, free_step_m, pose, cells)
+        if tally.once:
+            tally.passed[voxel] = 1
+        else:
+            tally.free[voxel] += 1
+        step += 1.0
+
+
+@cached
 def elect(
     free: NDArray[Any], candidates: NDArray[Any], labels: NDArray[Any], best: NDArray[Any], counts: NDArray[Any]
 ) -> None:
@@ -208,3 +188,50 @@ def elect(
         if votes > best[v] or (votes == best[v] and entry.label < labels[v]):
             best[v] = votes
             labels[v] = entry.label
+
+
+def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
+    """Return the function below. Closing over `sources` makes Numba's cache, which knows only this file, notice the others too."""
+
+    @cached
+    def vote(
+        points: NDArray[np.float32],
+        labels: NDArray[np.uint16],
+        pose: Pose,
+        view: View,
+        cells: Cells,
+        free_step_m: float,
+        voter: int,
+        tally: Tally,
+    ) -> None:
+        """Add the votes of one observation.
+
+        Args:
+            points: (3 N,) float32 x, y, z of each point, sensor frame.
+            labels: (N,) uint16.
+            pose: grid_T_sensor.
+            view: the grid from there.
+            cells: the grid.
+            free_step_m: distance between free samples.
+            voter: number of the observation.
+            tally: the votes so far, with room for N more candidates.
+        """
+        _ = sources
+        rays, hits = empty_rays(BLOCK), np.empty(BLOCK, np.int32)
+        for begin in range(0, len(labels), BLOCK):
+            block = labels[begin : begin + BLOCK]
+            corner = points[3 * begin : 3 * (begin + len(block))]
+            clip(corner, block, free_step_m, view, rays)
+            place_points(rays, view, hits)
+            vote_occupied(corner, block, rays, hits, pose, cells, voter, tally)
+            vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
+        if tally.once:
+            for v in range(len(tally.passed)):
+                tally.free[v] += tally.passed[v]
+                tally.passed[v] = 0
+
+    return vote
+
+
+_SOURCES = ("rule.py", "rays.py", "kernel.py")
+vote = _compile_vote(zlib.crc32(b"".join((Path(__file__).parent / name).read_bytes() for name in _SOURCES)))

@@ -70,7 +70,7 @@ class Ballot:
     def __init__(
         self, spec: GridSpec, classes: ClassTable = CARLA, *, vote: VoteRule = "sensor", free_step_m: float = 1.5
     ) -> None:
-        from carlasc.groundtruth import kernel
+        from carlasc.groundtruth import kernel, rule
 
         if vote not in ("sensor", "sample"):
             raise ArgumentError(f"vote rule: expected sensor or sample, found {vote!r}")
@@ -78,12 +78,16 @@ class Ballot:
             raise ArgumentError(f"free step: expected a positive number of metres, found {free_step_m}")
         self.spec, self.classes, self.vote, self.free_step_m = spec, classes, vote, float(free_step_m)
         self.num_observations = 0
-        self._cells = kernel.Cells.of(spec)
-        self._free = np.zeros(spec.num_voxels, np.uint32 if vote == "sensor" else np.int64)
-        self._passed = np.zeros(spec.num_voxels if vote == "sensor" else 0, np.uint8)
-        self._heads = np.full(spec.num_voxels, kernel.NONE, np.int32)
-        self._candidates = np.empty(0, kernel.CANDIDATE_DTYPE)
-        self._used = 0
+        once = vote == "sensor"
+        self._cells = rule.Cells.of(spec)
+        self._tally = kernel.Tally(
+            once,
+            free=np.zeros(spec.num_voxels + 1, np.uint32 if once else np.int64),
+            passed=np.zeros(spec.num_voxels + 1 if once else 0, np.uint8),
+            heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
+            candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
+            used=np.zeros(1, np.int64),
+        )
 
     def add(self, observation: Observation) -> None:
         """Add the votes of one observation.
@@ -91,40 +95,38 @@ class Ballot:
         Raises:
             FormatError: a label is not below the class table's number of channels; no vote was added.
         """
-        from carlasc.groundtruth import kernel
+        from carlasc.groundtruth import kernel, rays, rule
 
         self.classes.check(observation.labels, "observation labels")
         self._make_room(len(observation))
-        self._used = kernel.vote(
+        pose = rule.as_pose(observation.grid_T_sensor)
+        kernel.vote(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
             np.require(observation.labels, np.uint16, ["C", "A", "W"]),
-            kernel.as_pose(observation.grid_T_sensor),
+            pose,
+            rays.View.of(pose, self._cells),
             self._cells,
             self.free_step_m,
             self.num_observations,
-            self.vote == "sensor",
-            self._free,
-            self._passed,
-            self._heads,
-            self._candidates,
-            self._used,
+            self._tally,
         )
         self.num_observations += 1
 
     def votes(self) -> Votes:
         """Return the votes so far; later observations do not change them."""
-        used = self._candidates[: self._used]
-        occupied = np.empty(self._used, OCCUPIED_DTYPE)
+        candidates = self._tally.candidates[: self._tally.used[0]]
+        occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         for name in OCCUPIED_DTYPE.names or ():
-            occupied[name] = used[name]
-        return Votes(self.spec, self.classes, self._free.reshape(self.spec.size).copy(), occupied)
+            occupied[name] = candidates[name]
+        return Votes(self.spec, self.classes, self._tally.free[:-1].reshape(self.spec.size).copy(), occupied)
 
     def _make_room(self, points: int) -> None:
         """Let the candidates grow by as many as there are points: at worst each is the first of its kind."""
-        if self._used + points > len(self._candidates):
-            grown = np.empty(max(self._used + points, 3 * self._used // 2), self._candidates.dtype)
-            grown[: self._used] = self._candidates[: self._used]
-            self._candidates = grown
+        used, candidates = int(self._tally.used[0]), self._tally.candidates
+        if used + points > len(candidates):
+            grown = np.empty(2 * (used + points), candidates.dtype)
+            grown[:used] = candidates[:used]
+            self._tally = self._tally._replace(candidates=grown)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,108 @@
+# ruff: noqa: PLR0917 (compiled functions take scalars and arrays, by position)
+"""The rule that places a sample in a voxel, bit for bit (FORMAT section 4), one sample at a time.
+
+Norm and unit ray are float32, as the points are; distances, differences and the transform are float64; cells are half-open, floor, clamp.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from carlasc.geometry import Transform
+from carlasc.grids import GridSpec
+
+Triple = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""The upper 3 x 4 of a transform, row-major, as scalars."""
+
+jit = numba.njit(nogil=True, error_model="numpy")
+inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
+cached = numba.njit(nogil=True, error_model="numpy", cache=True)  # what Python calls; the rest is compiled into it
+
+
+class Cells(NamedTuple):
+    """A GridSpec as scalars, which compiled code keeps in registers."""
+
+    cylindrical: bool
+    size: tuple[int, int, int]
+    lower: Triple
+    upper: Triple
+    voxel_size: Triple
+
+    @classmethod
+    def of(cls, spec: GridSpec) -> Cells:
+        """Return the cells of a grid."""
+        x, y, z = spec.voxel_size.tolist()
+        return cls(spec.coordinates == "cylindrical", spec.size, spec.lower, spec.upper, (x, y, z))
+
+
+def as_pose(dst_T_src: Transform) -> Pose:
+    """Return a (4, 4) transform as scalars."""
+    pose: Pose = tuple(np.asarray(dst_T_src, np.float64)[:3].ravel().tolist())  # type: ignore[assignment]
+    return pose
+
+
+@inlined
+def transform(pose: Pose, x: float, y: float, z: float) -> Triple:
+    """Return R @ p + t, summed from the left."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
+        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
+        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
+    )
+
+
+@jit
+def voxel_of(x: float, y: float, z: float, cells: Cells) -> int:
+    """Return the flat index of the voxel of a point in the grid's frame, the number of voxels if outside."""
+    first, second = x, y
+    if cells.cylindrical:
+        first, second = math.sqrt(x * x + y * y), math.atan2(y, x)
+        turned = second
+        if second < cells.lower[1]:
+            turned = second + 2 * math.pi
+        elif second >= cells.upper[1]:
+            turned = second - 2 * math.pi
+        if cells.lower[1] <= turned < cells.upper[1]:
+            second = turned
+    if not (
+        cells.lower[0] <= first < cells.upper[0]
+        and cells.lower[1] <= second < cells.upper[1]
+        and cells.lower[2] <= z < cells.upper[2]
+    ):
+        return cells.size[0] * cells.size[1] * cells.size[2]
+    i = min(int((first - cells.lower[0]) / cells.voxel_size[0]), cells.size[0] - 1)
+    j = min(int((second - cells.lower[1]) / cells.voxel_size[1]), cells.size[1] - 1)
+    k = min(int((z - cells.lower[2]) / cells.voxel_size[2]), cells.size[2] - 1)
+    return (i * cells.size[1] + j) * cells.size[2] + k
+
+
+@inlined
+def unit_ray(x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the norm of a point and the unit ray to it, all float32."""
+    norm = np.sqrt(x * x + y * y + z * z)
+    return norm, x / norm, y / norm, z / norm
+
+
+@inlined
+def before_sensor(x: float, ux: float) -> bool:
+    """Return whether a sample is kept: its x over the unit ray's is positive. A ray whose x is 0 drops out altogether."""
+    return x / ux > 0.0 and ux != 0.0
+
+
+@jit
+def sample_voxel(
+    x: np.float32, y: np.float32, z: np.float32, step: float, free_step_m: float, pose: Pose, cells: Cells
+) -> tuple[bool, int]:
+    """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and its voxel."""
+    _, ux, uy, uz = unit_ray(x, y, z)
+    back = step * free_step_m
+    sx, sy, sz = np.float64(x) - ux * back, np.float64(y) - uy * back, np.float64(z) - uz * back
+    if not before_sensor(sx, ux):
+        return False, cells.size[0] * cells.size[1] * cells.size[2]
+    gx, gy, gz = transform(pose, sx, sy, sz)
+    return True, voxel_of(gx, gy, gz, cells)
