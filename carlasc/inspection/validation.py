@@ -17,6 +17,7 @@ from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
+from carlasc.inspection.opening import open_source
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
 from carlasc.sources.base import Sequence, Source
@@ -70,15 +71,6 @@ def validate(
             reports.append(end.value)
         findings += sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
     return ValidationResult(opened.location, tuple(findings), tuple(reports))
-
-
-def open_source(source: str | os.PathLike[str] | Source) -> Source:
-    """Return the Source itself, or what `carlasc.open` makes of a path."""
-    if isinstance(source, Source):
-        return source
-    from carlasc import sources
-
-    return sources.open(source)
 
 
 @dataclass(frozen=True)

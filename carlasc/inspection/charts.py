@@ -1,0 +1,66 @@
+"""Class histograms as a picture."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from carlasc.errors import ArgumentError, import_extra
+from carlasc.files import write_atomic
+from carlasc.inspection.statistics import KINDS, Kind, Statistics
+
+_SUFFIXES = (".png", ".svg", ".pdf")
+_OF: dict[Kind, str] = {"points": "points", "voxels": "known voxels"}
+
+
+def draw_histograms(statistics: Statistics, path: Path) -> None:
+    """Draw the share of each class, points beside voxels, a bar a split, on a logarithmic scale.
+
+    Args:
+        statistics: as `stats` returns them.
+        path: a .png, .svg or .pdf file.
+
+    Raises:
+        ArgumentError: another ending.
+        DependencyError: Matplotlib is not installed.
+    """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ArgumentError(f"{path}: expected a file ending in {', '.join(_SUFFIXES)}, found {path.suffix or 'none'}")
+    figures = import_extra("matplotlib.figure", "plots")
+    splits = statistics.by_split()
+    names, colors = statistics.classes.names, statistics.classes.palette / 255
+    ids = [i for i in names if any(histogram.of(kind)[i] for histogram in splits.values() for kind in KINDS)]
+    figure = figures.Figure(figsize=(11, 0.9 + 0.32 * max(6, len(ids))), layout="constrained")
+    for axes, kind in zip(figure.subplots(1, 2, sharey=True), KINDS, strict=True):
+        for row, (split, histogram) in enumerate(splits.items()):
+            counts = histogram.of(kind)[ids]
+            if not counts.sum():
+                continue
+            height = 0.8 / len(splits)
+            places = np.arange(len(ids)) + (row - (len(splits) - 1) / 2) * height
+            axes.barh(
+                places,
+                counts / counts.sum(),
+                height,
+                color=colors[ids],
+                edgecolor="black",
+                linewidth=0.4,
+                alpha=1 - 0.25 * row,
+                label=split,
+            )
+        axes.set_xscale("log")
+        axes.set_xlabel(f"share of {_OF[kind]}")
+        axes.set_yticks(range(len(ids)), [names[i] for i in ids])
+        axes.grid(axis="x", alpha=0.3)
+    figure.axes[0].invert_yaxis()
+    known = statistics.total.known_share
+    count = len(statistics.sequences)
+    title = "1 sequence" if count == 1 else f"{count} sequences"
+    if len(splits) > 1:
+        title += f" (darkest first: {', '.join(splits)})"
+    figure.suptitle(title if np.isnan(known) else f"{title}, {known:.1%} of voxels known")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix[1:].lower(), dpi=150)
+    write_atomic(path, buffer.getvalue())

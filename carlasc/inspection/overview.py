@@ -1,0 +1,260 @@
+"""What is there: splits, sequences, frames, fields and grids, from listings and text files alone."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import layout
+from carlasc.capture import Capture, find_captures
+from carlasc.errors import CarlascError, MissingDataError
+from carlasc.inspection.opening import open_source
+from carlasc.sources.base import Metadata, Sequence, Source
+from carlasc.sources.folder import FolderSequence
+
+_SIZED = 3  # files of a field whose sizes stand for those of all
+
+
+@dataclass(frozen=True)
+class GridOverview:
+    """One grid of a sequence.
+
+    Attributes:
+        name: its folder.
+        coordinates: "cartesian" or "cylindrical".
+        size: cells an axis.
+        lower: lower bound an axis; metres, radians for azimuth.
+        upper: upper bound an axis.
+        voxel_size: size of a cell an axis.
+        frames: number of frames.
+        parts: what there is of it: labels, counts, votes.
+        made: the record of how it was made; None for published data.
+    """
+
+    name: str
+    coordinates: str
+    size: tuple[int, int, int]
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    voxel_size: tuple[float, float, float]
+    frames: int
+    parts: tuple[str, ...]
+    made: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class SequenceOverview:
+    """One sequence.
+
+    Attributes:
+        path: where it stands in its Source.
+        split: "Train", "Val", "Test", or None.
+        name: what it is called.
+        coordinates: "cartesian" or "cylindrical".
+        frames: number of frames.
+        first: number of the first one; None where there is none.
+        last: number of the last one.
+        gaps: places where frame numbers are missing.
+        fields: number of frames by field; grids apart.
+        documents: text files.
+        grids: its grids.
+        frame: "carlasc" (y right) or "kitti" (y left).
+        classes: class table of its labels.
+        sensor: what took the scans, where known.
+        source: what the sequence was made from, where known.
+        bytes: about how much it takes; None where that is not cheap to say.
+        problem: why it could not be looked at whole; None if it could.
+    """
+
+    path: str
+    split: str | None
+    name: str
+    coordinates: str
+    frames: int
+    first: int | None
+    last: int | None
+    gaps: int
+    fields: Mapping[str, int]
+    documents: tuple[str, ...]
+    grids: tuple[GridOverview, ...]
+    frame: str
+    classes: str
+    sensor: str | None
+    source: str | None
+    bytes: int | None
+    problem: str | None = None
+
+
+@dataclass(frozen=True)
+class CaptureOverview:
+    """One raw capture: path below the place looked at, number of sensors, frames as in SequenceOverview."""
+
+    path: str
+    sensors: int
+    frames: int
+    first: int
+    last: int
+    gaps: int
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What `info` found.
+
+    Attributes:
+        location: what was looked at.
+        level: what it is: "data set", "split", "sequences", "sequence", "coordinates" (one `<coordinates>` folder), "capture".
+        store: how it is kept: "folder", "published" (a zip or a remote folder), or a kind of packed store.
+        sequences: in sorted order.
+        captures: in sorted order.
+        bytes: size of the file it is all in; None for folders.
+    """
+
+    location: str
+    level: str
+    store: str
+    sequences: tuple[SequenceOverview, ...]
+    captures: tuple[CaptureOverview, ...]
+    bytes: int | None
+
+    @property
+    def splits(self) -> dict[str, int]:
+        """Number of sequences by split; "none" where the path names none."""
+        found: dict[str, int] = {}
+        for sequence in self.sequences:
+            found[sequence.split or "none"] = found.get(sequence.split or "none", 0) + 1
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        return asdict(self) | {"splits": self.splits}
+
+
+def info(source: str | os.PathLike[str] | Source) -> Overview:
+    """Say what is there: no frame is read.
+
+    Args:
+        source: a path or URL that `carlasc.open` knows, a raw capture, or a Source.
+
+    Raises:
+        MissingDataError: there is neither a sequence nor a capture.
+    """
+    captures = _captures_in(source)
+    try:
+        opened = open_source(source)
+        # raw/ itself has a bev/ folder, as a sequence has
+        sequences = {path: s for path, s in opened.sequences().items() if s.fields() or path not in captures}
+    except MissingDataError:
+        if not captures:
+            raise
+        sequences = {}
+    if not sequences:
+        found = tuple(_look_at_capture(path, capture) for path, capture in captures.items())
+        return Overview(str(source), "capture", "folder", (), found, None)
+    location = Path(opened.location)
+    return Overview(
+        opened.location,
+        _level(opened.location, list(sequences)),
+        type(opened).__name__.removesuffix("Source").lower(),
+        tuple(_look_at(sequence) for sequence in sequences.values()),
+        tuple(_look_at_capture(path, capture) for path, capture in captures.items()),
+        location.stat().st_size if location.is_file() else None,
+    )
+
+
+def _captures_in(source: str | os.PathLike[str] | Source) -> dict[str, Capture]:
+    if isinstance(source, Source) or not Path(source).is_dir():
+        return {}
+    try:
+        return find_captures(source)
+    except MissingDataError:
+        return {}
+
+
+def _level(location: str, paths: list[str]) -> str:
+    """Tell what was given from how far below it the sequences lie."""
+    parts = [path.split("/") for path in paths]
+    if paths == [""]:
+        return "coordinates"
+    if all(len(p) == 1 for p in parts) and all(p[0] in layout.COORDINATES for p in parts):
+        return "sequence"
+    names = {split.lower() for split in layout.SPLITS}
+    if any(part.lower() in names for p in parts for part in p[:-1]):
+        return "data set"
+    return "split" if Path(location).name.lower() in names else "sequences"
+
+
+def _look_at(sequence: Sequence) -> SequenceOverview:
+    fields = {name: len(sequence.frames(name)) for name in sorted(sequence.fields())}
+    frames = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in fields)]))
+    metadata, problem = Metadata(), None
+    grids: tuple[GridOverview, ...] = ()
+    try:
+        metadata = sequence.metadata
+        grids = tuple(_look_at_grid(sequence, name, fields) for name in sequence.grids)
+    except CarlascError as error:
+        problem = str(error)
+    return SequenceOverview(
+        sequence.path,
+        sequence.split,
+        sequence.name,
+        sequence.coordinates,
+        len(frames),
+        int(frames[0]) if len(frames) else None,
+        int(frames[-1]) if len(frames) else None,
+        _gaps(frames),
+        {name: count for name, count in fields.items() if "/" not in name},
+        tuple(name for name in sequence.documents() if "/" not in name),
+        grids,
+        metadata.frame,
+        metadata.classes.name,
+        metadata.sensor,
+        metadata.source,
+        _about_bytes(sequence, fields),
+        problem,
+    )
+
+
+def _look_at_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> GridOverview:
+    spec = sequence.grids[name]
+    parts = tuple(part for part in layout.GRID_FIELDS if f"{name}/{part}" in fields)
+    x, y, z = spec.voxel_size.tolist()
+    return GridOverview(
+        name,
+        spec.coordinates,
+        spec.size,
+        spec.lower,
+        spec.upper,
+        (x, y, z),
+        fields.get(f"{name}/labels", 0),
+        parts,
+        sequence.params(name).get("carlasc"),
+    )
+
+
+def _about_bytes(sequence: Sequence, fields: Mapping[str, int]) -> int | None:
+    """Files of a field are much of a size: a few of them stand for all."""
+    if not isinstance(sequence, FolderSequence):
+        return None
+    total = 0.0
+    for name, count in fields.items():
+        frames = sequence.frames(name)
+        some = frames[np.linspace(0, count - 1, min(count, _SIZED)).astype(int)]
+        files = [sequence.folder / layout.field_named(name).file(int(number)) for number in some]
+        total += count * float(np.mean([file.stat().st_size for file in files]))
+    return round(total)
+
+
+def _look_at_capture(path: str, capture: Capture) -> CaptureOverview:
+    frames = capture.frames
+    return CaptureOverview(path, len(capture.sensors), len(frames), int(frames[0]), int(frames[-1]), _gaps(frames))
+
+
+def _gaps(frames: NDArray[np.int64]) -> int:
+    return int(np.count_nonzero(np.diff(frames) > 1))

@@ -1,0 +1,263 @@
+"""How much of each class there is, in points and in voxels, and the weights that follow from it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.inspection.opening import open_source
+from carlasc.labels import REMAPS, ClassTable, Remap, class_weights, remap_named
+from carlasc.layout import EVALUATION
+from carlasc.sources.base import Sequence, Source
+from carlasc.workers import count_workers, run_all
+
+Kind = Literal["points", "voxels"]
+KINDS: tuple[Kind, ...] = ("points", "voxels")
+_CHUNK = 32  # frames that a worker counts at a time
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How often each class stands in some frames.
+
+    Attributes:
+        points: (K,) int64 points of each class, by id; class 0 is unlabelled.
+        voxels: (K,) int64 known voxels of each class; class 0 is free.
+        unknown: number of unknown voxels (count 0).
+        scans: number of scans counted.
+        grids: number of grids counted.
+    """
+
+    points: NDArray[np.int64]
+    voxels: NDArray[np.int64]
+    unknown: int = 0
+    scans: int = 0
+    grids: int = 0
+
+    @classmethod
+    def empty(cls, classes: ClassTable) -> Histogram:
+        """Return the histogram of no frames."""
+        zeros = np.zeros(classes.num_channels, np.int64)
+        return cls(zeros, zeros)
+
+    def __add__(self, other: Histogram) -> Histogram:
+        return Histogram(
+            self.points + other.points,
+            self.voxels + other.voxels,
+            self.unknown + other.unknown,
+            self.scans + other.scans,
+            self.grids + other.grids,
+        )
+
+    def of(self, kind: Kind) -> NDArray[np.int64]:
+        """Return the (K,) counts of points or of voxels."""
+        return self.points if kind == "points" else self.voxels
+
+    @property
+    def known_share(self) -> float:
+        """Share of voxels that are known; NaN where there are no grids."""
+        total = int(self.voxels.sum()) + self.unknown
+        return int(self.voxels.sum()) / total if total else float("nan")
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What `stats` counted.
+
+    Attributes:
+        location: what was looked at.
+        classes: the labels' table.
+        remap: what the classes are summed to for the second table; None where there is none.
+        sequences: a histogram by the sequence's path.
+        splits: the split of each sequence, "none" where its path names none.
+        failures: (file, message) of the frames that could not be read.
+    """
+
+    location: str
+    classes: ClassTable
+    remap: Remap | None
+    sequences: dict[str, Histogram]
+    splits: dict[str, str]
+    failures: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def total(self) -> Histogram:
+        """All sequences together."""
+        return sum(self.sequences.values(), Histogram.empty(self.classes))
+
+    @property
+    def frames(self) -> int:
+        """Number of scans and grids counted."""
+        return self.total.scans + self.total.grids
+
+    def by_split(self) -> dict[str, Histogram]:
+        """Return the sequences summed up by split."""
+        found: dict[str, Histogram] = {}
+        for path, histogram in self.sequences.items():
+            split = self.splits[path]
+            found[split] = found.get(split, Histogram.empty(self.classes)) + histogram
+        return found
+
+    def summed(self, counts: NDArray[np.int64]) -> dict[str, int]:
+        """Return counts by the names of the classes that the remap sums them to."""
+        if self.remap is None:
+            return self.named(counts)
+        summed = dict.fromkeys(self.remap.target.names.values(), 0)
+        for old, new in self.remap.mapping.items():
+            summed[self.remap.target.names[new]] += int(counts[old]) if old < len(counts) else 0
+        return summed
+
+    def named(self, counts: NDArray[np.int64]) -> dict[str, int]:
+        """Return counts by the classes' names."""
+        return {name: int(counts[index]) for index, name in self.classes.names.items()}
+
+    def weights(self) -> dict[str, float]:
+        """Return the loss weight of each class, remapped if there is a remap, from the known voxels of all sequences."""
+        weights = class_weights(self.total.voxels, self.remap)
+        table = self.classes if self.remap is None else self.remap.target
+        return {name: float(weights[index]) for index, name in table.names.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+
+        def plain(histogram: Histogram) -> dict[str, Any]:
+            counts = {kind: self.named(histogram.of(kind)) for kind in KINDS}
+            remapped = {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS} if self.remap else {}
+            figures = {"unknown_voxels": histogram.unknown, "scans": histogram.scans, "grids": histogram.grids}
+            share = histogram.known_share
+            return counts | remapped | figures | {"known_share": None if np.isnan(share) else share}
+
+        return {
+            "location": self.location,
+            "classes": self.classes.name,
+            "remap": self.remap.name if self.remap else None,
+            "total": plain(self.total),
+            "splits": {split: plain(histogram) for split, histogram in self.by_split().items()},
+            "sequences": {path: plain(histogram) for path, histogram in self.sequences.items()},
+            "class_weights": self.weights(),
+            "failures": [list(failure) for failure in self.failures],
+        }
+
+
+def stats(
+    source: str | os.PathLike[str] | Source,
+    *,
+    grid: str = EVALUATION,
+    remap: str | Remap | None = "auto",
+    every: int = 1,
+    workers: int | None = 1,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Statistics:
+    """Count the classes of points and of a grid's known voxels, frame by frame.
+
+    Args:
+        source: a path or URL that `carlasc.open` knows, or a Source.
+        grid: the grid whose voxels are counted, in the sequences that have it; where one has a single other grid, that.
+        remap: what classes are summed to beside their own: a remap or its name, None, or "auto": the paper's 11 or SemanticKITTI's 19.
+        every: count every so many frames.
+        workers: processes that count side by side; None takes all cores.
+        executor: counts instead of processes of our own.
+        progress: called with the frames counted and their total.
+
+    Returns:
+        The histograms; a frame that cannot be read is among the `failures`.
+
+    Raises:
+        ArgumentError: `every` is less than 1, or the remap is unknown.
+        FormatError: sequences of several class tables, or a remap of another one.
+        MissingDataError: there is no data set, or nothing in it that has classes.
+    """
+    if every < 1:
+        raise ArgumentError(f"every: expected 1 or more, found {every}")
+    opened = open_source(source)
+    sequences = opened.sequences()
+    classes = _common_table(sequences.values())
+    chosen = _choose_remap(remap, classes)
+    tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
+    if not tasks:
+        raise MissingDataError(f"{opened.location}: expected labels of points or the grid {grid}, found neither")
+    total, done = sum(len(frames) for _, _, frames in tasks), 0
+    histograms = {path: Histogram.empty(classes) for path in sequences}
+    failures: list[tuple[str, str]] = []
+    counted = run_all(partial(_count, classes=classes), tasks, workers=count_workers(workers), executor=executor)
+    for (sequence, _, frames), (histogram, failed) in zip(tasks, counted, strict=True):
+        histograms[sequence.path] += histogram
+        failures += failed
+        done += len(frames)
+        if progress is not None:
+            progress(done, total)
+    splits = {path: sequence.split or "none" for path, sequence in sequences.items()}
+    return Statistics(opened.location, classes, chosen, histograms, splits, tuple(failures))
+
+
+_Task = tuple[Sequence, str, tuple[int, ...]]  # a sequence, a field with classes, some of its frames
+
+
+def _tasks(sequence: Sequence, grid: str, every: int) -> list[_Task]:
+    grids = sequence.grids
+    if grid not in grids and len(grids) == 1:
+        grid = next(iter(grids))
+    tasks: list[_Task] = []
+    for field in ("labels", f"{grid}/labels"):
+        frames = sequence.frames(field)[::every].tolist() if field in sequence.fields() else []
+        tasks += [(sequence, field, tuple(frames[i : i + _CHUNK])) for i in range(0, len(frames), _CHUNK)]
+    return tasks
+
+
+def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str, str]]]:
+    """Count the classes of some frames; runs in a worker."""
+    sequence, field, frames = task
+    histogram, failures = Histogram.empty(classes), []
+    for frame in frames:
+        try:
+            histogram += _count_frame(sequence, field, frame, classes)
+        except CarlascError as error:
+            failures.append((f"{sequence.path} {field} {frame:06d}", str(error)))
+    return histogram, failures
+
+
+def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable) -> Histogram:
+    labels = sequence.read(field, frame)
+    classes.check(labels, f"{sequence.location}: {field} of frame {frame}")
+    nothing = np.zeros(classes.num_channels, np.int64)
+    if field == "labels":
+        return Histogram(np.bincount(labels, minlength=classes.num_channels), nothing, scans=1)
+    labels = labels.reshape(-1)
+    counts = field.removesuffix("labels") + "counts"
+    if counts in sequence.fields():
+        known = sequence.read(counts, frame).reshape(-1) > 0
+        labels, unknown = labels[known], int(np.count_nonzero(~known))
+    else:
+        unknown = 0
+    return Histogram(nothing, np.bincount(labels, minlength=classes.num_channels), unknown, grids=1)
+
+
+def _common_table(sequences: Any) -> ClassTable:
+    tables = {sequence.metadata.classes.name: sequence.metadata.classes for sequence in sequences}
+    if len(tables) > 1:
+        raise FormatError(f"classes: expected one table, found {', '.join(sorted(tables))}: count the sequences apart")
+    return next(iter(tables.values()))
+
+
+def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | None:
+    if remap is None:
+        return None
+    if remap == "auto":
+        return next(
+            (r for r in REMAPS.values() if r.source == classes and r.name in ("carlasc11", "semantickitti19")), None
+        )
+    chosen = remap_named(remap) if isinstance(remap, str) else remap
+    if chosen.source.name != classes.name:
+        raise FormatError(f"remap {chosen.name}: expected labels of {chosen.source.name}, found {classes.name}")
+    return chosen
