@@ -62,7 +62,9 @@ class Street:
             (N, 3) float32 points in the sensor's frame, and their (N,) uint32 classes.
         """
         elevation, azimuth = np.meshgrid(
-            np.deg2rad(np.linspace(2, -25, channels)), np.linspace(-np.pi, np.pi, columns, endpoint=False), indexing="ij"
+            np.deg2rad(np.linspace(2, -25, channels)),
+            np.linspace(-np.pi, np.pi, columns, endpoint=False),
+            indexing="ij",
         )
         rays = np.stack(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
@@ -85,7 +87,9 @@ class Street:
         enter = np.where((enter < leave) & (enter > 0), enter, np.inf)
         nearest = enter.argmin(axis=1)
         distance = np.minimum(enter[np.arange(len(enter)), nearest], ground)
-        place = np.abs(origin[:2] + np.where(np.isfinite(distance), distance, 0)[:, None] * directions[:, :2]).min(axis=1)
+        place = np.abs(origin[:2] + np.where(np.isfinite(distance), distance, 0)[:, None] * directions[:, :2]).min(
+            axis=1
+        )
         surface = np.where(place < 4.0, ROAD, np.where(place < 7.0, SIDEWALK, TERRAIN))
         return distance, np.where(distance < ground, self.labels[nearest], surface).astype(np.uint32)
 
@@ -159,7 +163,7 @@ def vote(
     flip: NDArray[np.float32],
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
-    """Vote a grid from a scan and three more sensors beside it: a vote a point, a free one every 1.5 m of its ray."""
+    """Vote a grid from a scan and three more sensors beside it: a vote a point, a free one every 3 m of its ray."""
     votes = np.zeros(spec.num_voxels * 25, np.int64)
     for offset in ((0.0, 0.0, 0.0), (12.0, 2.0, 1.0), (-9.0, -3.0, 2.0), (3.0, 5.0, 1.5)):
         other = pose.copy()
@@ -168,8 +172,8 @@ def vote(
         origin = np.array(offset)
         samples, ids = [seen + origin], [classes]
         distance = np.linalg.norm(seen, axis=1)
-        for step in range(1, int(50 / 1.5)):
-            share = (distance - 1.5 * step) / np.maximum(distance, 1e-6)
+        for step in range(1, int(50 / 3)):
+            share = (distance - 3.0 * step) / np.maximum(distance, 1e-6)
             samples.append(seen[share > 0] * share[share > 0, None] + origin)
             ids.append(np.zeros(int((share > 0).sum()), np.uint32))
         voxels = spec.flat_index(np.concatenate(samples) * flip)
