@@ -209,11 +209,11 @@ def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: Ar
     faces = []
     for one, two in pairwise(angles):
         a, b = (np.cos(angle) * right + np.sin(angle) * up for angle in (one, two))
-        thin, thick = width / 2, np.minimum(1.5 * width, head / 2)
+        thin, thick = head / 9, head / 3
         faces += [
             (tails + thin * a, tails + thin * b, neck + thin * b, neck + thin * a),
             (neck + thick * a, neck + thick * b, tip, tip),
-            (neck, neck, neck + thick * b, neck + thick * a),
+            (neck + thin * a, neck + thin * b, neck + thick * b, neck + thick * a),
             (tails, tails, tails + thin * b, tails + thin * a),
         ]
     corners = np.array(faces).transpose(2, 0, 1, 3).reshape(-1, 4, 3)

@@ -230,13 +230,13 @@ def _fill(widths: list[int], limit: int, gap: int) -> list[list[int]]:
 
 
 def _tiling(width: int, height: int, panels: int, aspect: float) -> tuple[int, int]:
-    """Return the columns and rows in which pictures of an aspect come out largest."""
+    """Return the columns and rows in which pictures of an aspect come out largest; rather beside than above each other."""
 
     def scale(columns: int) -> float:
         rows = -(-panels // columns)
         return min(width / columns / aspect, height / rows)
 
-    columns = max(range(1, panels + 1), key=scale)
+    columns = max(range(panels, 0, -1), key=scale)
     return columns, -(-panels // columns)
 
 

@@ -22,7 +22,9 @@ SAMPLES = 2  # samples a pixel, each way
 
 _SKY_RAYS = 12
 _SKY_RANGE_M = 6.0  # what stands farther away darkens no sky
-_AMBIENT, _SUN = 0.62, 0.52
+_TO_SUN = np.array([-0.42, -0.62, 1.0])  # from behind on the left
+_AMBIENT = 0.6
+_SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that an open, level, sunlit face has just its own colour
 _EDGE_DARKNESS = 0.34
 _BAND = 1 << 19  # rays at a time: keeps memory bounded
 
@@ -114,8 +116,7 @@ def _embree_scene(mesh: QuadMesh) -> tuple[Any, Any]:
 
 def _suns(left_handed: bool) -> NDArray[np.float32]:
     """(SAMPLES^2, 3) unit vectors to points of the sun's disc, behind on the left of the vehicle."""
-    side = 1.0 if left_handed else -1.0
-    sun = np.array([-0.42, -0.62 * side, 1.0])
+    sun = _TO_SUN * (1.0, 1.0 if left_handed else -1.0, 1.0)
     spread = 0.02 * np.array([(a, b) for a in np.linspace(-1, 1, SAMPLES) for b in np.linspace(-1, 1, SAMPLES)])
     suns = sun + np.column_stack([spread, np.zeros(len(spread))])
     return (suns / np.linalg.norm(suns, axis=1, keepdims=True)).astype(np.float32)
