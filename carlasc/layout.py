@@ -9,7 +9,6 @@ folder `<grid>`. `poses` and `times` live in text files, one line a frame.
 from __future__ import annotations
 
 import io
-import re
 import zipfile
 from dataclasses import dataclass, replace
 from typing import Any
@@ -193,8 +192,10 @@ def grid_folder(spec: GridSpec) -> str:
 
 def frame_of(file_name: str, suffix: str) -> int | None:
     """Return the frame number of a file name such as `000012.label`, None if it is no frame of that suffix."""
-    stem = file_name.removesuffix(suffix)
-    return int(stem) if stem != file_name and re.fullmatch(r"[0-9]{6,}", stem) else None
+    if not file_name.endswith(suffix):
+        return None
+    stem = file_name[: len(file_name) - len(suffix)]
+    return int(stem) if len(stem) >= 6 and stem.isascii() and stem.isdigit() else None
 
 
 def encode_poses(poses: NDArray[np.float64]) -> bytes:
@@ -234,7 +235,7 @@ def _encode_lines(rows: NDArray[np.float64]) -> bytes:
 
 def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
     try:
-        rows = [[float(word) for word in line.split()] for line in data.decode().splitlines() if line.strip()]
+        rows = [list(map(float, line.split())) for line in data.decode().splitlines() if line.strip()]
     except (UnicodeDecodeError, ValueError) as error:
         raise FormatError(f"{where}: expected {columns} numbers a line, found something else: {error}") from error
     for number, row in enumerate(rows, 1):

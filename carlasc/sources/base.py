@@ -206,8 +206,8 @@ class Sequence(ABC):
 
     def scan_frames(self) -> NDArray[np.int64]:
         """Return the frames of the sequence: those with points, or, where it has only grids, those of all fields."""
-        if "points" in self.fields():
-            return self.frames("points")
+        if len(points := self.frames("points")):
+            return points
         return np.unique(
             np.concatenate([np.empty(0, np.int64), *(self.frames(field) for field in sorted(self.fields()))])
         )
