@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0917 (compiled functions take scalars and arrays, by position)
 """The hot loop of the ground truth: the votes of one observation, and what all votes of a voxel decide.
 
 Blocks of rays are clipped to the grid and their samples placed by the vectorised code of rays.py; whatever that is not sure of is

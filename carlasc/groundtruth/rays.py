@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0917 (compiled functions take scalars and arrays, by position)
 """The same samples as rule.py's, many at a time: vectorised, and sure of every answer that it gives.
 
 Rays are clipped to the grid's box, and samples placed in working coordinates: cells (of a cylindrical grid: metres across, cells upwards)
@@ -10,12 +9,12 @@ are DOUBTFUL: the rule itself places them.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.groundtruth.rule import Cells, Pose, Triple, before_sensor, inlined, jit, transform, unit_ray
+from carlasc.groundtruth.rule import Cells, Pose, Real, Triple, before_sensor, inlined, jit, transform, unit_ray
 
 DOUBTFUL = -1  # index of a sample too near a cell's edge to be sure of
 
@@ -139,7 +138,7 @@ def empty_rays(n: int) -> Rays:
 
 
 @inlined
-def narrow(first: float, last: float, start: float, stride: float, low: float, high: float) -> tuple[float, float]:
+def narrow(first: Real, last: Real, start: float, stride: Real, low: Real, high: Real) -> tuple[Real, Real]:
     """Return the steps from `first` to `last` at which `start - step * stride` is between `low` and `high`.
 
     No step at all gives an empty range; a coordinate that stays on a bound (0 / 0) leaves the range as it is.

@@ -1,4 +1,3 @@
-# ruff: noqa: PLR0917 (compiled functions take scalars and arrays, by position)
 """The rule that places a sample in a voxel, bit for bit (FORMAT section 4), one sample at a time.
 
 Norm and unit ray are float32, as the points are; distances, differences and the transform are float64; cells are half-open, floor, clamp.
@@ -7,7 +6,7 @@ Norm and unit ray are float32, as the points are; distances, differences and the
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from carlasc.geometry import Transform
 from carlasc.grids import GridSpec
 
+Real = Any  # float32 or float64: compiled code keeps them apart, NumPy's stubs do not
 Triple = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """The upper 3 x 4 of a transform, row-major, as scalars."""
@@ -47,7 +47,7 @@ def as_pose(dst_T_src: Transform) -> Pose:
 
 
 @inlined
-def transform(pose: Pose, x: float, y: float, z: float) -> Triple:
+def transform(pose: Pose, x: Real, y: Real, z: Real) -> tuple[Real, Real, Real]:
     """Return R @ p + t, summed from the left."""
     return (
         pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
@@ -82,21 +82,21 @@ def voxel_of(x: float, y: float, z: float, cells: Cells) -> int:
 
 
 @inlined
-def unit_ray(x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
     """Return the norm of a point and the unit ray to it, all float32."""
     norm = np.sqrt(x * x + y * y + z * z)
     return norm, x / norm, y / norm, z / norm
 
 
 @inlined
-def before_sensor(x: float, ux: float) -> bool:
+def before_sensor(x: Real, ux: Real) -> bool:
     """Return whether a sample is kept: its x over the unit ray's is positive. A ray whose x is 0 drops out altogether."""
-    return x / ux > 0.0 and ux != 0.0
+    return bool(x / ux > 0.0 and ux != 0.0)
 
 
 @jit
 def sample_voxel(
-    x: np.float32, y: np.float32, z: np.float32, step: float, free_step_m: float, pose: Pose, cells: Cells
+    x: Real, y: Real, z: Real, step: float, free_step_m: float, pose: Pose, cells: Cells
 ) -> tuple[bool, int]:
     """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and its voxel."""
     _, ux, uy, uz = unit_ray(x, y, z)

@@ -67,7 +67,7 @@ def cast(
     rays = rays.reshape(-1, 3)
     with np.errstate(divide="ignore"):
         inverse = 1 / rays
-    distance = np.where(rays[:, 2] < 0, (GROUND_Z - place[2]) * inverse[:, 2], np.inf)
+    distance = np.where(rays[:, 2] < 0, (GROUND_Z - place[2]) * inverse[:, 2], 1e3)
     across = np.abs(place[1] + distance * rays[:, 1])
     labels = np.where(across < 7, 7, np.where(across < 15, 8, 22)).astype(np.uint8)
     for (low, high), label in zip(boxes, box_labels, strict=True):

@@ -1,0 +1,85 @@
+"""What is refused, what is stored, and that ballots are independent."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from helpers.lidar_frames import street_frame
+
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.grids import GridSpec
+from carlasc.groundtruth.observations import Observation
+from carlasc.groundtruth.voting import OCCUPIED_DTYPE, Ballot, Votes, count_votes
+from carlasc.labels import CARLA
+from carlasc.layout import VOTES_DTYPE
+
+POINTS, LABELS, POSE = np.ones((4, 3), np.float32), np.full(4, 7, np.uint8), np.eye(4)
+
+
+@pytest.mark.parametrize("free_step_m", [0.0, -1.5, float("nan"), float("inf")])
+def test_a_free_step_that_is_no_positive_number_is_refused(free_step_m: float) -> None:
+    with pytest.raises(ArgumentError, match="free step: expected a positive number"):
+        count_votes([], GridSpec.published(), free_step_m=free_step_m)
+
+
+def test_an_unknown_vote_rule_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="expected sensor or sample, found 'ray'"):
+        count_votes([], GridSpec.published(), vote="ray")  # type: ignore[arg-type]
+
+
+def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:
+    ballot = Ballot(GridSpec.published())
+    labels = np.array([7, 7, 25, 25], np.uint8)
+    with pytest.raises(FormatError, match="expected class ids 0..24 .* found 25 on 2 of 4"):
+        ballot.add(Observation(POINTS, labels, POSE))
+    assert len(ballot.votes().to_sparse()) == 0
+
+
+@pytest.mark.parametrize(
+    ("points", "labels", "pose", "match"),
+    [
+        (POINTS, LABELS[:3], POSE, r"expected shape \(4,\), one a point, found \(3,\)"),
+        (POINTS[:, :2], LABELS, POSE, r"expected shape \(N, 3\) float32, found \(4, 2\)"),
+        (POINTS.astype(np.float64), LABELS, POSE, r"float32, found \(4, 3\) float64"),
+        (POINTS, LABELS.astype(np.int64), POSE, "expected unsigned integers, found int64"),
+        (POINTS, LABELS, 2 * np.eye(4), "expected a rigid transform"),
+    ],
+)
+def test_an_observation_whose_parts_disagree_is_refused(points, labels, pose, match) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(FormatError, match=match):
+        Observation(points, labels, pose)
+
+
+def test_no_observation_at_all_leaves_everything_unknown() -> None:
+    grid = count_votes([], GridSpec.published()).to_grid()
+    assert not grid.known.any()
+    assert not grid.labels.any()
+
+
+def test_an_observation_without_points_is_a_voter_without_votes() -> None:
+    votes = count_votes([Observation(POINTS[:0], LABELS[:0], POSE)], GridSpec.published())
+    assert len(votes.to_sparse()) == 0
+
+
+def test_sparse_votes_are_sorted_and_those_that_do_not_fit_are_kept_as_the_most_that_does() -> None:
+    spec = GridSpec("cartesian", (2, 1, 1), (0.0, 0.0, 0.0), (2.0, 1.0, 1.0))
+    occupied = np.array([(1, 9, 5), (0, 7, 70_000), (1, 3, 65_535)], OCCUPIED_DTYPE)
+    votes = Votes(spec, CARLA, np.array([0, 100_000], np.int64).reshape(spec.size), occupied)
+    sparse = votes.to_sparse()
+    assert sparse.dtype == VOTES_DTYPE
+    assert sparse.tolist() == [(0, 7, 65_535), (1, 0, 65_535), (1, 3, 65_535), (1, 9, 5)]
+    counts = votes.to_grid().counts
+    assert counts is not None
+    assert counts[:, 0, 0].tolist() == [70_000, 165_540]
+
+
+def test_ballots_of_several_threads_do_not_meet() -> None:
+    frame = street_frame(sensors=4, channels=16, columns=256, distinct=2)
+    specs = [GridSpec.published(name) for name in ("cartesian", "cylindrical", "cartesian", "cylindrical")]
+    alone = [count_votes(frame, spec).to_sparse() for spec in specs]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda spec: count_votes(frame, spec).to_sparse(), specs))
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one, other)
