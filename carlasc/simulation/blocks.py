@@ -20,6 +20,7 @@ KINDS = ("downtown", "houses", "houses", "park", "square")
 
 
 def fill_block(plan: Plan, block: Block, kind: str) -> None:
+    """Lay a block's sidewalk and land and put on it what its use, one of KINDS, asks for."""
     inner = lay_sidewalk(plan, block)
     land = Land(inner)
     lay_ground(plan, inner, {"downtown": GROUND, "square": GROUND}.get(kind, TERRAIN))
@@ -82,7 +83,7 @@ def _front_garden(plan: Plan, side: Side, land: Land, along: float, width: float
             along + float(rng.uniform(0, width)), INNER_M + bay + float(rng.uniform(1.2, max(back - 0.5, 1.5)))
         )
         if land.claim(Rectangle(place, (1.2, 1.2), 0.0), 0.0):
-            plan.put(plants.bush(rng), place, 0.0)
+            plan.put(plan.plants.bush(), place, 0.0)
 
 
 def _yard(plan: Plan, block: Block, land: Land, kind: str) -> None:
@@ -95,7 +96,7 @@ def _yard(plan: Plan, block: Block, land: Land, kind: str) -> None:
         pick = rng.random()
         if pick < 0.55:
             if land.claim(Rectangle(place, (2.4, 2.4), 0.0), 0.5, 1.5):
-                plan.put(plants.broadleaf(rng) if rng.random() < 0.7 else plants.conifer(rng), place, rng.uniform(0, 6))
+                plan.put(plan.plants.tree(), place, 0.0)
         elif pick < 0.75:
             yaw = block.sides[int(rng.integers(len(block.sides)))].yaw_rad
             length = float(rng.uniform(6, 12))
@@ -105,7 +106,7 @@ def _yard(plan: Plan, block: Block, land: Land, kind: str) -> None:
                 )
         elif pick < 0.9:
             if land.claim(Rectangle(place, (1.4, 1.4), 0.0), 0.1, 0.5):
-                plan.put(plants.bush(rng), place, 0.0)
+                plan.put(plan.plants.bush(), place, 0.0)
         elif land.claim(Rectangle(place, (1.6, 1.6), 0.0), 0.1, 0.5):
             plan.put(furniture.trash(rng), place, 0.0)
 
@@ -133,9 +134,9 @@ def _park(plan: Plan, block: Block, land: Land) -> None:
         if not land.claim(Rectangle(place, (size, size), 0.0), 0.4, 0.8):
             continue
         if pick < 0.5:
-            plan.put(plants.broadleaf(rng) if rng.random() < 0.75 else plants.conifer(rng), place, rng.uniform(0, 6))
+            plan.put(plan.plants.tree(), place, 0.0)
         elif pick < 0.8:
-            plan.put(plants.bush(rng), place, 0.0)
+            plan.put(plan.plants.bush(), place, 0.0)
         else:
             plan.put(
                 furniture.bench() if rng.random() < 0.7 else furniture.bin_(), place, rng.uniform(0, 6), KERB_M + 0.2
@@ -167,7 +168,7 @@ def _square(plan: Plan, block: Block, land: Land) -> None:
     makers: tuple[Callable[[], Mesh], ...] = (
         furniture.kiosk,
         lambda: furniture.planter(rng),
-        lambda: plants.broadleaf(rng),
+        plan.plants.street_tree,
         furniture.bench,
         lambda: furniture.trash(rng),
     )

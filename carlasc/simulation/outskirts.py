@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from carlasc.simulation import furniture, plants
+from carlasc.simulation import furniture
 from carlasc.simulation.meshes import closed, lifted
 from carlasc.simulation.paving import TERRAIN, lay_sidewalk
 from carlasc.simulation.plan import INNER_M, KERB_M, Plan
@@ -50,4 +50,4 @@ def fill_outskirts(plan: Plan, block: Block) -> None:
         for _ in range(22):
             place = side.point(float(rng.uniform(2, side.length_m - 2)), INNER_M + float(rng.uniform(13, 40)))
             if land.claim(Rectangle(place, (3.0, 3.0), 0.0), 0.3):
-                plan.put(plants.broadleaf(rng) if rng.random() < 0.5 else plants.conifer(rng), place, 0.0, KERB_M + 0.8)
+                plan.put(plan.plants.tree(), place, 0.0, KERB_M + 0.8)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from carlasc.geometry import Transform, rotation_z, translation
 from carlasc.simulation.buildings import building
 from carlasc.simulation.meshes import Mesh, MeshBuilder
+from carlasc.simulation.plants import Nursery
 from carlasc.simulation.plots import Rectangle
 from carlasc.simulation.streets import HALF_ROAD_M, SIDEWALK_M
 
@@ -37,12 +38,14 @@ class Plan:
 
     Attributes:
         rng: what they draw from.
+        plants: the plants that grow in it.
         builder: the town's mesh.
         solids: footprints of buildings with their heights, metres.
         parking: parking spaces.
     """
 
     rng: np.random.Generator
+    plants: Nursery
     builder: MeshBuilder = field(default_factory=MeshBuilder)
     solids: list[tuple[Rectangle, float]] = field(default_factory=list)
     parking: list[ParkingSpace] = field(default_factory=list)

@@ -5,10 +5,39 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.geometry import rotation_z
 from carlasc.labels import CARLA
 from carlasc.simulation.meshes import Mesh, MeshBuilder
 
 VEGETATION = CARLA.id_of("Vegetation")
+
+
+class Nursery:
+    """The kinds of plants of a town: some of each, which stand in it many times, turned and scaled."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._trees = [broadleaf(rng) for _ in range(12)] + [conifer(rng) for _ in range(4)]
+        self._street_trees = self._trees[:12]
+        self._bushes = [bush(rng) for _ in range(8)]
+
+    def tree(self) -> Mesh:
+        """Return any tree."""
+        return self._pick(self._trees)
+
+    def street_tree(self) -> Mesh:
+        """Return a tree with a clear trunk."""
+        return self._pick(self._street_trees)
+
+    def bush(self) -> Mesh:
+        """Return a bush."""
+        return self._pick(self._bushes)
+
+    def _pick(self, kinds: list[Mesh]) -> Mesh:
+        kind = kinds[int(self._rng.integers(len(kinds)))]
+        scale = float(self._rng.uniform(0.85, 1.15))
+        turned = kind.moved(rotation_z(float(self._rng.uniform(-np.pi, np.pi))))
+        return Mesh(turned.vertices * scale, turned.faces, turned.labels)
 
 
 def broadleaf(rng: np.random.Generator) -> Mesh:

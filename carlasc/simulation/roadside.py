@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from carlasc.geometry import rotation_z, translation
-from carlasc.simulation import furniture, plants
+from carlasc.simulation import furniture
 from carlasc.simulation.meshes import Mesh
 from carlasc.simulation.plan import INNER_M, ParkingSpace, Plan
 from carlasc.simulation.streets import BAY_M, HALF_ROAD_M, Side, Streets
@@ -21,7 +21,7 @@ def equip_side(plan: Plan, side: Side, trees: bool) -> None:
         plan.put(furniture.street_lamp(), side.point(at, side.kerb_offset(at) + 0.45), side.yaw_rad)
     taken = list(lamps)
     makers: tuple[tuple[float, Callable[[], Mesh]], ...] = (
-        (0.34, lambda: plants.broadleaf(rng) if trees else furniture.bollard()),
+        (0.34, plan.plants.street_tree if trees else furniture.bollard),
         (0.14, furniture.bin_),
         (0.12, furniture.bench),
         (0.10, lambda: furniture.sign(rng)),
@@ -41,6 +41,7 @@ def equip_side(plan: Plan, side: Side, trees: bool) -> None:
 
 
 def park_in_bay(plan: Plan, side: Side) -> None:
+    """Mark the parking spaces of a street's bay, if it has one."""
     if not side.bay:
         return
     for at in np.arange(6.0, side.length_m - 6.0, 6.4):

@@ -11,6 +11,7 @@ from carlasc.simulation.meshes import Mesh
 from carlasc.simulation.outskirts import fill_outskirts
 from carlasc.simulation.paving import paint, pave
 from carlasc.simulation.plan import ParkingSpace, Plan
+from carlasc.simulation.plants import Nursery
 from carlasc.simulation.plots import Rectangle
 from carlasc.simulation.roadside import add_footbridge, equip_crossings
 from carlasc.simulation.streets import Streets, lay_out
@@ -36,7 +37,7 @@ class Town:
 def build_town(rng: np.random.Generator) -> Town:
     """Draw a town: streets first, then each block's sidewalk, land, buildings, plants and furniture."""
     streets = lay_out(rng)
-    plan = Plan(rng)
+    plan = Plan(rng, Nursery(rng))
     pave(plan, streets)
     paint(plan, streets)
     kinds = _draw_kinds(rng, len(streets.blocks) - 1)
