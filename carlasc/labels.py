@@ -27,6 +27,7 @@ class ClassTable:
         names: id -> name.
         colors: id -> RGB 0..255.
         moving: ids whose label itself says that the thing moves.
+        movable: ids of things that may move, whether they do or not.
         deformable: ids of things that change their shape as they move: people.
         num_channels: number of vote channels: ids are below it. More than the ids need where the format says so.
     """
@@ -35,6 +36,7 @@ class ClassTable:
     names: Mapping[int, str]
     colors: Mapping[int, Color]
     moving: frozenset[int] = field(default=frozenset())
+    movable: frozenset[int] = field(default=frozenset())
     deformable: frozenset[int] = field(default=frozenset())
     num_channels: int = 0
 
@@ -173,6 +175,7 @@ CARLA = ClassTable(
     "carla",
     {i: name for i, (name, _, _) in enumerate(_CARLA)},
     {i: color for i, (_, color, _) in enumerate(_CARLA)},
+    movable=frozenset({4, 10}),
     deformable=frozenset({4}),
     num_channels=25,  # as every published params.json says, although 23 classes exist
 )
@@ -185,6 +188,8 @@ CARLASC11 = ClassTable(
             + [(200, 40, 255), (90, 30, 150), (255, 0, 255), (255, 150, 255), (75, 0, 75)]
         )
     ),
+    movable=frozenset({4, 10}),
+    deformable=frozenset({4}),
 )
 
 _KITTI: tuple[tuple[int, str, Color, int], ...] = (  # raw id, name, colour, class of the benchmark (0: ignored)
@@ -228,6 +233,7 @@ SEMANTICKITTI = ClassTable(
     {i: name for i, name, _, _ in _KITTI},
     {i: color for i, _, color, _ in _KITTI},
     moving=frozenset(range(252, 260)),
+    movable=frozenset({10, 11, 13, 15, 16, 18, 20, 30, 31, 32, *range(252, 260)}),
     deformable=frozenset({30, 254}),
 )
 _KITTI19 = {0: "unlabeled"} | {k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)}
@@ -235,6 +241,8 @@ SEMANTICKITTI19 = ClassTable(
     "semantickitti19",
     dict(sorted(_KITTI19.items())),
     {0: (255, 255, 255)} | {k: color for i, _, color, k in _KITTI if k and i < 252 and i not in (13, 16, 60)},
+    movable=frozenset(range(1, 9)),
+    deformable=frozenset({6}),
 )
 
 
@@ -276,6 +284,8 @@ SEMANTICPOSS = ClassTable(
     "semanticposs",
     {i: _POSS_NAMES.get(i, f"class {i}") for i in sorted(_POSS_TO_CARLA)},
     {i: _CARLA[_POSS_TO_CARLA[i]][1] for i in sorted(_POSS_TO_CARLA)},
+    movable=frozenset({4, 5, 6, 7, 21}),
+    deformable=frozenset({4, 5}),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +117,11 @@ class Standing:
     labels: NDArray[np.int64]
     points: NDArray[np.float64]
 
+    @classmethod
+    def none(cls, frame: int) -> Standing:
+        """Return no points at all."""
+        return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
+
     def in_place_of(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
         """Return the standing points of a segment's class where the segment was, None where there are hardly any."""
         lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
@@ -128,11 +134,11 @@ class Standing:
 
 
 def standing_points(
-    frame: int, scan: Scan, world_T_sensor: Transform, labels: set[int], *, min_speed_m_s: float = MIN_SPEED_M_S
+    frame: int, scan: Scan, world_T_sensor: Transform, labels: Collection[int], *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> Standing:
     """Return the points of classes that move elsewhere, but not here."""
     if scan.flow is None or scan.labels is None:
-        return Standing(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
+        return Standing.none(frame)
     slow = ~(np.square(np.nan_to_num(scan.flow)).sum(axis=1) > min_speed_m_s**2)
     members = np.flatnonzero(slow & np.isin(scan.labels, sorted(labels)))
     points = transform_points(world_T_sensor, scan.points[members])
