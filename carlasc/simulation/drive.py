@@ -6,7 +6,7 @@ frame can be made by itself, in any process, with the same bytes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -107,16 +107,23 @@ class Drive:
         ego = self.ego_pose(frame)
         return np.stack([ego @ translation(offset) for offset in self.sensor_offsets(count)])
 
-    def record(self, frame: int, sensor: int = 0, count: int | None = None) -> Recording:
-        """Return what a sensor of the vehicle records in a frame.
+    def record(self, frame: int, sensor: int = 0) -> Recording:
+        """Return what a sensor of the vehicle records in a frame: sensor 0 is the ego one, any number may follow.
 
-        Args:
-            frame: frame number, from 0.
-            sensor: 0 is the ego sensor.
-            count: ignored sensors beyond it need not exist; any number above `sensor` gives the same.
+        Points are in the sensor's frame; velocities are over ground (ego motion removed), in the sensor's frame.
+
+        Raises:
+            ArgumentError: the frame or the sensor is negative.
         """
-        pose = self.sensor_poses(frame, max(sensor + 1, count or 0))[sensor]
+        if sensor < 0:
+            raise ArgumentError(f"sensor: expected 0 or more, found {sensor}")
+        pose = self.sensor_poses(frame, sensor + 1)[sensor]
         return self._observe(frame, pose, self._random(_NOISE, frame, sensor))
+
+    def scan(self, frame: int, sensor: int = 0) -> Scan:
+        """Return a sensor's scan with all that is known of its points: labels, flow, instances."""
+        recording = self.record(frame, sensor)
+        return replace(recording.scan, flow=recording.flow())
 
     def reference_observations(self, frame: int, sensors: int = 60, seed: int = 0) -> list[Recording]:
         """Return what many other sensors see at the very instant of a frame: the judge of any ground truth.

@@ -1,0 +1,12 @@
+from __future__ import annotations
+
+import pytest
+
+from carlasc.simulation.drive import Drive
+from carlasc.simulation.lidar import Lidar
+
+
+@pytest.fixture(scope="session")
+def drive() -> Drive:
+    """A drive in heavy traffic with a coarse LiDAR, as noisy as the real one."""
+    return Drive(seed=3, traffic="heavy", lidar=Lidar(channels=32, points=16_000))
