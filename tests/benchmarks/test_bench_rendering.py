@@ -1,0 +1,34 @@
+"""Pictures of 1280 x 720 pixels: grids as full as those of the data set, and a full scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from carlasc.grids import Grid, GridSpec
+from carlasc.rendering import render_grid, render_scan
+from carlasc.scans import Scan
+
+
+def street(spec):
+    """A grid as full as a town's: ground everywhere, walls along a street, trees, cars."""
+    x, y, z = np.moveaxis(spec.from_axes(spec.centers()), -1, 0)
+    labels = np.where(z < -1.6, np.where(abs(y) < 5, 7, np.where(abs(y) < 8, 8, 22)), 0)
+    labels[(abs(abs(y) - 12) < 0.4) & (np.sin(x / 3) > -0.8)] = 1
+    labels[(np.hypot((x % 8) - 4, abs(y) - 9) < 1.6) & (z > -0.5)] = 9
+    labels[(abs((x % 11) - 5) < 2.2) & (abs(abs(y) - 3.5) < 0.9) & (z < 0)] = 10
+    return Grid(spec, labels.astype(np.uint8))
+
+
+@pytest.mark.benchmark(group="rendering")
+@pytest.mark.parametrize("view", ["perspective", "bev"])
+@pytest.mark.parametrize("name", ["cartesian", "cartesian_fine", "cylindrical"])
+def test_bench_full_grid(benchmark, name, view):
+    grid = street(GridSpec.published(name))
+    benchmark.pedantic(render_grid, (grid,), {"view": view}, rounds=5, warmup_rounds=1)
+
+
+@pytest.mark.benchmark(group="rendering")
+def test_bench_scan(benchmark):
+    points = np.random.default_rng(0).uniform((-25, -25, -2), (25, 25, 1), (130_000, 3)).astype(np.float32)
+    benchmark.pedantic(render_scan, (Scan(points),), rounds=5, warmup_rounds=1)
