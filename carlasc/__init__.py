@@ -17,6 +17,20 @@ _HOME = {  # public name -> module
     "ClassTable": "labels",
     "Remap": "labels",
     "open": "sources",
+    "Source": "sources",
+    "Sink": "sources",
+    "Dataset": "dataset",
+    "collate": "dataset",
+    "regrid": "groundtruth",
+    "simulate": "simulation",
+    "render": "rendering",
+    "pack": "packing",
+    "unpack": "packing",
+    "info": "inspection.overview",
+    "stats": "inspection.statistics",
+    "validate": "inspection.validation",
+    "evaluate": "metrics",
+    "download": "downloads",
 }
 
 __all__ = ["__version__", "errors", *_HOME]  # noqa: PLE0604 (names of the table)
