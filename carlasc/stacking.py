@@ -1,6 +1,7 @@
 """Scans to dense arrays, fast: moved, binned and counted in one pass of compiled code, and labels looked up in another.
 
-The rules are those of `GridSpec` (`to_axes`, `index`) in the same float64 arithmetic, so every voxel is the same. A scan is
+The rules are those of `GridSpec` (`to_axes`, `index`): every voxel is the same, for where quicker arithmetic could be in doubt the rules
+themselves are followed. A scan is
 worked through in blocks that stay in the cache: the columns are split, and the rest vectorises. Loading this module loads Numba.
 """
 
@@ -18,7 +19,13 @@ from carlasc.geometry import Transform
 from carlasc.grids import GridSpec
 
 _BLOCK = 256  # points at once: their float64 columns and cells take 7 KB of the first-level cache
-_EDGE = 0.5 - 1e-6  # a product with 1 / voxel_size is off by less than 1e-6 cells: nearer to an edge, divide
+_DEGREE = 11
+_ARCTAN = tuple(  # of s: arctan(sqrt(s)) / sqrt(s) on 0..1, off by less than 1e-9
+    np.polynomial.chebyshev.Chebyshev.interpolate(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), _DEGREE, [0, 1])
+    .convert(kind=np.polynomial.Polynomial)
+    .coef.tolist()
+)
+_ARCTAN_ERROR = 1e-9
 
 
 def stack_scans(
@@ -59,9 +66,11 @@ def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype
 
 
 def _geometry(spec: GridSpec) -> tuple[Any, ...]:
-    voxel = spec.voxel_size
-    sizes = tuple(float(n) for n in spec.size)
-    return spec.lower, spec.upper, tuple(voxel), tuple(1.0 / voxel), sizes, spec.coordinates == "cylindrical"
+    voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
+    cylindrical = spec.coordinates == "cylindrical"
+    # How many cells a quick coordinate may be off: its rounding, that of voxel_size * size against the bounds, and the azimuth's error.
+    doubt = 1e-6 + 1e-7 * max(sizes) + (_ARCTAN_ERROR / float(voxel[1]) if cylindrical else 0.0)
+    return spec.lower, spec.upper, tuple(voxel), tuple(1.0 / voxel), sizes, cylindrical, doubt
 
 
 def _rows(transform: Transform) -> tuple[float, ...]:
@@ -114,45 +123,60 @@ def _move(x, y, z, count, rows):  # type: ignore[no-untyped-def]
 
 
 @_step
-def _to_cylindrical(x, y, count, lower, upper):  # type: ignore[no-untyped-def]
+def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore[no-untyped-def]
+    """Write the radius, and the azimuth to within _ARCTAN_ERROR: `arctan2` itself does not vectorise."""
+    c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, c11 = _ARCTAN
     for n in range(count):
-        azimuth = np.arctan2(y[n], x[n])
-        turned = azimuth
-        if azimuth < lower:
-            turned = azimuth + 2 * np.pi
-        elif azimuth >= upper:
-            turned = azimuth - 2 * np.pi
-        x[n] = np.sqrt(x[n] * x[n] + y[n] * y[n])
-        y[n] = turned if lower <= turned < upper else azimuth
+        a, b = np.abs(x[n]), np.abs(y[n])
+        long, short = (a, b) if a > b else (b, a)
+        t = short / long
+        s = t * t
+        high = c6 + s * (c7 + s * (c8 + s * (c9 + s * (c10 + s * c11))))
+        angle = t * (c0 + s * (c1 + s * (c2 + s * (c3 + s * (c4 + s * (c5 + s * high))))))
+        angle = np.pi / 2 - angle if b > a else angle
+        angle = np.pi - angle if x[n] < 0 else angle
+        angle = -angle if y[n] < 0 else angle
+        turned = angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
+        angle = turned if (turned >= lower) & (turned < upper) else angle
+        azimuth[n] = angle if long > 0 else lower  # at the origin: on an edge, so looked at again
+        radius[n] = np.sqrt(a * a + b * b)
 
 
 @_step
 def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def]
-    """Write the flat index of each point's voxel, -1 outside.
+    """Write the flat index of each point's voxel given on the grid's axes: -1 outside, -2 where it is in doubt.
 
-    Three divisions a point would take half the time: multiply instead, and divide only where the result is so near to a
-    cell's edge that the rounding could matter.
+    Three divisions a point would take half the time. So multiply, and doubt what comes near to a cell's edge.
     """
-    (l0, l1, l2), (u0, u1, u2), (v0, v1, v2), (w0, w1, w2), (s0, s1, s2), _ = geometry
-    edges = 0
+    (l0, l1, l2), _, _, (w0, w1, w2), (s0, s1, s2), _, doubt = geometry
+    clear = 0.5 - doubt
+    doubtful = 0
     for n in range(count):
-        a, b, c = x[n], y[n], z[n]
-        inside = (a >= l0) & (a < u0) & (b >= l1) & (b < u1) & (c >= l2) & (c < u2)
-        a, b, c = (a - l0) * w0, (b - l1) * w1, (c - l2) * w2
+        a, b, c = (x[n] - l0) * w0, (y[n] - l1) * w1, (z[n] - l2) * w2
         i, j, k = np.floor(a), np.floor(b), np.floor(c)
-        edge = (np.abs(a - i - 0.5) > _EDGE) | (np.abs(b - j - 0.5) > _EDGE) | (np.abs(c - k - 0.5) > _EDGE)
-        i = i if i < s0 else s0 - 1.0
-        j = j if j < s1 else s1 - 1.0
-        k = k if k < s2 else s2 - 1.0
-        edges += edge & inside
-        cell = -2.0 if edge else (i * s1 + j) * s2 + k
-        cells[n] = np.int32(cell if inside else -1.0)
-    for n in range(count if edges else 0):
-        if cells[n] == -2:
-            i = min(np.floor((x[n] - l0) / v0), s0 - 1.0)
-            j = min(np.floor((y[n] - l1) / v1), s1 - 1.0)
-            k = min(np.floor((z[n] - l2) / v2), s2 - 1.0)
-            cells[n] = np.int32((i * s1 + j) * s2 + k)
+        inside = (i >= 0) & (i < s0) & (j >= 0) & (j < s1) & (k >= 0) & (k < s2)
+        edge = (np.abs(a - i - 0.5) > clear) | (np.abs(b - j - 0.5) > clear) | (np.abs(c - k - 0.5) > clear)
+        doubtful += edge
+        cell = (i * s1 + j) * s2 + k if inside else -1.0
+        cells[n] = np.int32(-2.0 if edge else cell)
+    return doubtful
+
+
+@_step
+def _find_cell(x, y, z, geometry):  # type: ignore[no-untyped-def]
+    """Return the flat index of the voxel of one Cartesian point, -1 outside: the rules of `GridSpec` to the letter."""
+    (l0, l1, l2), (u0, u1, u2), (v0, v1, v2), _, (s0, s1, s2), cylindrical, _ = geometry
+    if cylindrical:
+        azimuth = np.arctan2(y, x)
+        turned = azimuth + 2 * np.pi if azimuth < l1 else (azimuth - 2 * np.pi if azimuth >= u1 else azimuth)
+        x = np.sqrt(x * x + y * y)
+        y = turned if l1 <= turned < u1 else azimuth
+    if not (l0 <= x < u0 and l1 <= y < u1 and l2 <= z < u2):
+        return np.int32(-1)
+    i = min(np.floor((x - l0) / v0), s0 - 1.0)
+    j = min(np.floor((y - l1) / v1), s1 - 1.0)
+    k = min(np.floor((z - l2) / v2), s2 - 1.0)
+    return np.int32((i * s1 + j) * s2 + k)
 
 
 @_step
@@ -171,6 +195,7 @@ def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _bin_scan(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
     x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
     cells = np.empty(_BLOCK, np.int32)
     near, far = ranges
     for start in range(0, len(words), 2 * _BLOCK):
@@ -181,8 +206,13 @@ def _bin_scan(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-d
             _leave_out(x, y, z, count, near * near, far * far)
         _move(x, y, z, count, rows)
         if geometry[5]:
-            _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1])
-        _find_cells(x, y, z, count, geometry, cells)
+            _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1], radius, azimuth)
+            doubtful = _find_cells(radius, azimuth, z, count, geometry, cells)
+        else:
+            doubtful = _find_cells(x, y, z, count, geometry, cells)
+        for n in range(count if doubtful else 0):
+            if cells[n] == -2:
+                cells[n] = _find_cell(x[n], y[n], z[n], geometry)
         _mark(cells, count, grid)
 
 
