@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
 
@@ -32,9 +35,11 @@ class ArrayStore(ABC):
 
     Attributes:
         location: what to call it in errors.
+        local: whether its bytes are on this machine.
     """
 
     location: str
+    local: bool
 
     @abstractmethod
     def attributes(self, node: str) -> dict[str, Any] | None:
@@ -155,86 +160,45 @@ class _PackedField:
             raise FormatError(
                 f"{self.where}: expected a field of kind {self.packing.kind}, found {attributes.get('kind')!r}"
             )
+        self.local = store.local
         self.frames: NDArray[np.int64] = store.read_small(f"{node}/frames").astype(np.int64)
         self._positions = {frame: position for position, frame in enumerate(self.frames.tolist())}
 
     @cached_property
-    def columns(self) -> dict[str, tuple[Column, StoredArray, NDArray[np.int64]]]:
-        """Each column that is stored, with where each frame starts and ends in it: (F, 2)."""
-        found = {}
-        for column in self.packing.columns:
-            node = f"{self.node}/{column.name}"
-            if self.store.attributes(node) is None:
-                continue  # no frame needed it
-            array = self.store.array(node)
-            if self.packing.kind == "grid":
-                starts = np.arange(len(self.frames), dtype=np.int64)
-                spans = np.stack([starts, starts + 1], axis=1)
-            else:
-                spans = self.store.read_small(f"{node}_offsets").astype(np.int64)
-            if (
-                spans.shape != (len(self.frames), 2)
-                or spans.min(initial=0) < 0
-                or spans.max(initial=0) > array.shape[array.axis]
-            ):
-                raise FormatError(
-                    f"{self.where}/{column.name}: expected offsets of {len(self.frames)} frames inside the array, found others"
-                )
-            found[column.name] = column, array, spans
-        return found
+    def columns(self) -> dict[str, _StoredColumn]:
+        """The columns that are stored: those that some frame needed."""
+        nodes = {column: f"{self.node}/{column.name}" for column in self.packing.columns}
+        is_grid = self.packing.kind == "grid"
+        return {
+            column.name: _StoredColumn(self.store, node, column, len(self.frames), is_grid)
+            for column, node in nodes.items()
+            if self.store.attributes(node) is not None
+        }
 
     def read(self, frames: list[int]) -> list[NDArray[Any]]:
-        """Read frames: fetch the chunks of a column all at once, decode frame by frame."""
+        """Read frames: from a remote store all their chunks at once, then frame by frame, side by side."""
         positions = [self._position(frame) for frame in frames]
-        fetched: dict[str, list[tuple[range, list[memoryview]]]] = {}
-        for name, (_, array, spans) in self.columns.items():
-            numbers = [_chunks(array.step, *spans[position].tolist()) for position in positions]
-            try:
-                parts = iter(array.fetch([number for chunks in numbers for number in chunks]))
-            except FormatError as error:
-                listed = ", ".join(map(str, frames))
-                raise FormatError(f"{self.where}: field {self.packing.entry.name}, frame {listed}: {error}") from error
-            fetched[name] = [(chunks, [next(parts) for _ in chunks]) for chunks in numbers]
+        tasks = {name: column.tasks(positions) for name, column in self.columns.items()}
+        if not self.local:
+            with self._naming(frames):
+                for name, column in self.columns.items():
+                    column.fetch(tasks[name])
 
         def assemble(k: int) -> NDArray[Any]:
-            try:
-                return self.packing.join(
-                    {
-                        c.name: self._column(c, positions[k], fetched[c.name][k] if c.name in fetched else None)
-                        for c in self.packing.columns
-                    }
-                )
-            except FormatError as error:
-                raise FormatError(
-                    f"{self.where}: field {self.packing.entry.name}, frame {frames[k]}: {error}"
-                ) from error
+            with self._naming([frames[k]]):
+                parts = {name: column.decode(tasks[name][k]) for name, column in self.columns.items()}
+                return self.packing.join({c.name: parts.get(c.name, _nothing(c)) for c in self.packing.columns})
 
         return parallel(assemble, range(len(frames)))
 
-    def _column(self, column: Column, position: int, fetched: tuple[range, list[memoryview]] | None) -> NDArray[Any]:
-        """Decode a frame's part of a column."""
-        if fetched is None:
-            return np.empty((column.rows, 0) if column.rows else 0, column.dtype)
-        _, array, spans = self.columns[column.name]
-        start, end = spans[position].tolist()
-        numbers, parts = fetched
-        if self.packing.kind == "grid":
-            out = np.empty(array.chunk, array.dtype)
-            array.decode(parts[0], numbers[0], out)
-            return out[0]
-        rows = column.room or column.rows or 1
-        whole = np.empty((rows, len(numbers) * array.step), array.dtype)
-        stored = column.rows or 1
-        whole[stored:] = 0
-        for place, (number, part) in enumerate(zip(numbers, parts, strict=True)):
-            if len(numbers) == 1:  # the rule: decode into place
-                array.decode(part, number, whole[:stored].reshape(array.chunk))
-            else:
-                out = np.empty(array.chunk, array.dtype)
-                array.decode(part, number, out)
-                whole[:stored, place * array.step : (place + 1) * array.step] = out
-        values = whole[:, : end - start]
-        return values if column.rows else values[0]
+    @contextmanager
+    def _naming(self, frames: list[int]) -> Iterator[None]:
+        """Put the field and the frame in front of what went wrong."""
+        try:
+            yield
+        except FormatError as error:
+            listed = ", ".join(map(str, frames))
+            raise FormatError(f"{self.where}: field {self.packing.entry.name}, frame {listed}: {error}") from error
 
     def _position(self, frame: int) -> int:
         if frame not in self._positions:
@@ -242,9 +206,89 @@ class _PackedField:
         return self._positions[frame]
 
 
-def _chunks(step: int, start: int, end: int) -> range:
-    """Return the chunks of a frame, which starts at the beginning of its first one."""
-    return range(start // step, -(-end // step))
+@dataclass
+class _Task:
+    """A frame's part of a column, to be read.
+
+    Attributes:
+        chunks: the chunks that it is in.
+        count: elements of the frame.
+        room: (rows, elements of all its chunks), where they go.
+        fetched: the chunks' bytes, where they were asked for beforehand.
+    """
+
+    chunks: range
+    count: int
+    room: NDArray[Any]
+    fetched: list[memoryview] | None = None
+
+
+class _StoredColumn:
+    """One array of a field, and where each frame starts and ends in it: (F, 2)."""
+
+    def __init__(self, store: ArrayStore, node: str, column: Column, frames: int, is_grid: bool) -> None:
+        self.column = column
+        self.array = store.array(node)
+        self.is_grid = is_grid
+        array, step = self.array, self.array.step
+        if is_grid:
+            self.spans = np.stack([np.arange(frames), np.arange(frames) + 1], axis=1)
+        else:
+            self.spans = store.read_small(f"{node}_offsets").astype(np.int64)
+        fits = self.spans.shape == (frames, 2) and (self.spans[:, 0] % step == 0).all()
+        if not fits or self.spans.min(initial=0) < 0 or self.spans.max(initial=0) > array.shape[array.axis]:
+            raise FormatError(
+                f"{node}: expected offsets of {frames} frames inside the array, found others: damaged store"
+            )
+
+    def tasks(self, positions: list[int]) -> list[_Task]:
+        """Return what is to be read for some frames.
+
+        The room for all of them is one block: the system hands out large blocks in large pages, and touching the small ones of
+        sixteen scans' arrays takes longer than decoding what goes there.
+        """
+        step, unit = self.array.step, math.prod(self.array.chunk) // self.array.step
+        rows = self.column.room or unit
+        spans = [self.spans[position].tolist() for position in positions]
+        chunks = [range(start // step, -(-end // step)) for start, end in spans]
+        ends = np.cumsum([rows * len(numbers) * step for numbers in chunks]).tolist()
+        block = np.empty(ends[-1] if ends else 0, self.array.dtype)
+        rooms = [
+            block[end - rows * len(numbers) * step : end].reshape(rows, -1)
+            for end, numbers in zip(ends, chunks, strict=True)
+        ]
+        return [
+            _Task(numbers, end - start, room) for numbers, (start, end), room in zip(chunks, spans, rooms, strict=True)
+        ]
+
+    def fetch(self, tasks: list[_Task]) -> None:
+        """Fetch the chunks of all tasks at once."""
+        parts = iter(self.array.fetch([number for task in tasks for number in task.chunks]))
+        for task in tasks:
+            task.fetched = [next(parts) for _ in task.chunks]
+
+    def decode(self, task: _Task) -> NDArray[Any]:
+        """Decode a frame's chunks into their room."""
+        parts = task.fetched if task.fetched is not None else self.array.fetch(task.chunks)
+        if self.is_grid:
+            values = task.room.reshape(self.array.chunk)
+            self.array.decode(parts[0], task.chunks[0], values)
+            return values[0]
+        step, stored = self.array.step, self.column.rows or 1
+        task.room[stored:] = 0
+        for place, (number, part) in enumerate(zip(task.chunks, parts, strict=True)):
+            if len(parts) == 1:  # the rule: decode into place
+                self.array.decode(part, number, task.room[:stored].reshape(self.array.chunk))
+            else:
+                out = np.empty(self.array.chunk, self.array.dtype)
+                self.array.decode(part, number, out)
+                task.room[:stored, place * step : (place + 1) * step] = out
+        values = task.room[:, : task.count]
+        return values if self.column.rows else values[0]
+
+
+def _nothing(column: Column) -> NDArray[Any]:
+    return np.empty((column.rows, 0) if column.rows else 0, column.dtype)
 
 
 def check_root(attributes: Mapping[str, Any] | None, where: str) -> Mapping[str, Any]:

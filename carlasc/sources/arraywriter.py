@@ -251,7 +251,7 @@ class _ColumnWriter:
         self.column = column
         self.is_grid = is_grid
         self.dtype = np.dtype(column.dtype)
-        self.step = 0  # elements a chunk, known from the first frame that has any
+        self.step = column.step or 0  # elements a chunk; 0: not known before the first frame that has any
         self.chunks = 0
         self.spans: list[tuple[int, int]] = []
         self._writer: ChunkWriter | None = None

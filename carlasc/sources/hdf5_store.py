@@ -70,6 +70,7 @@ class HDF5Store(ArrayStore):
         self.tree = tree
         self.path = path
         self.location = tree.where(path)
+        self.local = not isinstance(tree, RemoteTree)
 
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""

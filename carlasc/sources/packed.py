@@ -20,6 +20,9 @@ from carlasc.sources.base import SequenceWriter, Sink, Source
 from carlasc.sources.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
 
 VERSION = 1
+_PCODEC_STEP = (
+    8192  # points a chunk: PCodec's bins follow the scene better than in a whole scan, and padding costs it bits
+)
 Columns = dict[str, NDArray[Any]]
 
 
@@ -51,6 +54,7 @@ class Column:
         unit: of its values.
         rows: leading dimension of a (rows, N) column; None for a flat one.
         room: rows to make room for when it is read; the ones that are not stored are zero.
+        step: elements of a chunk; None takes them from the first frame, which then fills one chunk.
     """
 
     name: str
@@ -59,6 +63,7 @@ class Column:
     unit: str = ""
     rows: int | None = None
     room: int | None = None
+    step: int | None = None
 
 
 class Packing(ABC):
@@ -101,7 +106,7 @@ class Points(Packing):
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
         return (
-            Column("xyz", dtype, encoding, unit, rows=3, room=4),
+            Column("xyz", dtype, encoding, unit, rows=3, room=4, step=_PCODEC_STEP if options.small else None),
             Column("fourth", "<f4", Encoding(shuffle=BITSHUFFLE)),
         )
 

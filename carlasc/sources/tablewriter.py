@@ -21,7 +21,7 @@ from carlasc.sources.tablefields import statistics, table_field
 from carlasc.sources.tables import FRAMES, SEQUENCE
 
 _RUN = "unfinished.json"  # how a store that is being written is packed
-_LEVEL = 9  # of Zstandard
+_LEVEL = 12  # of Zstandard: from 11 on points pack better by 2 %, above 12 it takes several times longer
 _PAGE = 8 << 20  # bytes: a scan's column in one page
 
 

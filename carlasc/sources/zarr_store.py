@@ -25,7 +25,7 @@ from carlasc.sources.arrays import SEQUENCE, ArraySource, ArrayStore
 from carlasc.sources.arraywriter import ArraySink, ArrayStoreWriter, ChunkWriter, remove
 from carlasc.sources.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray
 from carlasc.sources.packed import Options
-from carlasc.sources.trees import LocalTree, Tree
+from carlasc.sources.trees import LocalTree, RemoteTree, Tree
 
 METADATA = "zarr.json"
 _SHARD = 32 << 20  # bytes of a shard before compression: held back while one is filled
@@ -69,6 +69,7 @@ class ZarrStore(ArrayStore):
     def __init__(self, tree: Tree) -> None:
         self.tree = tree
         self.location = tree.location
+        self.local = not isinstance(tree, RemoteTree)
 
     @cached_property
     def _root(self) -> dict[str, Any]:
