@@ -31,7 +31,7 @@ EGO_ID = 1
 PARKED_SHARE = 0.4  # of the town's parking spaces
 TWO_WHEELERS = 0.1  # of the vehicles
 STRIDE_M = 1.4  # two steps
-WHEELBASE = 0.6  # of the length
+WHEELBASE = 0.7  # of the length
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from carlasc.errors import ArgumentError, import_extra
 from carlasc.geometry import Transform
 from carlasc.simulation.meshes import Mesh
 
+EDGE_ON = 1e-4  # sine of the angle between a ray and a triangle
+
 
 @dataclass(frozen=True)
 class Lidar:
@@ -84,7 +86,8 @@ class RayScene:
         vertices = np.ascontiguousarray(mesh.vertices - centre, np.float32)
         geometry.TriangleMesh(self._scene, vertices, np.ascontiguousarray(mesh.faces, np.int32))
         triangles = vertices.astype(np.float64)[mesh.faces]
-        self._normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        self._normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         self._offsets = np.einsum("fi,fi->f", self._normals, triangles[:, 0])
 
     def cast(
@@ -112,11 +115,12 @@ class RayScene:
         start_x, start_y, start_z = origin - self._centre
         height = self._offsets[triangles] - (x * start_x + y * start_y + z * start_z)
         with np.errstate(divide="ignore", invalid="ignore"):
-            distances = height / (x * directions[rays, 0] + y * directions[rays, 1] + z * directions[rays, 2])
-        sound = (distances > 0) & (distances <= range_m)
+            slope = x * directions[rays, 0] + y * directions[rays, 1] + z * directions[rays, 2]
+            distances = height / slope
+        # A triangle seen exactly edge-on has no distance that could be told.
+        sound = (np.abs(slope) > EDGE_ON) & (distances > 0) & (distances <= range_m)
         return rays[sound], triangles[sound], distances[sound]
 
     def normals(self, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return (H, 3) unit normals of triangles, on no particular side."""
-        normals = self._normals[triangles]
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return self._normals[triangles]
