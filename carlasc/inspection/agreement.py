@@ -7,8 +7,6 @@ than a full one, as long as enough of them are known.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,7 +34,10 @@ _AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # what the points look l
     ("points in camera axes (x right, y down, z forward)", np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]])),
     ("points in camera axes (x right, y down, z forward)", np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])),
 )
-_SHIFTS = tuple(sorted((s for s in itertools.product((-1, 0, 1), repeat=3) if any(s)), key=lambda s: np.abs(s).sum()))
+_STEPS = (-1, 0, 1)
+_SHIFTS = tuple(  # the nearer cells first
+    sorted(((x, y, z) for x in _STEPS for y in _STEPS for z in _STEPS if x or y or z), key=lambda s: sum(map(abs, s)))
+)
 
 
 @dataclass(frozen=True)
@@ -79,20 +80,16 @@ class GridEvidence:
             points, labels = points[labels != 0], labels[labels != 0]
         step = max(1, len(points) // _MAX_POINTS)
         points, labels = points[::step], None if labels is None else labels[::step]
-        as_is = _score(points, labels, grid, (0, 0, 0))
-        if as_is.known < _MIN_POINTS and all(
-            _score(points @ matrix.T, labels, grid, (0, 0, 0)).known < _MIN_POINTS for _, matrix in _AXES
-        ):
+        as_is = _place(points, self.spec)
+        candidates = [_score(as_is, labels, grid)]
+        candidates += [_score(_place(points @ matrix.T, self.spec), labels, grid) for _, matrix in _AXES]
+        if max(score.known for score in candidates) < _MIN_POINTS:
             return
-        candidates = [
-            as_is,
-            *(_score(points @ matrix.T, labels, grid, (0, 0, 0)) for _, matrix in _AXES),
-            *(_score(points, labels, grid, shift) for shift in _SHIFTS),
-        ]
-        enough = max(_MIN_POINTS, _INSIDE * as_is.known)
-        self._points += as_is.known
+        candidates += [_score(as_is.shifted(shift, self.spec), labels, grid) for shift in _SHIFTS]
+        enough = max(_MIN_POINTS, _INSIDE * candidates[0].known)
+        self._points += candidates[0].known
         self._shares.append(np.array([score.share if score.known >= enough else 0.0 for score in candidates]))
-        self._occupied.append(as_is.share if labels is None else _score(points, None, grid, (0, 0, 0)).share)
+        self._occupied.append(_score(as_is, None, grid).share)
 
     def diagnose(self) -> GridDiagnosis:
         """Say which mistake, if any, explains the frames seen so far."""
@@ -114,6 +111,22 @@ class GridEvidence:
 
 
 @dataclass(frozen=True)
+class _Placement:
+    """The cells (M, 3) of the points that are in the grid, and which of all points those are."""
+
+    cells: NDArray[np.int32]
+    points: NDArray[np.int64]
+
+    def shifted(self, shift: tuple[int, int, int], spec: GridSpec) -> _Placement:
+        """The same where the grid's content stands `shift` cells too far along its axes."""
+        cells = self.cells + np.array(shift, np.int32)
+        if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
+            cells[:, 1] %= spec.size[1]  # the azimuth goes round
+        within = np.all((cells >= 0) & (cells < np.array(spec.size)), axis=1)
+        return _Placement(cells[within], self.points[within])
+
+
+@dataclass(frozen=True)
 class _Score:
     known: int  # points in known voxels
     right: int  # of these, those in a voxel of their class
@@ -123,20 +136,17 @@ class _Score:
         return self.right / self.known if self.known else 0.0
 
 
-def _score(
-    points: NDArray[np.floating], labels: NDArray[np.integer] | None, grid: Grid, shift: Sequence[int]
-) -> _Score:
-    """Look the points up in the grid as if its content stood `shift` cells too far along its axes."""
-    cells, inside = grid.spec.index(grid.spec.to_axes(points))
-    cells = cells[inside] + np.array(shift, np.int32)
-    if grid.spec.coordinates == "cylindrical" and grid.spec.upper[1] - grid.spec.lower[1] > 2 * np.pi - 1e-3:
-        cells[:, 1] %= grid.spec.size[1]  # the azimuth goes round
-    within = ((cells >= 0) & (cells < np.array(grid.spec.size))).all(axis=1)
-    index = np.ravel_multi_index(tuple(cells[within].T), grid.spec.size)
+def _place(points: NDArray[np.floating], spec: GridSpec) -> _Placement:
+    cells, inside = spec.index(spec.to_axes(points))
+    return _Placement(cells[inside], np.flatnonzero(inside))
+
+
+def _score(placement: _Placement, labels: NDArray[np.integer] | None, grid: Grid) -> _Score:
+    index = np.ravel_multi_index(tuple(placement.cells.T), grid.spec.size)
     voxels = grid.labels.reshape(-1)[index]
     known = np.ones(len(voxels), np.bool_) if grid.counts is None else grid.counts.reshape(-1)[index] > 0
-    right = voxels != 0 if labels is None else voxels == labels[inside][within]
-    return _Score(int(known.sum()), int((right & known).sum()))
+    right = voxels != 0 if labels is None else voxels == labels[placement.points]
+    return _Score(int(np.count_nonzero(known)), int(np.count_nonzero(right & known)))
 
 
 def _mistake(column: int, spec: GridSpec) -> str:

@@ -95,20 +95,19 @@ def test_a_drive_round_a_bend_is_sound_in_both_frames(fixture: str, request: pyt
     assert result.sequences[0].voxel_share["evaluation"] > 0.9
 
 
-@pytest.mark.parametrize("labelled", [True, False])
 @pytest.mark.parametrize(
     "poses",
     [
         pytest.param(drive(10, speed_m=0.0), id="standing"),
-        pytest.param(drive(16), id="straight"),
-        pytest.param(drive(16, speed_m=0.02), id="creeping"),
-        pytest.param(drive(16, speed_m=-0.5, turn_rad=0.03), id="backwards"),
+        pytest.param(drive(10), id="straight"),
+        pytest.param(drive(10, speed_m=0.02), id="creeping"),
+        pytest.param(drive(10, speed_m=-0.5, turn_rad=0.03), id="backwards"),
         pytest.param(np.concatenate([np.repeat(drive(1), 5, axis=0), drive(8, turn_rad=0.04)]), id="starting"),
         pytest.param(drive(1), id="one frame"),
         pytest.param(drive(2), id="two frames"),
     ],
 )
-@pytest.mark.parametrize("frame", ["carlasc", "kitti"])
+@pytest.mark.parametrize(("frame", "labelled"), [("carlasc", True), ("kitti", True), ("kitti", False)])
 def test_scans_alone_raise_no_false_alarm(tmp_path: Path, poses: np.ndarray, labelled: bool, frame: str) -> None:
     write_drive(tmp_path / "cartesian", poses, frame=frame, labelled=labelled, seed=3)
     result = validate(tmp_path)
@@ -420,10 +419,10 @@ def test_a_sequence_without_anything_is_an_error_and_the_others_are_still_checke
     assert [report.frames for report in result.sequences] == [12, 0]
 
 
-def test_every_level_above_a_sequence_is_understood(turning: Path, tmp_path: Path) -> None:
-    shutil.copytree(turning / "cartesian", tmp_path / "Val" / "A" / "cartesian")
-    for folder in (tmp_path, tmp_path / "Val", tmp_path / "Val" / "A", tmp_path / "Val" / "A" / "cartesian"):
-        assert validate(folder).sequences[0].frames == 12
+def test_the_level_above_a_sequence_is_understood(turning: Path, tmp_path: Path) -> None:
+    (tmp_path / "Val" / "A").mkdir(parents=True)
+    (tmp_path / "Val" / "A" / "cartesian").symlink_to(turning / "cartesian")
+    assert [report.path for report in validate(tmp_path / "Val", every=6).sequences] == ["A/cartesian"]
 
 
 def test_a_level_too_low_and_an_empty_folder_are_told(turning: Path, tmp_path: Path) -> None:
