@@ -25,8 +25,9 @@ from carlasc.groundtruth.rays import (
     clip,
     empty_rays,
     narrow,
+    place_cartesian,
+    place_cylindrical,
     place_points,
-    place_samples,
 )
 from carlasc.groundtruth.rule import Cells, Pose, cached, inlined, jit, sample_voxel, transform, unit_ray
 
@@ -123,19 +124,34 @@ def vote_free(
             )
         if rays.state[i] != 0.0:
             continue
-        step = rays.first[i]
-        while step <= rays.last[i]:
-            place_samples(rays, i, step, rays.last[i], view, voxels)
-            for j in range(CHUNK):
-                if voxels[j] == DOUBTFUL:
-                    x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-                    voxels[j] = sample_voxel(x, y, z, step + j, free_step_m, pose, cells)[1]
-            if tally.once:
+        x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
+        step, last = rays.first[i], rays.last[i]
+        while step <= last:
+            lowest = np.int32(
+                0
+            )  # the loops stand here, not in a function: passing an array counts a reference every time
+            if view.cylindrical:
                 for j in range(CHUNK):
-                    tally.passed[voxels[j]] = 1
+                    back = step + j
+                    voxels[j] = place_cylindrical(x - back * dx, y - back * dy, z - back * dz, view)
+                    lowest = min(lowest, voxels[j])
             else:
                 for j in range(CHUNK):
-                    tally.free[voxels[j]] += 1
+                    back = step + j
+                    voxels[j] = place_cartesian(x - back * dx, y - back * dy, z - back * dz, view)
+                    lowest = min(lowest, voxels[j])
+            number = int(min(float(CHUNK), last - step + 1.0))
+            if lowest == DOUBTFUL:
+                for j in range(number):
+                    if voxels[j] == DOUBTFUL:
+                        point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
+                        voxels[j] = sample_voxel(point[0], point[1], point[2], step + j, free_step_m, pose, cells)[1]
+            if tally.once:
+                for j in range(number):
+                    tally.passed[np.uint32(voxels[j])] = 1
+            else:
+                for j in range(number):
+                    tally.free[np.uint32(voxels[j])] += 1
             step += CHUNK
 
 

@@ -19,6 +19,9 @@ class Observation:
         points: (N, 3) float32, metres, the sensor's own frame. float32 is part of the rule (FORMAT section 4).
         labels: (N,) unsigned integer class ids; points labelled 0 take no part, their rays neither.
         grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's.
+        hits: (N,) bool, points that vote for their class; the others only let their rays vote. None: all.
+        hit_region: region of the grid in which the points vote; None: all of it.
+        free_region: region of the grid in which the rays vote; None: all of it.
 
     Raises:
         FormatError: points and labels disagree, have another shape or type, or the transform is not rigid.
@@ -27,6 +30,9 @@ class Observation:
     points: NDArray[np.float32]
     labels: NDArray[np.unsignedinteger]
     grid_T_sensor: Transform
+    hits: NDArray[np.bool_] | None = None
+    hit_region: int | None = None
+    free_region: int | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -37,6 +43,8 @@ class Observation:
             raise FormatError(f"observation labels: expected {expected}, found {self.labels.shape}")
         if self.labels.dtype.kind != "u":
             raise FormatError(f"observation labels: expected unsigned integers, found {self.labels.dtype}")
+        if self.hits is not None and self.hits.shape != self.labels.shape:
+            raise FormatError(f"observation hits: expected shape ({len(self.points)},), found {self.hits.shape}")
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
 
     def __len__(self) -> int:

@@ -21,6 +21,9 @@ Pose = tuple[float, float, float, float, float, float, float, float, float, floa
 
 jit = numba.njit(nogil=True, error_model="numpy")
 inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
+fused = numba.njit(
+    nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"}
+)  # where margins cover rounding
 cached = numba.njit(nogil=True, error_model="numpy", cache=True)  # what Python calls; the rest is compiled into it
 
 

@@ -20,7 +20,7 @@ from carlasc.groundtruth.observations import Observation
 from carlasc.labels import CARLA, ClassTable
 from carlasc.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
-VoteRule = Literal["sensor", "sample"]
+VoteRule = Literal["sensor", "sample", "point"]
 
 OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
 
@@ -39,7 +39,8 @@ def count_votes(
         observations: the voters, all in one grid frame.
         spec: the grid.
         classes: table of the labels.
-        vote: "sensor": at most one vote an observation, voxel and class (the published files); "sample": every sample counts.
+        vote: "sensor": at most one vote an observation, voxel and class (the published files); "sample": every sample counts; "point":
+            every point counts, free space at most once an observation and voxel.
         free_step_m: distance between the free samples of a ray, metres.
 
     Raises:
@@ -60,33 +61,46 @@ class Ballot:
     Args:
         spec: the grid.
         classes: table of the labels.
-        vote: "sensor" or "sample", as in `count_votes`.
+        vote: "sensor", "sample" or "point", as in `count_votes`.
         free_step_m: distance between the free samples of a ray, metres.
+        regions: (V,) uint16 region of each voxel, for observations that vote in one of them; not with "sample".
 
     Raises:
-        ArgumentError: an unknown vote rule, or a step that is not a positive number.
+        ArgumentError: an unknown vote rule, or a step that is not a positive number, or regions that do not fit.
     """
 
     def __init__(
-        self, spec: GridSpec, classes: ClassTable = CARLA, *, vote: VoteRule = "sensor", free_step_m: float = 1.5
+        self,
+        spec: GridSpec,
+        classes: ClassTable = CARLA,
+        *,
+        vote: VoteRule = "sensor",
+        free_step_m: float = 1.5,
+        regions: NDArray[np.uint16] | None = None,
     ) -> None:
         from carlasc.groundtruth import kernel, rule
 
-        if vote not in ("sensor", "sample"):
-            raise ArgumentError(f"vote rule: expected sensor or sample, found {vote!r}")
+        if vote not in ("sensor", "sample", "point"):
+            raise ArgumentError(f"vote rule: expected sensor, sample or point, found {vote!r}")
+        if regions is not None and (regions.shape != (spec.num_voxels,) or vote == "sample"):
+            raise ArgumentError(
+                f"regions: expected ({spec.num_voxels},) of them and no sample votes, found {regions.shape}"
+            )
         if not (math.isfinite(free_step_m) and free_step_m > 0):
             raise ArgumentError(f"free step: expected a positive number of metres, found {free_step_m}")
         self.spec, self.classes, self.vote, self.free_step_m = spec, classes, vote, float(free_step_m)
         self.num_observations = 0
-        once = vote == "sensor"
+        free_once = vote != "sample"
         self._cells = rule.Cells.of(spec)
         self._tally = kernel.Tally(
-            once,
-            free=np.zeros(spec.num_voxels + 1, np.uint32 if once else np.int64),
-            passed=np.zeros(spec.num_voxels + 1 if once else 0, np.uint8),
+            vote == "sensor",
+            free_once,
+            free=np.zeros(spec.num_voxels + 1, np.uint32 if free_once else np.int64),
+            passed=np.zeros(spec.num_voxels + 1 if free_once else 0, np.uint8),
             heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
             candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
             used=np.zeros(1, np.int64),
+            regions=np.empty(0, np.uint16) if regions is None else np.ascontiguousarray(regions, np.uint16),
         )
 
     def add(self, observation: Observation) -> None:
@@ -94,20 +108,31 @@ class Ballot:
 
         Raises:
             FormatError: a label is not below the class table's number of channels; no vote was added.
+            ArgumentError: it votes in a region, and the ballot has none.
         """
         from carlasc.groundtruth import kernel, rays, rule
 
         self.classes.check(observation.labels, "observation labels")
+        hit_region, free_region = (
+            kernel.ANYWHERE if region is None else region
+            for region in (observation.hit_region, observation.free_region)
+        )
+        if not len(self._tally.regions) and (hit_region, free_region) != (kernel.ANYWHERE, kernel.ANYWHERE):
+            raise ArgumentError("observation: expected a ballot with regions for one that votes in a region")
+        labels = np.require(observation.labels, np.uint16, ["C", "A", "W"])
         self._make_room(len(observation))
         pose = rule.as_pose(observation.grid_T_sensor)
         kernel.vote(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
-            np.require(observation.labels, np.uint16, ["C", "A", "W"]),
+            labels,
+            labels if observation.hits is None else np.where(observation.hits, labels, np.uint16(0)),
             pose,
             rays.View.of(pose, self._cells),
             self._cells,
             self.free_step_m,
             self.num_observations,
+            hit_region,
+            free_region,
             self._tally,
         )
         self.num_observations += 1
@@ -146,15 +171,30 @@ class Votes:
     free: NDArray[Any]
     occupied: NDArray[Any]
 
-    def to_grid(self) -> Grid:
-        """Return the class with most votes of each voxel (ties to the lowest id; free is 0) and the sum of its votes."""
+    def to_grid(self, free_weight: NDArray[np.floating] | None = None) -> Grid:
+        """Elect a class for each voxel, and sum its votes.
+
+        Args:
+            free_weight: (K,) by class: how many votes for things one vote for free space outweighs. A voxel is occupied, by the class
+                with most votes, where its votes for things are more than that. None: free is a class among others, the class with
+                most votes wins, ties go to the lowest id (FORMAT section 4).
+        """
+        free = self.free.reshape(-1)
+        if free_weight is None:
+            labels, counts = self._elect(free)
+        else:
+            labels, things = self._elect(np.zeros_like(free))
+            labels[things <= free_weight[labels] * free] = 0
+            counts = things + free
+        return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
+
+    def _elect(self, free: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return (V,) the class with most votes, ties to the lowest id, and the sum of the votes, `free` being those of class 0."""
         from carlasc.groundtruth import kernel
 
-        size = self.spec.num_voxels
-        labels, best = np.empty(size, self.classes.dtype), np.empty(size, self.free.dtype)
-        counts = np.empty(size, self.free.dtype)
-        kernel.elect(self.free.reshape(-1), self.occupied, labels, best, counts)
-        return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
+        labels, best, counts = np.empty(len(free), self.classes.dtype), np.empty_like(free), np.empty_like(free)
+        kernel.elect(free, self.occupied, labels, best, counts)
+        return labels, counts
 
     def occupied_counts(self) -> NDArray[np.int64]:
         """Return (X, Y, Z) int64: votes for any class but free."""

@@ -25,7 +25,7 @@ def test_a_free_step_that_is_no_positive_number_is_refused(free_step_m: float) -
 
 
 def test_an_unknown_vote_rule_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="expected sensor or sample, found 'ray'"):
+    with pytest.raises(ArgumentError, match="expected sensor, sample or point, found 'ray'"):
         count_votes([], GridSpec.published(), vote="ray")  # type: ignore[arg-type]
 
 
