@@ -33,6 +33,7 @@ from carlasc.groundtruth.rule import Cells, Pose, cached, inlined, jit, sample_v
 
 BLOCK = 256  # rays: their coordinates stay in the first cache
 NONE = -1  # end of a voxel's chain of candidates
+ANYWHERE = -1  # votes that count in all regions
 
 CANDIDATE_DTYPE = np.dtype(
     [("votes", np.int64), ("voxel", np.int32), ("next", np.int32), ("voter", np.int32), ("label", np.uint16)],
@@ -46,19 +47,23 @@ class Tally(NamedTuple):
 
     Attributes:
         once: whether an observation has at most one vote a voxel and class.
+        free_once: whether it has at most one vote a voxel for free space.
         free: (V + 1,) votes for free space; the last one takes samples outside.
-        passed: (V + 1,) uint8, voxels that the current observation saw free; all zero between observations. Only if `once`.
+        passed: (V + 1,) uint8, voxels that the current observation saw free; all zero between observations. Only if `free_once`.
         heads: (V,) int32, first candidate of each voxel, or NONE.
         candidates: CANDIDATE_DTYPE, those of all voxels.
         used: (1,) int64, how many of them are in use.
+        regions: (V,) uint16, region of each voxel; empty if there is only one.
     """
 
     once: bool
+    free_once: bool
     free: NDArray[Any]
     passed: NDArray[np.uint8]
     heads: NDArray[np.int32]
     candidates: NDArray[Any]
     used: NDArray[np.int64]
+    regions: NDArray[np.uint16]
 
 
 @jit
@@ -70,16 +75,17 @@ def vote_occupied(
     pose: Pose,
     cells: Cells,
     voter: int,
+    region: int,
     tally: Tally,
 ) -> None:
-    """Let the points of a block vote for their classes."""
+    """Let the points of a block vote for their classes, in voxels of a region; those labelled 0 only let their rays vote."""
     for i in range(len(labels)):
-        if rays.state[i] == DROPPED:
+        if rays.state[i] == DROPPED or labels[i] == 0:
             continue
         voxel = hits[i]
         if voxel == DOUBTFUL or rays.state[i] == UNSURE:
             _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
-        if voxel < len(tally.heads):
+        if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
             vote_for(voxel, labels[i], voter, tally)
 
 
@@ -146,7 +152,7 @@ def vote_free(
                     if voxels[j] == DOUBTFUL:
                         point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
                         voxels[j] = sample_voxel(point[0], point[1], point[2], step + j, free_step_m, pose, cells)[1]
-            if tally.once:
+            if tally.free_once:
                 for j in range(number):
                     tally.passed[np.uint32(voxels[j])] = 1
             else:
@@ -173,7 +179,7 @@ def vote_free_by_rule(
     kept = step < 2.0**52  # beyond that one step more is no other number
     while kept and step <= last + 1.0:
         kept, voxel = sample_voxel(x, y, z, step, free_step_m, pose, cells)
-        if tally.once:
+        if tally.free_once:
             tally.passed[voxel] = 1
         else:
             tally.free[voxel] += 1
@@ -212,23 +218,29 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
     def vote(
         points: NDArray[np.float32],
         labels: NDArray[np.uint16],
+        hit_labels: NDArray[np.uint16],
         pose: Pose,
         view: View,
         cells: Cells,
         free_step_m: float,
         voter: int,
+        hit_region: int,
+        free_region: int,
         tally: Tally,
     ) -> None:
         """Add the votes of one observation.
 
         Args:
             points: (3 N,) float32 x, y, z of each point, sensor frame.
-            labels: (N,) uint16.
+            labels: (N,) uint16; 0 takes no part.
+            hit_labels: (N,) uint16, what the points themselves vote for; 0 leaves them their rays alone.
             pose: grid_T_sensor.
             view: the grid from there.
             cells: the grid.
             free_step_m: distance between free samples.
             voter: number of the observation.
+            hit_region: region in which points vote, or ANYWHERE.
+            free_region: region in which rays vote, or ANYWHERE.
             tally: the votes so far, with room for N more candidates.
         """
         _ = sources
@@ -238,9 +250,13 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
             corner = points[3 * begin : 3 * (begin + len(block))]
             clip(corner, block, free_step_m, view, rays)
             place_points(rays, view, hits)
-            vote_occupied(corner, block, rays, hits, pose, cells, voter, tally)
+            own = hit_labels[begin : begin + BLOCK]
+            vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
             vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
-        if tally.once:
+        if tally.free_once:
+            if free_region != ANYWHERE:
+                for v in range(len(tally.regions)):
+                    tally.passed[v] &= np.uint8(tally.regions[v] == free_region)
             for v in range(len(tally.passed)):
                 tally.free[v] += tally.passed[v]
                 tally.passed[v] = 0
