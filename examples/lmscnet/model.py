@@ -42,11 +42,11 @@ class LMSCNet(nn.Module):
 
     Args:
         num_classes: K.
-        height: Z, cells along z; the number f of feature channels. X and Y must be multiples of 8.
+        height: Z, cells along z; the number f of feature channels. X, Y and Z must be multiples of 8.
         multiscale: whether the coarse outputs are classified, too.
     """
 
-    divisor = 8
+    divisors = (8, 8, 8)  # cells of the grid must be multiples of these
 
     def __init__(self, num_classes: int, height: int, *, multiscale: bool = False) -> None:
         super().__init__()

@@ -79,7 +79,8 @@ class SpatioTemporalPyramid(nn.Module):
 
     def _encode(self, name: str, x: Tensor) -> Tensor:
         """Run a stage on every frame: (B, T, C, X, Y) to (B, T, C', X', Y')."""
-        return self._stage(name, x.flatten(0, 1)).unflatten(0, x.shape[:2])
+        frames = self._stage(name, x.flatten(0, 1))
+        return frames.reshape(*x.shape[:2], *frames.shape[1:])
 
     def _decode(self, name: str, deeper: Tensor, skip: Tensor) -> Tensor:
         """Upsample the deeper map by 2, put it before the skip map, run a stage."""
@@ -95,7 +96,7 @@ class MotionSC(nn.Module):
         frames: T, 1 or more.
     """
 
-    divisor = 16
+    divisors = (16, 16, 1)  # cells of the grid must be multiples of these
 
     def __init__(self, num_classes: int, height: int, frames: int = 1) -> None:
         super().__init__()

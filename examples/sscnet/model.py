@@ -18,7 +18,7 @@ class SSCNet(nn.Module):
         full: upsample by a transposed convolution (SSCNet-full) rather than to the nearest coarse voxel.
     """
 
-    divisor = 4
+    divisors = (4, 4, 4)  # cells of the grid must be multiples of these
 
     def __init__(self, num_classes: int, *, full: bool = False) -> None:
         super().__init__()

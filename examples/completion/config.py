@@ -1,0 +1,137 @@
+"""What a run is made of: a dataclass, and a YAML file a network and data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from carlasc.errors import ArgumentError, FormatError, import_extra
+
+NETWORKS = ("motionsc", "lmscnet_ss", "lmscnet", "sscnet", "sscnet_full")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a training run. The defaults are those of MotionSC on CarlaSC.
+
+    Attributes:
+        network: one of `NETWORKS`.
+        history: T, scans in a stack; more than 1 for MotionSC only.
+        align: move past scans into the newest one's frame by their poses.
+        shuffle_history: put the past scans of each stack in random order (to find out what the order is worth).
+        grid: which grid of the data to predict.
+        remap: to the classes predicted.
+        train: split to train on, or names of sequences.
+        val: split to choose the best epoch by.
+        test: split to report.
+        flips: axes along which samples are mirrored at random.
+        class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the training split), "none", or the file
+            that `carlasc stats --json` wrote.
+        free_ratio: free voxels that take part in the loss for each occupied one, drawn at random a batch; 0 takes all (SSCNet: 2).
+        epochs: passes over the training split.
+        batch_size: samples a step, over all processes together.
+        learning_rate: Adam's, at first.
+        decay: factor on the learning rate after each epoch.
+        patience: stop after so many epochs without a better mIoU; None never does.
+        precision: "float32", or "bf16" for mixed precision.
+        compile: run through torch.compile.
+        workers: processes that load data, a process of training.
+        seed: of weights, order, flips and draws.
+    """
+
+    network: Literal["motionsc", "lmscnet_ss", "lmscnet", "sscnet", "sscnet_full"]
+    history: int = 1
+    align: bool = True
+    shuffle_history: bool = False
+    grid: str = "evaluation"
+    remap: str | None = "carlasc11"
+    train: str | list[str] = "train"
+    val: str | list[str] = "val"
+    test: str | list[str] = "test"
+    flips: str = "xy"
+    class_weights: str = "table"
+    free_ratio: float = 0.0
+    epochs: int = 10
+    batch_size: int = 16
+    learning_rate: float = 1e-3
+    decay: float = 0.96
+    patience: int | None = None
+    precision: Literal["float32", "bf16"] = "float32"
+    compile: bool = False
+    workers: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, kind in typing.get_type_hints(Config).items():
+            value = getattr(self, name)
+            if kind is float and isinstance(value, int) and not isinstance(value, bool):
+                object.__setattr__(self, name, float(value))
+            elif not _fits(value, kind):
+                raise ArgumentError(f"{name}: expected {_describe(kind)}, found {value!r}")
+        for name in ("history", "epochs", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ArgumentError(f"{name}: expected 1 or more, found {getattr(self, name)}")
+        if self.history > 1 and self.network != "motionsc":
+            raise ArgumentError(
+                f"history: expected 1 for {self.network}, found {self.history}: only motionsc takes more"
+            )
+        if not set(self.flips) <= {"x", "y"}:
+            raise ArgumentError(f"flips: expected x, y, xy or nothing, found {self.flips!r}")
+
+    @classmethod
+    def read(cls, path: Path, overrides: Iterable[str] = ()) -> Config:
+        """Read a YAML file; `overrides` are "key=value" texts that win over it.
+
+        Raises:
+            FormatError: the file is no table of settings, or holds one that there is not.
+            ArgumentError: an override is none, or a value makes no sense.
+        """
+        yaml = import_extra("yaml", "torch")
+        try:
+            values = yaml.safe_load(path.read_text())
+        except (OSError, yaml.YAMLError) as error:
+            raise FormatError(
+                f"{path}: expected a YAML file of settings, found something else: {error}".replace("\n", " ")
+            ) from error
+        if not isinstance(values, Mapping):
+            raise FormatError(f"{path}: expected settings as `key: value` lines, found {type(values).__name__}")
+        settings: dict[str, Any] = dict(values)
+        for text in overrides:
+            key, equals, value = text.partition("=")
+            if not equals:
+                raise ArgumentError(f"--set: expected key=value, found {text!r}")
+            settings[key] = yaml.safe_load(value)
+        names = [field.name for field in dataclasses.fields(cls)]
+        if unknown := set(settings) - set(names):
+            raise ArgumentError(f"{path}: expected some of {', '.join(names)}, found {', '.join(sorted(unknown))}")
+        if "network" not in settings:
+            raise FormatError(f"{path}: expected the key network, found none")
+        return cls(**settings)
+
+    def write(self, path: Path) -> None:
+        """Write all settings as YAML."""
+        yaml = import_extra("yaml", "torch")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(yaml.safe_dump(dataclasses.asdict(self), sort_keys=False))
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin = typing.get_origin(kind)
+    if origin is Literal:
+        return value in typing.get_args(kind)
+    if origin is types.UnionType:
+        return any(_fits(value, part) for part in typing.get_args(kind))
+    if origin is list:
+        return isinstance(value, list) and all(_fits(item, typing.get_args(kind)[0]) for item in value)
+    return isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+
+
+def _describe(kind: Any) -> str:
+    if typing.get_origin(kind) is Literal:
+        return "one of " + ", ".join(map(str, typing.get_args(kind)))
+    return str(getattr(kind, "__name__", kind) if typing.get_origin(kind) is None else kind)

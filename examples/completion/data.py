@@ -1,0 +1,183 @@
+"""Data sets and loaders of a run: which samples, in which order, flipped how; and the weights of the classes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, DistributedSampler, Subset
+
+from carlasc import Dataset
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.labels import REMAPS, TRAIN_VOXEL_COUNTS
+from carlasc.labels import class_weights as weights_of
+from carlasc.transforms import Flip
+from completion.config import Config
+from completion.losses import IGNORE
+
+Sample = dict[str, Any]
+
+
+class ShuffleHistory:
+    """Puts the past scans of a stack in random order; the newest stays last. The order follows from the seed and the frame."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def __call__(self, sample: Sample) -> Sample:
+        """Return the sample with its history shuffled."""
+        stack = sample["occupancy"]
+        order = np.random.default_rng([self.seed, sample["frame"]]).permutation(len(stack) - 1)
+        return sample | {"occupancy": stack[[*order, len(stack) - 1]]}
+
+
+class Compose:
+    """Transforms one after another."""
+
+    def __init__(self, *transforms: Any) -> None:
+        self.transforms = transforms
+
+    def __call__(self, sample: Sample) -> Sample:
+        """Return the sample after all of them."""
+        for transform in self.transforms:
+            sample = transform(sample)
+        return sample
+
+    def set_epoch(self, epoch: int) -> None:
+        """Tell those that draw anew each epoch."""
+        for transform in self.transforms:
+            if hasattr(transform, "set_epoch"):
+                transform.set_epoch(epoch)
+
+
+def open_split(root: str | Path, split: str | list[str], config: Config, *, training: bool = False) -> Dataset:
+    """Open a split of a data set as `config` says.
+
+    Raises:
+        MissingDataError: there is no such split, or no frame in it.
+        ArgumentError: the history is longer than every sequence.
+    """
+    try:
+        data = Dataset(root, split, history=config.history, grid=config.grid, remap=config.remap, align=config.align)
+    except MissingDataError as error:
+        raise MissingDataError(f"split {split!r}: {error}") from error
+    frames = {sequence.location: len(sequence.scan_frames()) for sequence in data.sequences}
+    longest = max(frames, key=lambda location: frames[location])
+    if config.history > frames[longest]:
+        raise ArgumentError(
+            f"history: expected at most the {frames[longest]} frames of {longest} (the longest sequence), found {config.history}"
+        )
+    transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history else []
+    if training and config.flips:
+        transforms.append(Flip(data.spec, tuple(config.flips), seed=config.seed))
+    data.transform = Compose(*transforms)
+    return data
+
+
+class TrainLoader:
+    """Batches of the training split: another order and other flips each epoch, the same for the same seed and epoch.
+
+    Args:
+        data: the split.
+        config: batch size (over all processes), workers, seed.
+        rank: of this process.
+        world: number of processes; each takes every world-th sample.
+    """
+
+    def __init__(self, data: Dataset, config: Config, rank: int = 0, world: int = 1) -> None:
+        if config.batch_size % world:
+            raise ArgumentError(f"batch_size: expected a multiple of the {world} processes, found {config.batch_size}")
+        if len(data) < world:
+            raise ArgumentError(
+                f"training split: expected a sample for each of the {world} processes, found {len(data)}"
+            )
+        self.data = data
+        self.sampler: DistributedSampler[Sample] = DistributedSampler(data, world, rank, shuffle=True, seed=config.seed)
+        self.loader = _loader(data, config, config.batch_size // world, sampler=self.sampler)
+
+    def __len__(self) -> int:
+        return len(self.loader)
+
+    def epoch(self, number: int) -> Any:
+        """Return an iterator over the batches of an epoch."""
+        self.sampler.set_epoch(number)
+        if isinstance(self.data.transform, Compose):
+            self.data.transform.set_epoch(number)
+        return iter(self.loader)
+
+
+def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Sample]:
+    """Return a loader of each sample once, in order; each process takes every world-th one."""
+    mine: Any = data if world == 1 else Subset(data, range(rank, len(data), world))
+    return _loader(mine, config, max(1, config.batch_size // world))
+
+
+def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataLoader[Sample]:
+    return DataLoader(
+        data,
+        batch_size,
+        num_workers=config.workers,
+        persistent_workers=config.workers > 0,
+        pin_memory=torch.cuda.is_available(),
+        **options,
+    )
+
+
+def to_device(batch: Sample, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return a batch's input (B, T, X, Y, Z) float32 and target (B, X, Y, Z) int64, `IGNORE` where unknown."""
+    occupancy = batch["occupancy"].to(device, non_blocking=True).float()
+    labels = batch["labels"].to(device, non_blocking=True).long()
+    return occupancy, labels.masked_fill(~batch["known"].to(device, non_blocking=True), IGNORE)
+
+
+def class_weights(root: str | Path, data: Dataset, config: Config) -> NDArray[np.float32]:
+    """Return the (K,) weights of the loss for the training split `data` of `root`.
+
+    Raises:
+        ArgumentError: the published counts are asked for, but the classes are not CarlaSC's.
+        FormatError: the file of `carlasc stats` does not hold counts.
+    """
+    num_classes = max(data.classes.names) + 1
+    remap = REMAPS.get(config.remap or "")
+    if config.class_weights == "none":
+        return np.ones(num_classes, np.float32)
+    if config.class_weights == "train":
+        weights = weights_of(_count_voxels(root, config, num_classes))
+    elif config.class_weights == "table":
+        if (found := data.sequences[0].metadata.classes.name) != "carla":
+            raise ArgumentError(f"class_weights: the table is of CARLA's classes, found data of {found}: take `train`")
+        weights = weights_of(TRAIN_VOXEL_COUNTS, remap)
+    else:
+        weights = _read_weights(Path(config.class_weights), data)
+    if len(weights) != num_classes:
+        raise FormatError(f"class weights: expected {num_classes} of them, found {len(weights)}")
+    return weights.astype(np.float32)
+
+
+def _count_voxels(root: str | Path, config: Config, num_classes: int) -> NDArray[np.int64]:
+    """Count the known voxels of each class over the training split."""
+    data = Dataset(root, config.train, grid=config.grid, remap=config.remap, fields=("labels", "known"))
+    counts = np.zeros(num_classes, np.int64)
+    for index in range(len(data)):
+        sample = data[index]
+        counts += np.bincount(sample["labels"][sample["known"]], minlength=num_classes)
+    return counts
+
+
+def _read_weights(path: Path, data: Dataset) -> NDArray[np.float64]:
+    """Read the weights that `carlasc stats --json` printed into a file."""
+    try:
+        named = json.loads(path.read_text())["class_weights"]
+        weights = np.zeros(max(data.classes.names) + 1)
+        for index, name in data.classes.names.items():
+            weights[index] = named[name]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(
+            f"{path}: expected what `carlasc stats --json` prints, with a weight for each class of {data.classes.name}, found something else: {error}"
+        ) from error
+    return weights

@@ -1,0 +1,52 @@
+"""Networks by name, for a number of classes and a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from lmscnet.model import LMSCNet
+from motionsc.model import MotionSC
+from sscnet.model import SSCNet
+from torch import nn
+
+from carlasc import GridSpec
+from carlasc.errors import ArgumentError
+
+_BUILDERS: Mapping[str, Callable[[int, int, int], nn.Module]] = {  # (classes, Z, T)
+    "motionsc": MotionSC,
+    "lmscnet_ss": lambda classes, height, _: LMSCNet(classes, height),
+    "lmscnet": lambda classes, height, _: LMSCNet(classes, height, multiscale=True),
+    "sscnet": lambda classes, _height, _frames: SSCNet(classes),
+    "sscnet_full": lambda classes, _height, _frames: SSCNet(classes, full=True),
+}
+
+
+def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1) -> nn.Module:
+    """Build a network for a grid.
+
+    Args:
+        name: one of `completion.config.NETWORKS`.
+        num_classes: K.
+        spec: the grid that it is fed and predicts.
+        history: T, scans in a stack.
+
+    Raises:
+        ArgumentError: there is no such network, or the grid's cells do not divide as it needs.
+    """
+    if name not in _BUILDERS:
+        raise ArgumentError(f"network: expected one of {', '.join(_BUILDERS)}, found {name!r}")
+    if history > 1 and name != "motionsc":
+        raise ArgumentError(f"history: expected 1 for {name}, found {history}: only motionsc takes more")
+    network = _BUILDERS[name](num_classes, spec.size[2], history)
+    check_size(network, name, spec.size)
+    return network
+
+
+def check_size(network: nn.Module, name: str, size: tuple[int, int, int]) -> None:
+    """Raise ArgumentError where a grid of `size` cannot be halved as often as the network does."""
+    divisors: Any = network.divisors
+    if any(cells % divisor for cells, divisor in zip(size, divisors, strict=True)):
+        raise ArgumentError(
+            f"{name}: expected a grid of multiples of {' x '.join(map(str, divisors))} cells, found {' x '.join(map(str, size))}"
+        )

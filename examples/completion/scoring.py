@@ -1,0 +1,35 @@
+"""Scoring a network on a split."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from carlasc.metrics import ConfusionMatrix
+from completion.data import to_device
+from completion.losses import IGNORE
+from completion.processes import Processes
+
+
+@torch.no_grad()
+def score(
+    network: nn.Module, loader: DataLoader[dict[str, Any]], num_classes: int, processes: Processes, bf16: bool = False
+) -> ConfusionMatrix:
+    """Return the confusion of a network's predictions over the known voxels of every process's share of a split."""
+    network.eval()
+    matrix = ConfusionMatrix(num_classes)
+    for batch in loader:
+        occupancy, target = to_device(batch, processes.device)
+        matrix.update(predict(network, occupancy, bf16), target, target != IGNORE)
+    counts = processes.sum(torch.from_numpy(matrix.counts).to(processes.device))
+    return ConfusionMatrix(num_classes, counts=counts.cpu().numpy().astype(np.int64))
+
+
+def predict(network: nn.Module, occupancy: Tensor, bf16: bool = False) -> Tensor:
+    """Return (B, X, Y, Z) class ids for (B, T, X, Y, Z) float32 occupancy."""
+    with torch.autocast(occupancy.device.type, torch.bfloat16, enabled=bf16):
+        return network(occupancy).argmax(-1)

@@ -1,0 +1,237 @@
+"""The training loop: epochs of steps, a score after each, the best kept, and a checkpoint to go on from."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from carlasc.errors import CarlascError, ConflictError
+from carlasc.metrics import ConfusionMatrix
+from completion.config import Config
+from completion.data import TrainLoader, class_weights, eval_loader, open_split, to_device
+from completion.inference import check_compiler
+from completion.losses import balance_free, completion_loss
+from completion.networks import build_network
+from completion.processes import Processes
+from completion.scoring import score
+from completion.tensorboard import Board
+from completion.weights import load_weights, read_checkpoint, read_weights, write_checkpoint, write_weights
+
+LAST, BEST, CONFIG = "last.pt", "best.safetensors", "config.yaml"
+
+
+@dataclass
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        epoch: epochs done.
+        best_epoch: the one whose weights are kept, counted from 1; 0 before the first.
+        best_miou: its mIoU on the validation split.
+        losses: mean training loss of each epoch.
+        mious: mIoU on the validation split after each.
+        samples_per_s: training samples a second of each epoch.
+    """
+
+    epoch: int = 0
+    best_epoch: int = 0
+    best_miou: float = -1.0
+    losses: list[float] = field(default_factory=list)
+    mious: list[float] = field(default_factory=list)
+    samples_per_s: list[float] = field(default_factory=list)
+
+    def is_over(self, config: Config) -> bool:
+        """Whether all epochs are done, or none got better for too long."""
+        stalled = config.patience is not None and self.epoch - self.best_epoch >= config.patience
+        return self.epoch >= config.epochs or stalled
+
+
+def train(root: str | Path, config: Config, out: Path, processes: Processes, *, resume: bool = False) -> Progress:
+    """Train a network on a data set.
+
+    Writes to `out`: config.yaml, last.pt (to go on from), best.safetensors (the weights of the best epoch by mIoU) and TensorBoard's files.
+
+    Args:
+        root: the data, anything that `carlasc.open` takes.
+        config: the settings.
+        out: folder of the run.
+        processes: which process this is of how many.
+        resume: go on from last.pt; the result is that of a run that was never stopped.
+
+    Raises:
+        CarlascError: a split is empty, a loss is no number, memory is short, or `out` holds another run; one line each.
+    """
+    data = open_split(root, config.train, config, training=True)
+    loader = TrainLoader(data, config, processes.rank, processes.world)
+    val = open_split(root, config.val, config)
+    val_loader = eval_loader(val, config, processes.rank, processes.world)
+    num_classes = max(data.classes.names) + 1
+    weights = torch.from_numpy(class_weights(root, data, config)).to(processes.device)
+
+    torch.manual_seed(config.seed)
+    network = build_network(config.network, num_classes, data.spec, config.history).to(processes.device)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=(0.9, 0.999))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, config.decay)
+    parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
+    progress = _resume(out, config, parts) if resume else _begin(out, config, processes)
+    stepped = _prepare(network, config, processes)
+
+    with Board(out / "tensorboard", data.classes, enabled=processes.first) as board:
+        while not progress.is_over(config):
+            start = time.perf_counter()
+            loss = _train_epoch(stepped, optimizer, loader, weights, progress.epoch, config, processes)
+            elapsed_s = time.perf_counter() - start
+            learning_rate = optimizer.param_groups[0]["lr"]
+            schedule.step()
+            processes.share(network.buffers())
+            matrix = score(network, val_loader, num_classes, processes, config.precision == "bf16")
+
+            progress.epoch += 1
+            progress.losses.append(loss)
+            progress.mious.append(matrix.miou)
+            progress.samples_per_s.append(len(data) / elapsed_s)
+            if matrix.miou > progress.best_miou:
+                progress.best_miou, progress.best_epoch = matrix.miou, progress.epoch
+                if processes.first:
+                    write_weights(out / BEST, network)
+            if processes.first:
+                states = {name: part.state_dict() for name, part in parts.items()}
+                write_checkpoint(out / LAST, states | dataclasses.asdict(progress))
+                board.add_epoch(progress.epoch, loss, learning_rate, matrix)
+                board.add_pictures(progress.epoch, network, val, processes.device)
+                _print_epoch(progress, config, matrix)
+            processes.wait()
+    return progress
+
+
+def _begin(out: Path, config: Config, processes: Processes) -> Progress:
+    if (out / LAST).exists():
+        raise ConflictError(
+            f"{out / LAST}: expected no earlier run, found one: go on with it (--resume), or choose another folder"
+        )
+    processes.wait()
+    if processes.first:
+        config.write(out / CONFIG)
+    return Progress()
+
+
+def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
+    """Load last.pt; nothing else is remembered, because order, flips and draws follow from seed and epoch."""
+    before = Config.read(out / CONFIG) if (out / CONFIG).is_file() else config
+    changed = [f.name for f in dataclasses.fields(Config) if getattr(before, f.name) != getattr(config, f.name)]
+    if changed := [name for name in changed if name not in ("epochs", "patience", "workers")]:
+        raise ConflictError(
+            f"{out / CONFIG}: expected the settings of the run to go on with, found others: {', '.join(changed)}"
+        )
+    read_weights(out / LAST)  # says so if there is none
+    state = read_checkpoint(out / LAST)
+    load_weights(parts["network"], state["network"], str(out / LAST))
+    for name in ("optimizer", "schedule"):
+        parts[name].load_state_dict(state[name])
+    return Progress(**{f.name: state[f.name] for f in dataclasses.fields(Progress)})
+
+
+def _prepare(network: nn.Module, config: Config, processes: Processes) -> nn.Module:
+    """Wrap the network for several processes and for torch.compile; both share its weights."""
+    if processes.world > 1:
+        ids = [processes.device.index] if processes.device.type == "cuda" else None
+        network = DistributedDataParallel(network, device_ids=ids)
+    if config.compile:
+        check_compiler(processes.device)
+        network = torch.compile(network)  # type: ignore[assignment]
+    return network
+
+
+def _train_epoch(
+    network: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    loader: TrainLoader,
+    class_weights: Tensor,
+    epoch: int,
+    config: Config,
+    processes: Processes,
+) -> float:
+    """Run an epoch's steps; return the mean loss."""
+    network.train()
+    total = 0.0
+    for step, batch in enumerate(loader.epoch(epoch)):
+        try:
+            loss = _train_step(network, optimizer, batch, class_weights, (epoch, step), config, processes)
+        except (torch.OutOfMemoryError, RuntimeError) as error:
+            if not _is_out_of_memory(error):
+                raise
+            smaller = max(1, config.batch_size // 2)
+            raise CarlascError(
+                f"out of memory at batch size {config.batch_size}: try --set batch_size={smaller}"
+                + ("" if config.precision == "bf16" else " or --set precision=bf16")
+            ) from error
+        if not math.isfinite(loss):
+            names = ", ".join(f"{s} {int(f)}" for s, f in zip(batch["sequence"], batch["frame"], strict=True))
+            raise CarlascError(
+                f"epoch {epoch + 1}, batch {step + 1}: the loss is {loss} (frames {names}): try a smaller learning rate; the last epoch is in {LAST}"
+            )
+        total += loss
+        if processes.first and sys.stderr.isatty():
+            print(
+                f"\repoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss {total / (step + 1):.4f}",
+                end="",
+                file=sys.stderr,
+            )
+    return total / len(loader)
+
+
+def _train_step(
+    network: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    batch: dict[str, Any],
+    class_weights: Tensor,
+    place: tuple[int, int],
+    config: Config,
+    processes: Processes,
+) -> float:
+    """One step on the loss of the whole batch, all processes' shares together; return that loss."""
+    occupancy, target = to_device(batch, processes.device)
+    if config.free_ratio:
+        draw = torch.Generator(processes.device).manual_seed(_mix(config.seed, *place, processes.rank))
+        target = balance_free(target, config.free_ratio, draw)
+    with torch.autocast(processes.device.type, torch.bfloat16, enabled=config.precision == "bf16"):
+        outputs = network(occupancy)
+    sums, weights = completion_loss(outputs, target, class_weights)
+    weights = processes.sum(weights.detach())
+    loss = (sums / weights.clamp_min(1e-12)).mean() * processes.world  # gradients are averaged over the processes
+    optimizer.zero_grad(set_to_none=True)
+    torch.autograd.backward(loss)
+    optimizer.step()
+    return float(processes.sum(loss.detach()) / processes.world)
+
+
+def _mix(*numbers: int) -> int:
+    """One seed of several numbers."""
+    mixed = 0
+    for number in numbers:
+        mixed = (mixed * 1_000_003 + number + 1) % (2**63)
+    return mixed
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
+def _print_epoch(progress: Progress, config: Config, matrix: ConfusionMatrix) -> None:
+    geometry = matrix.completeness()
+    mark = "  best" if progress.best_epoch == progress.epoch else ""
+    start = "\r" if sys.stderr.isatty() else ""
+    print(
+        f"{start}epoch {progress.epoch}/{config.epochs}  loss {progress.losses[-1]:.4f}  mIoU {100 * matrix.miou:.2f}"
+        f"  IoU {100 * geometry.iou:.2f}  {progress.samples_per_s[-1]:.1f} samples/s{mark}",
+        file=sys.stderr,
+    )

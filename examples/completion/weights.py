@@ -1,0 +1,146 @@
+"""Reading and writing weights: state dicts as `.pt` or `.safetensors`. No code in a file is ever run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from carlasc.errors import FormatError, MissingDataError, import_extra
+
+StateDict = dict[str, Tensor]
+
+_MARKS = {  # a name that only one network's state dict has; looked for in this order
+    "motionsc": "stpn.conv_pre_1.weight",
+    "lmscnet": "seg_head_1_2.conv0.weight",
+    "lmscnet_ss": "seg_head_1_1.conv0.weight",
+    "sscnet_full": "deconv_classes.weight",
+    "sscnet": "conv_classes.weight",
+}
+
+
+def read_weights(path: Path) -> StateDict:
+    """Read a state dict onto the CPU.
+
+    Raises:
+        MissingDataError: there is no such file.
+        FormatError: it is no state dict; a pickle that would run code is refused.
+    """
+    if not path.is_file():
+        raise MissingDataError(f"{path}: expected weights, found nothing")
+    if path.suffix == ".safetensors":
+        safetensors = import_extra("safetensors.torch", "torch")
+        try:
+            return safetensors.load_file(path, device="cpu")
+        except Exception as error:
+            raise FormatError(f"{path}: expected safetensors, found something else: {error}") from error
+    state = read_checkpoint(path)
+    if "network" in state and "epoch" in state:  # a checkpoint of ours
+        state = state["network"]
+    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+        raise FormatError(f"{path}: expected a state dict (names to tensors), found {_describe(state)}")
+    return state
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a dict of tensors and plain values, `weights_only`.
+
+    Raises:
+        FormatError: it is something else.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise FormatError(
+            f"{path}: expected a state dict, found something else, which was not run: {reason}"
+        ) from error
+    if not isinstance(state, Mapping):
+        raise FormatError(f"{path}: expected a state dict (names to tensors), found {type(state).__name__}")
+    return dict(state)
+
+
+def write_weights(path: Path, network: nn.Module) -> None:
+    """Write a network's state dict, as safetensors where the ending says so; whole or not at all."""
+    state = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    if path.suffix == ".safetensors":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        import_extra("safetensors.torch", "torch").save_file(state, _beside(path))
+        os.replace(_beside(path), path)
+    else:
+        write_checkpoint(path, state)
+
+
+def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a dict of tensors and plain values; whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(dict(state), _beside(path))
+    os.replace(_beside(path), path)
+
+
+def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) -> None:
+    """Load a state dict strictly; `where` is the file named in errors.
+
+    Raises:
+        FormatError: a layer is missing, unknown, or of another shape; names it and both shapes.
+    """
+    own = network.state_dict()
+    for name, value in own.items():
+        if name not in state:
+            raise FormatError(
+                f"{where}: expected the layer {name} {_shape(value)}, found none: weights of another network?"
+            )
+        if state[name].shape != value.shape:
+            raise FormatError(
+                f"{where}: layer {name}: expected {_shape(value)}, found {_shape(state[name])}: {_advice(name)}"
+            )
+    if unknown := [name for name in state if name not in own]:
+        raise FormatError(
+            f"{where}: expected no layer {unknown[0]}, found {_shape(state[unknown[0]])}: weights of another network?"
+        )
+    network.load_state_dict(dict(state), strict=True)
+
+
+def identify(state: Mapping[str, Tensor], where: str) -> tuple[str, int]:
+    """Tell from a state dict which network it is of, and for how many classes.
+
+    Raises:
+        FormatError: none of ours.
+    """
+    name = next((name for name, mark in _MARKS.items() if mark in state), None)
+    if name is None:
+        raise FormatError(
+            f"{where}: expected weights of {', '.join(_MARKS)}, found a first layer named {next(iter(state))}"
+        )
+    last = {
+        "motionsc": "segmentation_head.conv_classes.bias",
+        "sscnet_full": "deconv_classes.bias",
+        "sscnet": "conv_classes.bias",
+    }
+    return name, len(state[last.get(name, "seg_head_1_1.conv_classes.bias")])
+
+
+def _advice(layer: str) -> str:
+    if "conv3d_" in layer:
+        return "weights of another history (T)"
+    if "classes" in layer:
+        return "weights of another number of classes"
+    return "weights of another grid (cells along z) or network"
+
+
+def _describe(state: Mapping[str, Any]) -> str:
+    other = next((name for name, value in state.items() if not isinstance(value, Tensor)), None)
+    return "an empty one" if other is None else f"{type(state[other]).__name__} under {other!r}"
+
+
+def _shape(value: Tensor) -> str:
+    return " x ".join(map(str, value.shape)) or "a single number"
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.part")

@@ -1,0 +1,34 @@
+"""Train a network: `python examples/train.py examples/motionsc/carlasc.yaml DATA --out runs/motionsc`.
+
+On several GPUs: `torchrun --nproc-per-node 4 examples/train.py ...`. `--set key=value` changes a setting of the file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from completion.command import run
+from completion.config import Config
+from completion.processes import join_processes
+from completion.training import BEST, train
+
+
+def main(
+    config: Annotated[Path, typer.Argument(help="Settings: a YAML file.")],
+    data: Annotated[str, typer.Argument(help="The data set: anything carlasc opens.")],
+    out: Annotated[Path, typer.Option(help="Folder of the run.")],
+    settings: Annotated[list[str] | None, typer.Option("--set", help="key=value, over the file's.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's last checkpoint.")] = False,
+    device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
+) -> None:
+    """Train a network on a data set; the best weights by validation mIoU are kept."""
+    with join_processes(device) as processes:
+        progress = train(data, Config.read(config, settings or ()), out, processes, resume=resume)
+        if processes.first:
+            print(f"best mIoU {100 * progress.best_miou:.2f} after epoch {progress.best_epoch}: {out / BEST}")
+
+
+if __name__ == "__main__":
+    run(main)

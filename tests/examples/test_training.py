@@ -1,0 +1,152 @@
+"""Training on a tiny data set: what is written, resumed, stopped, and shared among processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from completion.config import Config
+from completion.processes import Processes
+from completion.training import BEST, LAST, train
+from completion.weights import read_weights
+from helpers.completion import SPEC, write_split
+
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
+
+ALONE = Processes(0, 1, torch.device("cpu"))
+QUICK = Config("lmscnet_ss", epochs=2, batch_size=2, workers=0, learning_rate=0.01, class_weights="train")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    write_split(root, "Train", ["Town01_Light", "Town02_Light"], frames=3)
+    write_split(root, "Val", ["Town07_Light"], frames=3, seed=1)
+    return root
+
+
+def test_a_run_writes_weights_checkpoint_settings_and_curves(data, tmp_path, capsys):
+    progress = train(data, replace(QUICK, epochs=6), tmp_path / "run", ALONE)
+    assert progress.epoch == 6
+    assert progress.losses[-1] < progress.losses[0]
+    assert progress.best_miou == max(progress.mious) == progress.mious[progress.best_epoch - 1]
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {LAST, BEST, "config.yaml", "tensorboard"} <= names
+    assert Config.read(tmp_path / "run" / "config.yaml") == replace(QUICK, epochs=6)
+    assert "epoch 6/6" in capsys.readouterr().err
+
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events.Reload()
+    assert [e.value for e in events.Scalars("val/mIoU")] == pytest.approx(progress.mious)
+    assert len(events.Tags()["images"]) == 3
+
+
+@pytest.mark.parametrize("network", ["lmscnet_ss", "sscnet"])
+def test_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data, tmp_path, network):
+    config = replace(QUICK, network=network, free_ratio=2.0, epochs=3)
+    whole = train(data, config, tmp_path / "whole", ALONE)
+    train(data, replace(config, epochs=1), tmp_path / "parts", ALONE)
+    parts = train(data, config, tmp_path / "parts", ALONE, resume=True)
+    assert parts.losses == whole.losses
+    expected, found = read_weights(tmp_path / "whole" / LAST), read_weights(tmp_path / "parts" / LAST)
+    for name, value in expected.items():
+        assert torch.equal(value, found[name]), name
+
+
+def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(data, tmp_path):
+    train(data, replace(QUICK, epochs=1), tmp_path, ALONE)
+    with pytest.raises(ConflictError, match="--resume"):
+        train(data, QUICK, tmp_path, ALONE)
+    with pytest.raises(ConflictError, match="found others: batch_size"):
+        train(data, replace(QUICK, batch_size=3), tmp_path, ALONE, resume=True)
+
+
+def test_training_stops_early_when_nothing_gets_better(data, tmp_path):
+    config = replace(QUICK, epochs=9, learning_rate=1e-12, network="sscnet", patience=2, flips="")
+    progress = train(data, config, tmp_path, ALONE)
+    assert (progress.best_epoch, progress.epoch) == (1, 3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"network": "motionsc", "history": 3, "shuffle_history": True}, {"network": "lmscnet"}, {"precision": "bf16"}],
+)
+def test_every_network_and_precision_trains(data, tmp_path, changes):
+    progress = train(data, replace(QUICK, epochs=1, **changes), tmp_path, ALONE)
+    assert np.isfinite(progress.losses[0])
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_names_the_batch(data, tmp_path):
+    with pytest.raises(CarlascError, match=r"epoch 1, batch \d+: the loss is (nan|inf).*Town0\d_Light \d"):
+        train(data, replace(QUICK, learning_rate=1e30, flips=""), tmp_path, ALONE)
+
+
+def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monkeypatch):
+    from completion import training
+
+    def no_memory(*_):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(training, "completion_loss", no_memory)
+    with pytest.raises(CarlascError, match="batch size 2: try --set batch_size=1 or --set precision=bf16"):
+        train(data, QUICK, tmp_path, ALONE)
+
+
+def test_data_that_cannot_be_trained_on_is_named(data, tmp_path):
+    write_split(tmp_path / "only_train", "Train", ["Town01_Light"], frames=2)
+    with pytest.raises(MissingDataError, match="split 'val'"):
+        train(tmp_path / "only_train", QUICK, tmp_path / "a", ALONE)
+    with pytest.raises(ArgumentError, match="history: expected at most the 3 frames"):
+        train(data, replace(QUICK, network="motionsc", history=4), tmp_path / "b", ALONE)
+    with pytest.raises(ArgumentError, match="only motionsc"):
+        replace(QUICK, history=2)
+    with pytest.raises(FormatError, match="carlasc stats --json"):
+        train(data, replace(QUICK, class_weights=str(tmp_path / "none.json")), tmp_path / "c", ALONE)
+
+
+def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(data, tmp_path):
+    from completion.data import class_weights, open_split
+
+    split = open_split(data, "train", QUICK)
+    names = split.classes.names
+    assert len(class_weights(data, split, replace(QUICK, class_weights="table"))) == 11
+    np.testing.assert_array_equal(class_weights(data, split, replace(QUICK, class_weights="none")), np.ones(11))
+    (tmp_path / "stats.json").write_text(json.dumps({"class_weights": {name: i / 10 for i, name in names.items()}}))
+    found = class_weights(data, split, replace(QUICK, class_weights=str(tmp_path / "stats.json")))
+    np.testing.assert_allclose(found, np.arange(11) / 10)
+
+
+def test_settings_files_of_every_network_are_read(examples):
+    files = sorted(examples.glob("*/*.yaml"))
+    assert len(files) == 6
+    for file in files:
+        assert Config.read(file, ["epochs=3"]).epochs == 3
+    with pytest.raises(ArgumentError, match="found speed"):
+        Config.read(files[0], ["speed=3"])
+    with pytest.raises(ArgumentError, match="epochs: expected int, found 'many'"):
+        Config.read(files[0], ["epochs=many"])
+
+
+def test_two_processes_of_torchrun_end_with_the_weights_of_one(data, tmp_path, examples):
+    config = tmp_path / "config.yaml"
+    settings = replace(QUICK, network="sscnet", epochs=1)  # no batch norm: its statistics would be each process's own
+    settings.write(config)
+    train(data, settings, tmp_path / "one", ALONE)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += [str(examples / "train.py"), str(config), str(data), "--out", str(tmp_path / "two"), "--device", "cpu"]
+    done = subprocess.run(
+        command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    one, two = read_weights(tmp_path / "one" / LAST), read_weights(tmp_path / "two" / LAST)
+    for name, value in one.items():
+        torch.testing.assert_close(value, two[name], rtol=1e-3, atol=1e-5, msg=name)
+    assert SPEC.size == (16, 16, 8)
