@@ -19,6 +19,7 @@ from carlasc.groundtruth.rays import (
     DOUBTFUL,
     DROPPED,
     MARGIN,
+    SURE,
     UNSURE,
     Rays,
     View,
@@ -128,14 +129,13 @@ def vote_free(
             vote_free_by_rule(
                 points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, tally
             )
-        if rays.state[i] != 0.0:
+        if rays.state[i] != SURE:
             continue
         x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
         step, last = rays.first[i], rays.last[i]
         while step <= last:
-            lowest = np.int32(
-                0
-            )  # the loops stand here, not in a function: passing an array counts a reference every time
+            # These loops stand here and not in a function: passing it an array would count a reference, every time.
+            lowest = np.int32(0)
             if view.cylindrical:
                 for j in range(CHUNK):
                     back = step + j

@@ -21,9 +21,8 @@ Pose = tuple[float, float, float, float, float, float, float, float, float, floa
 
 jit = numba.njit(nogil=True, error_model="numpy")
 inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
-fused = numba.njit(
-    nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"}
-)  # where margins cover rounding
+# Where margins cover the rounding, a product and a sum may become one operation.
+fused = numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})
 cached = numba.njit(nogil=True, error_model="numpy", cache=True)  # what Python calls; the rest is compiled into it
 
 
