@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,6 +23,7 @@ from carlasc.errors import ArgumentError
 
 if TYPE_CHECKING:
     from carlasc.grids import GridSpec
+    from carlasc.groundtruth.windows import Merging
 
 
 class Coordinates(StrEnum):
@@ -45,15 +46,44 @@ class Vote(StrEnum):
 
     sensor = "sensor"
     sample = "sample"
+    point = "point"
+
+
+class Observed(StrEnum):
+    """What grids are made of."""
+
+    capture = "capture"
+    scans = "scans"
+    grid = "grid"
+
+
+class Dynamics(StrEnum):
+    """What becomes of moving points."""
+
+    align = "align"
+    current = "current"
+    drop = "drop"
+    tube = "tube"
+
+
+class Poses(StrEnum):
+    """Where poses come from."""
+
+    file = "file"
+    kiss_icp = "kiss-icp"
 
 
 _GRID = "Grid: one of --res, --size and --preset"
+_SCANS = "Scans merged over time"
 
 
 def regrid(
     src: Annotated[
         Path,
-        typer.Argument(help="A sequence's folder that holds raw/, or a folder of such sequences.", show_default="here"),
+        typer.Argument(
+            help="A sequence's folder, with a raw capture or with scans; or a folder of such sequences.",
+            show_default="here",
+        ),
     ] = Path(),
     out: Annotated[
         Path | None,
@@ -84,8 +114,12 @@ def regrid(
     ] = None,
     free_step: Annotated[float, typer.Option(help="Distance between the free samples on a ray, metres.")] = 1.5,
     vote: Annotated[
-        Vote, typer.Option(help="One vote a sensor, voxel and class (as published), or every sample (as in the paper).")
-    ] = Vote.sensor,
+        Vote | None,
+        typer.Option(
+            help="sensor: one vote a sensor, voxel and class (as published; the default for captures); sample: every sample (as in the"
+            " paper); point: every point, free space once a scan (the default for scans)."
+        ),
+    ] = None,
     frames: Annotated[
         str | None, typer.Option(help="Frame numbers A:B of the source, B not included; either end may be left out.")
     ] = None,
@@ -93,9 +127,42 @@ def regrid(
     keep_votes: Annotated[bool, typer.Option("--keep-votes", help="Write the votes of every class too.")] = False,
     name: Annotated[str | None, typer.Option(help="The grid's folder; by its size if not given.")] = None,
     overwrite: Overwrite = False,
+    source: Annotated[
+        Observed | None,
+        typer.Option(help="What grids are made of; the capture where there is one, else scans.", show_default=False),
+    ] = None,
+    from_grid: Annotated[
+        str | None, typer.Option(help="With --source grid: the finer grid; the finest if not given.")
+    ] = None,
+    window: Annotated[
+        str | None,
+        typer.Option(help="Scans A:B around each frame, in frames; -30:30 if not given.", rich_help_panel=_SCANS),
+    ] = None,
+    window_m: Annotated[
+        float | None,
+        typer.Option(help="Of those, only scans within so many metres driven.", rich_help_panel=_SCANS),
+    ] = None,
+    stride: Annotated[int | None, typer.Option(help="Every so manyth scan.", rich_help_panel=_SCANS)] = None,
+    dynamic: Annotated[
+        Dynamics | None,
+        typer.Option(
+            help="What moves: align (complete each actor; the default), current (that frame's points only), drop, tube (SemanticKITTI's rule).",
+            rich_help_panel=_SCANS,
+        ),
+    ] = None,
+    min_range: Annotated[
+        float | None, typer.Option(help="Leave nearer points out of grids, metres.", rich_help_panel=_SCANS)
+    ] = None,
+    max_range: Annotated[
+        float | None, typer.Option(help="Leave farther points out of grids, metres.", rich_help_panel=_SCANS)
+    ] = None,
+    poses: Annotated[
+        Poses, typer.Option(help="poses.txt, or estimated from the scans by KISS-ICP.", rich_help_panel=_SCANS)
+    ] = Poses.file,
+    force: Annotated[bool, typer.Option("--force", help="Go on where poses jump.", rich_help_panel=_SCANS)] = False,
     json: Json = False,
 ) -> None:
-    """Make ground truth at any resolution from a raw capture, with its scans, flow, poses and times.
+    """Make ground truth at any resolution: from a raw capture, from the scans of one sensor merged over time, or from a finer grid.
 
     Run it again to go on where it stopped: frames that are there are skipped. Inside a sequence's folder `carlasc regrid --res 0.2` is all.
     """
@@ -107,24 +174,59 @@ def regrid(
             src,
             out,
             spec,
-            vote=vote.value,
+            observations=None if source is None else source.value,
+            vote=None if vote is None else vote.value,
             free_step_m=free_step,
             frames=parse_frames(frames),
             name=name,
             keep_votes=keep_votes,
             overwrite=overwrite,
+            merging=_merging(window, window_m, stride, dynamic, min_range, max_range),
+            from_grid=from_grid,
+            estimate_poses=poses is Poses.kiss_icp,
+            force=force,
             workers=workers,
             progress=progress,
         )
     if json:
         print_json(result)
     else:
+        for note in result.notes:
+            typer.echo(f"note: {note}")
         there = f" ({result.skipped} were there)" if result.skipped else ""
         for grid in result.grids:
             typer.echo(grid)
         typer.echo(f"{spec}: {result.made} frames made{there} in {result.elapsed_s:.1f} s")
     failures = [(failure.frame, failure.message) for failure in result.failures]
     report_failures(failures, result.made + result.skipped + len(failures))
+
+
+def _merging(
+    window: str | None,
+    window_m: float | None,
+    stride: int | None,
+    dynamic: Dynamics | None,
+    min_range: float | None,
+    max_range: float | None,
+) -> Merging | None:
+    """Return how scans are merged, None if nothing was said of it."""
+    from carlasc.groundtruth.windows import Merging
+
+    given: dict[str, Any] = {"window_m": window_m, "stride": stride, "min_range_m": min_range, "max_range_m": max_range}
+    given["dynamic"] = None if dynamic is None else dynamic.value
+    given["window"] = None if window is None else _parse_window(window)
+    given = {name: value for name, value in given.items() if value is not None}
+    return Merging(**given) if given else None
+
+
+def _parse_window(text: str) -> tuple[int, int]:
+    first, _, last = text.partition(":")
+    try:
+        return int(first), int(last)
+    except ValueError:
+        raise ArgumentError(
+            f"--window: expected A:B in frames around the current one such as -30:30, found {text!r}"
+        ) from None
 
 
 def parse_grid(

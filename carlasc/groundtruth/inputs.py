@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,40 @@ from carlasc import layout
 from carlasc.capture import RAW, Capture, Recording, find_captures
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.geometry import relative_to
+from carlasc.grids import Grid, GridSpec
 from carlasc.groundtruth.observations import Observation
+from carlasc.groundtruth.voting import VoteRule, Votes, count_votes
+from carlasc.labels import ClassTable
 from carlasc.sources.base import Metadata
 
 FrameRange = tuple[int | None, int | None]
 """Half-open range of frame numbers; None leaves an end open."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a grid is made of a frame: what every task of a sequence shares.
+
+    Attributes:
+        spec: the grid's geometry.
+        grid: its folder.
+        classes: table of the labels.
+        vote: rule by which votes are counted.
+        free_step_m: distance of free samples on a ray, metres.
+        keep_votes: whether the votes by class are written too.
+    """
+
+    spec: GridSpec
+    grid: str
+    classes: ClassTable
+    vote: VoteRule
+    free_step_m: float
+    keep_votes: bool
+
+    def fields(self) -> tuple[str, ...]:
+        """Return the names of the grid's fields."""
+        parts = ("labels", "counts", "votes") if self.keep_votes else ("labels", "counts")
+        return tuple(f"{self.grid}/{part}" for part in parts)
 
 
 @dataclass(frozen=True)
@@ -33,11 +62,13 @@ class FrameData:
 
     Attributes:
         fields: scan fields that are written beside the grid, by name.
-        observations: what votes, one at a time: each is read when the last one has voted, so memory does not grow with them.
+        grid: the grid.
+        votes: what it was elected from; None where it was not elected.
     """
 
     fields: Mapping[str, NDArray[Any]]
-    observations: Iterable[Observation]
+    grid: Grid
+    votes: Votes | None
 
 
 class FrameInputs(ABC):
@@ -53,11 +84,11 @@ class FrameInputs(ABC):
 
     @abstractmethod
     def fields(self) -> tuple[str, ...]:
-        """Return the names of the scan fields that `read` gives."""
+        """Return the names of the scan fields that `make` gives."""
 
     @abstractmethod
-    def read(self) -> FrameData:
-        """Read the frame.
+    def make(self, recipe: Recipe) -> FrameData:
+        """Read the frame and make its grid.
 
         Raises:
             MissingDataError: a file is not there.
@@ -79,18 +110,23 @@ class SequenceInputs(ABC):
     location: str
     metadata: Metadata
     frames: tuple[FrameInputs, ...]
+    vote: VoteRule = "sensor"  # the rule if none is asked for
 
     @abstractmethod
-    def poses(self) -> NDArray[np.float64]:
-        """Return (F, 4, 4) first_T_sensor by output frame; NaN where a pose cannot be read."""
+    def poses(self) -> NDArray[np.float64] | None:
+        """Return (F, 4, 4) first_T_sensor by output frame; NaN where a pose cannot be read; None where there are none."""
 
     @abstractmethod
-    def times(self) -> NDArray[np.float64]:
-        """Return (F,) seconds since the first frame by output frame."""
+    def times(self) -> NDArray[np.float64] | None:
+        """Return (F,) seconds since the first frame by output frame; None where there are none."""
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
         """Return what params.json tells of the source: a run that differs in it may not go on with the grid."""
+
+    def notes(self) -> list[str]:
+        """Return what the reader of the grids should know, a line each."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -107,8 +143,8 @@ class CaptureFrame(FrameInputs):
         always = ("points", "labels", "flow", "instances")
         return (*always, "bev") if self.capture.has_bev(self.source_frame) else always
 
-    def read(self) -> FrameData:
-        """Read the ego sensor's recording, which is the scan; the other sensors' as they vote."""
+    def make(self, recipe: Recipe) -> FrameData:
+        """Read the ego sensor's recording, which is the scan; the other sensors' as they vote: memory does not grow with them."""
         ego = self.capture.read(self.sensors[0], self.source_frame)
         fields: dict[str, NDArray[Any]] = {
             "points": np.column_stack([ego.scan.points, np.zeros(len(ego.scan), np.float32)]),
@@ -119,7 +155,10 @@ class CaptureFrame(FrameInputs):
         picture = self.capture.read_bev(self.source_frame)
         if picture is not None:
             fields["bev"] = np.frombuffer(picture, np.uint8)
-        return FrameData(fields, self._observe(ego))
+        votes = count_votes(
+            self._observe(ego), recipe.spec, recipe.classes, vote=recipe.vote, free_step_m=recipe.free_step_m
+        )
+        return FrameData(fields, votes.to_grid(), votes)
 
     def _observe(self, ego: Recording) -> Iterator[Observation]:
         for sensor in self.sensors:
@@ -141,7 +180,7 @@ class CaptureInputs(SequenceInputs):
         numbers = [int(f) for f in capture.frames if (start is None or f >= start) and (stop is None or f < stop)]
         if not numbers:
             raise MissingDataError(
-                f"{capture.location}: expected frames in {_range_text(start, stop)}, found only {capture.frames[0]} to {capture.frames[-1]}"
+                f"{capture.location}: expected frames in {range_text(start, stop)}, found only {capture.frames[0]} to {capture.frames[-1]}"
             )
         self.path, self.location, self.metadata = path, capture.location, Metadata(classes=capture.classes)
         # Frames carry a capture of their own: the one here remembers its listing, which need not be pickled each time.
@@ -193,31 +232,24 @@ def capture_inputs(source: str | os.PathLike[str], frames: FrameRange | None) ->
 
 
 def default_sink(source: str | os.PathLike[str]) -> Path:
-    """Return the folder that a run writes to if it is told nothing: the source, beside raw/."""
-    folder = Path(source)
-    return folder.resolve().parent if folder.resolve().name == RAW else folder
-
-
-PROVIDERS: Mapping[str, Callable[[str | os.PathLike[str], FrameRange | None], list[SequenceInputs]]] = {
-    "capture": capture_inputs
-}
-
-
-def find_inputs(source: str | os.PathLike[str], observations: str, frames: FrameRange | None) -> list[SequenceInputs]:
-    """Return the sequences of a source, from the provider of that name.
+    """Return the folder that a run writes to if it is told nothing: the source, beside raw/ and `<coordinates>/`.
 
     Raises:
-        ArgumentError: no provider has that name, or the range holds no frame.
-        MissingDataError: there is no sequence, or none of its frames is in the range.
+        ArgumentError: the source is no folder, so nothing can be written into it.
     """
-    if observations not in PROVIDERS:
-        raise ArgumentError(f"observations: expected one of {', '.join(PROVIDERS)}, found {observations!r}")
+    folder = Path(source)
+    if not folder.is_dir() and folder.exists():
+        raise ArgumentError(f"{source}: expected a folder to write into, found a file: say where to (`-o`)")
+    return folder.resolve().parent if folder.resolve().name in (RAW, *layout.COORDINATES) else folder
+
+
+def check_frames(frames: FrameRange | None) -> None:
+    """Raise ArgumentError where a range can hold no frame."""
     start, stop = frames or (None, None)
     if (start is not None and start < 0) or (stop is not None and stop <= (start or 0)):
         raise ArgumentError(
-            f"frames: expected a half-open range of frame numbers from 0, found {_range_text(start, stop)}"
+            f"frames: expected a half-open range of frame numbers from 0, found {range_text(start, stop)}"
         )
-    return PROVIDERS[observations](source, frames)
 
 
 def _present(array: NDArray[Any] | None) -> NDArray[Any]:
@@ -226,5 +258,6 @@ def _present(array: NDArray[Any] | None) -> NDArray[Any]:
     return array
 
 
-def _range_text(start: int | None, stop: int | None) -> str:
+def range_text(start: int | None, stop: int | None) -> str:
+    """Return a range as it is typed: "3:7"."""
     return f"{'' if start is None else start}:{'' if stop is None else stop}"

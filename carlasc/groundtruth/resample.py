@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import math
+import os
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.grids import Grid, GridSpec
+from carlasc.groundtruth.inputs import FrameData, FrameInputs, FrameRange, Recipe, SequenceInputs
+from carlasc.groundtruth.scans import StoredInputs, choose_frames, scan_fields
+from carlasc.groundtruth.windows import bare
 from carlasc.labels import ClassTable
+from carlasc.sources import open as open_source
+from carlasc.sources.base import Sequence
 
 
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
@@ -60,3 +70,67 @@ def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
         raise ArgumentError(
             f"--source grid: expected bounds within {fine.lower} .. {fine.upper}, found {coarse.lower} .. {coarse.upper}"
         )
+
+
+@dataclass(frozen=True)
+class FinerGrid(FrameInputs):
+    """One frame of a sequence whose finer grid is resampled; it holds paths only."""
+
+    sequence: Sequence
+    finer: str
+    number: int
+    source_frame: int
+
+    def fields(self) -> tuple[str, ...]:
+        """Return the scan fields that the frame has."""
+        return scan_fields(self.sequence, self.number)
+
+    def make(self, recipe: Recipe) -> FrameData:
+        """Read the frame and resample its grid."""
+        if recipe.keep_votes:
+            raise ArgumentError(
+                "--keep-votes: expected grids that were voted on, found --source grid, which only resamples"
+            )
+        fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
+        return FrameData(
+            fields, resample(self.sequence.grid(self.finer, self.number), recipe.spec, recipe.classes), None
+        )
+
+
+class GridInputs(StoredInputs):
+    """A sequence whose finer grid is resampled."""
+
+    def __init__(self, sequence: Sequence, frames: FrameRange | None, finer: str) -> None:
+        super().__init__(sequence)
+        self.finer = finer
+        chosen = choose_frames(sequence, sequence.frames(f"{finer}/labels"), frames)
+        light = bare(sequence)
+        self.frames = tuple(FinerGrid(light, finer, number, number) for number in chosen)
+
+    def record(self) -> dict[str, Any]:
+        """Return the kind of source and the finer grid."""
+        return {"source": "grid", "grid": self.finer}
+
+
+def grid_inputs(
+    source: str | os.PathLike[str], frames: FrameRange | None, spec: GridSpec, from_grid: str | None
+) -> list[SequenceInputs]:
+    """Find the sequences of a source that have a finer grid of the coordinates asked for.
+
+    Raises:
+        MissingDataError: no sequence has such a grid.
+        ArgumentError: the grid is not finer.
+    """
+    found: list[SequenceInputs] = []
+    for sequence in open_source(source).sequences().values():
+        grids = {n: s for n, s in sequence.grids.items() if s.coordinates == spec.coordinates and (from_grid or n) == n}
+        if grids:
+            finest = min(grids, key=lambda name: math.prod(grids[name].voxel_size.tolist()))
+            check_coarser(grids[finest], spec)
+            found.append(GridInputs(sequence, frames, finest))
+    if not found:
+        wanted = f"the grid {from_grid}" if from_grid else f"a {spec.coordinates} grid"
+        raise MissingDataError(
+            f"{source}: expected {wanted} to resample, found none: make one from scans or a capture first"
+        )
+    return found

@@ -17,7 +17,8 @@ from carlasc import layout
 from carlasc.errors import CarlascError, ConflictError, StorageError
 from carlasc.files import to_json
 from carlasc.grids import GridSpec
-from carlasc.groundtruth.inputs import FrameInputs, FrameRange, SequenceInputs, default_sink, find_inputs
+from carlasc.groundtruth.inputs import FrameInputs, FrameRange, Recipe, SequenceInputs, check_frames, default_sink
+from carlasc.groundtruth.providers import Observations, find_inputs
 from carlasc.groundtruth.record import (
     RECORD,
     agree_metadata,
@@ -27,8 +28,8 @@ from carlasc.groundtruth.record import (
     check_name,
     check_scan,
 )
-from carlasc.groundtruth.voting import Ballot, VoteRule, count_votes
-from carlasc.labels import ClassTable
+from carlasc.groundtruth.voting import Ballot, VoteRule
+from carlasc.groundtruth.windows import Merging
 from carlasc.sources.base import SequenceWriter, Sink
 from carlasc.sources.folder import FolderSink
 from carlasc.workers import count_workers, run_all
@@ -62,6 +63,7 @@ class RegridResult:
         skipped: frames that were there already.
         failures: frames that could not be made.
         elapsed_s: how long it took, seconds.
+        notes: what the reader should know of how they were made.
     """
 
     grids: tuple[str, ...]
@@ -70,32 +72,7 @@ class RegridResult:
     skipped: int
     failures: tuple[FrameFailure, ...]
     elapsed_s: float
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How a grid is made of a frame's observations: what every task of a sequence shares.
-
-    Attributes:
-        spec: the grid's geometry.
-        grid: its folder.
-        classes: table of the labels.
-        vote: rule by which votes are counted.
-        free_step_m: distance of free samples on a ray, metres.
-        keep_votes: whether the votes by class are written too.
-    """
-
-    spec: GridSpec
-    grid: str
-    classes: ClassTable
-    vote: VoteRule
-    free_step_m: float
-    keep_votes: bool
-
-    def fields(self) -> tuple[str, ...]:
-        """Return the names of the grid's fields."""
-        parts = ("labels", "counts", "votes") if self.keep_votes else ("labels", "counts")
-        return tuple(f"{self.grid}/{part}" for part in parts)
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -133,13 +110,17 @@ def regrid(
     sink: str | os.PathLike[str] | Sink | None,
     spec: GridSpec,
     *,
-    observations: str = "capture",
-    vote: VoteRule = "sensor",
+    observations: Observations | None = None,
+    vote: VoteRule | None = None,
     free_step_m: float = 1.5,
     frames: FrameRange | None = None,
     name: str | None = None,
     keep_votes: bool = False,
     overwrite: bool = False,
+    merging: Merging | None = None,
+    from_grid: str | None = None,
+    estimate_poses: bool = False,
+    force: bool = False,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -155,14 +136,20 @@ def regrid(
         sink: where to write: a folder, or any Sink. Each sequence goes to its path below `source`, then `<coordinates>/`. None writes
             into `source`.
         spec: the grid.
-        observations: what votes: "capture" takes every sensor of a raw capture.
-        vote: "sensor": at most one vote a sensor, voxel and class, as in the published files; "sample": every sample counts.
+        observations: what votes: "capture": every sensor of a raw capture; "scans": the ego sensor's scans of other times;
+            "grid": an existing finer grid. None takes the capture where there is one, else the scans.
+        vote: "sensor": at most one vote a sensor (scan), voxel and class, as in the published files; "sample": every sample
+            counts; "point": every point counts, free space once a scan. None: "sensor" for captures, "point" for scans.
         free_step_m: distance between free samples on a ray, metres.
         frames: half-open range of the source's frame numbers, None at an open end; all frames if None. A capture's frames
             are renumbered from 0.
         name: the grid's folder; by its size if None.
         keep_votes: also write the votes by class.
         overwrite: replace an earlier grid of ours that was made with other settings.
+        merging: which scans are merged, and what becomes of moving points; the defaults if None. Only with scans.
+        from_grid: name of the finer grid; the finest if None. Only with "grid".
+        estimate_poses: take poses from KISS-ICP, not from poses.txt; they are written only where there are none. Only with scans.
+        force: go on where poses jump.
         workers: how many frames are made side by side; all cores if None. With an executor: how many its workers are.
         executor: takes the frames instead of processes of our own; it is left open.
         progress: called with the number of finished frames and of all.
@@ -178,17 +165,25 @@ def regrid(
     """
     start, workers = time.perf_counter(), count_workers(workers)
     sink = sink if isinstance(sink, Sink) else FolderSink(default_sink(source) if sink is None else sink)
-    Ballot(
-        GridSpec(spec.coordinates, (1, 1, 1), spec.lower, spec.upper), vote=vote, free_step_m=free_step_m
-    )  # checks them
+    tiny = GridSpec(spec.coordinates, (1, 1, 1), spec.lower, spec.upper)
+    Ballot(tiny, vote=vote or "sensor", free_step_m=free_step_m)  # checks them
+    check_frames(frames)
     grid = layout.grid_folder(spec) if name is None else check_name(name)
-    settings = {"free_step_m": float(free_step_m), "vote": vote}
 
     plans = []
-    for inputs in find_inputs(source, observations, frames):
-        recipe = Recipe(spec, grid, inputs.metadata.classes, vote, float(free_step_m), keep_votes)
+    for inputs in find_inputs(
+        source,
+        observations,
+        frames,
+        spec,
+        merging=merging,
+        from_grid=from_grid,
+        estimate_poses=estimate_poses,
+        force=force,
+    ):
+        recipe = Recipe(spec, grid, inputs.metadata.classes, vote or inputs.vote, float(free_step_m), keep_votes)
         writer = sink.sequence("/".join(part for part in (inputs.path, spec.coordinates) if part))
-        plans.append(_plan(inputs, writer, recipe, settings, overwrite=overwrite))
+        plans.append(_plan(inputs, writer, recipe, overwrite=overwrite))
 
     with ExitStack() as writers:
         for plan in plans:
@@ -210,36 +205,31 @@ def regrid(
 
     grids = tuple(f"{plan.writer.location}/{grid}" for plan in plans)
     made = len(tasks) - len(failures)
-    return RegridResult(grids, spec, made, skipped, tuple(failures), time.perf_counter() - start)
+    notes = tuple(note for plan in plans for note in plan.inputs.notes())
+    return RegridResult(grids, spec, made, skipped, tuple(failures), time.perf_counter() - start, notes)
 
 
 def make_frame(frame: FrameInputs, recipe: Recipe) -> Outputs:
-    """Make all that a frame's files hold: read, vote, elect."""
-    data = frame.read()
-    votes = count_votes(
-        data.observations, recipe.spec, recipe.classes, vote=recipe.vote, free_step_m=recipe.free_step_m
-    )
-    grid = votes.to_grid()
-    outputs: Outputs = {**data.fields, f"{recipe.grid}/labels": grid.labels}
-    if grid.counts is not None:
-        outputs[f"{recipe.grid}/counts"] = grid.counts
-    if recipe.keep_votes:
-        outputs[f"{recipe.grid}/votes"] = votes.to_sparse()
+    """Make all that a frame's files hold."""
+    data = frame.make(recipe)
+    outputs: Outputs = {**data.fields, f"{recipe.grid}/labels": data.grid.labels}
+    if data.grid.counts is not None:
+        outputs[f"{recipe.grid}/counts"] = data.grid.counts
+    if recipe.keep_votes and data.votes is not None:
+        outputs[f"{recipe.grid}/votes"] = data.votes.to_sparse()
     return outputs
 
 
-def _plan(
-    inputs: SequenceInputs, writer: SequenceWriter, recipe: Recipe, settings: dict[str, Any], *, overwrite: bool
-) -> _Plan:
+def _plan(inputs: SequenceInputs, writer: SequenceWriter, recipe: Recipe, *, overwrite: bool) -> _Plan:
     """Look at what is there, and stop before anything is written if this run may not go on with it."""
-    record = {"version": carlasc.__version__, **inputs.record(), **settings}
+    record = {"version": carlasc.__version__, **inputs.record(), "free_step_m": recipe.free_step_m, "vote": recipe.vote}
     params = recipe.spec.to_params(recipe.classes.num_channels) | {RECORD: record}
     numbers = [frame.number for frame in inputs.frames]
     ours = check_grid(writer, recipe.grid, params, numbers, overwrite=overwrite)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
-        layout.POSES: agree_poses(writer, inputs.poses()),
-        layout.TIMES: agree_times(writer, inputs.times()),
+        layout.POSES: None if (poses := inputs.poses()) is None else agree_poses(writer, poses),
+        layout.TIMES: None if (times := inputs.times()) is None else agree_times(writer, times),
         layout.params_file(recipe.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}

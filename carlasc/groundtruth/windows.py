@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from carlasc import layout
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.geometry import Transform
+from carlasc.grids import GridSpec
 from carlasc.groundtruth.merging import DYNAMICS, Dynamic, Merger, PreparedScan
 from carlasc.motion import (
     Segment,
@@ -111,7 +112,7 @@ class ScanFeed:
         self._lock = threading.RLock()  # an executor may be of threads
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
-        return _restore, (_without_memory(self.sequence), self.merging, self._given_poses)
+        return _restore, (bare(self.sequence), self.merging, self._given_poses)
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
@@ -138,6 +139,21 @@ class ScanFeed:
         return [*self._by_distance(frame, near[near < frame][::-1])][::-1] + [
             frame,
             *self._by_distance(frame, near[near > frame]),
+        ]
+
+    def reaching(self, frame: int, spec: GridSpec) -> list[int]:
+        """Return the frames of the window whose scans can reach a frame's grid."""
+        here = self.pose(frame)
+        corners = np.array(np.meshgrid(*zip(spec.lower, spec.upper, strict=True))).reshape(3, -1).T
+        across = (
+            float(np.linalg.norm(corners, axis=1).max())
+            if spec.coordinates == "cartesian"
+            else np.hypot(spec.upper[0], max(abs(spec.lower[2]), abs(spec.upper[2])))
+        )
+        return [
+            other
+            for other in self.window_of(frame)
+            if np.linalg.norm(self.pose(other)[:3, 3] - here[:3, 3]) <= across + self.read(other).prepared.reach_m
         ]
 
     def _by_distance(self, frame: int, others: NDArray[np.int64]) -> Iterator[int]:
@@ -258,7 +274,7 @@ def _restore(sequence: Sequence, merging: Merging, poses: NDArray[np.float64] | 
     return _FEEDS[key]
 
 
-def _without_memory(sequence: Sequence) -> Sequence:
+def bare(sequence: Sequence) -> Sequence:
     """Return a copy of a sequence that has forgotten what it looked up: small enough to send with every frame."""
     bare = copy.copy(sequence)
     for name in [n for n in vars(bare) if isinstance(getattr(type(bare), n, None), cached_property)]:

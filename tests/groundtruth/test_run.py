@@ -270,7 +270,7 @@ def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_p
     [
         ({"free_step_m": 0}, "free step: expected a positive number"),
         ({"free_step_m": float("nan")}, "free step: expected a positive number"),
-        ({"vote": "majority"}, "vote rule: expected sensor or sample, found 'majority'"),
+        ({"vote": "majority"}, "vote rule: expected sensor, sample or point, found 'majority'"),
         ({"observations": "dreams"}, "observations: expected one of capture.*, found 'dreams'"),
         ({"frames": (5, 5)}, "frames: expected a half-open range of frame numbers from 0, found 5:5"),
         ({"frames": (-3, None)}, "frames: expected a half-open range of frame numbers from 0, found -3:"),

@@ -1,0 +1,70 @@
+"""What a run makes its grids of: a capture, scans merged over time, or a finer grid."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal, get_args
+
+from carlasc.capture import find_captures
+from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.grids import GridSpec
+from carlasc.groundtruth.inputs import FrameRange, SequenceInputs, capture_inputs
+from carlasc.groundtruth.resample import grid_inputs
+from carlasc.groundtruth.scans import scan_inputs
+from carlasc.groundtruth.windows import Merging
+
+Observations = Literal["capture", "scans", "grid"]
+
+
+def find_inputs(
+    source: str | os.PathLike[str],
+    observations: Observations | None,
+    frames: FrameRange | None,
+    spec: GridSpec,
+    *,
+    merging: Merging | None = None,
+    from_grid: str | None = None,
+    estimate_poses: bool = False,
+    force: bool = False,
+) -> list[SequenceInputs]:
+    """Return the sequences of a source.
+
+    Args:
+        source: what holds them.
+        observations: what votes; None: the capture where there is one, else scans.
+        frames: which frames.
+        spec: the grid to be made.
+        merging: which scans are merged; only with scans.
+        from_grid: name of a finer grid; only with "grid".
+        estimate_poses: let KISS-ICP find the poses; only with scans.
+        force: go on where poses jump.
+
+    Raises:
+        ArgumentError: nothing of that name votes, or an option is for something else.
+        MissingDataError: there is no sequence, or none of its frames is in the range.
+    """
+    if observations is None:
+        observations = "capture" if _holds_capture(source) else "scans"
+    if observations not in get_args(Observations):
+        raise ArgumentError(
+            f"observations: expected one of {', '.join(get_args(Observations))}, found {observations!r}"
+        )
+    if (merging is not None or estimate_poses) and observations != "scans":
+        raise ArgumentError(
+            f"window, stride, dynamic, ranges and poses are for scans: expected none of them, found some with {observations}"
+        )
+    if from_grid is not None and observations != "grid":
+        raise ArgumentError(f"from_grid: expected a grid to resample, found {observations}")
+    if observations == "capture":
+        return capture_inputs(source, frames)
+    if observations == "scans":
+        return scan_inputs(source, frames, merging or Merging(), estimate_poses=estimate_poses, force=force)
+    return grid_inputs(source, frames, spec, from_grid)
+
+
+def _holds_capture(source: str | os.PathLike[str]) -> bool:
+    try:
+        return Path(source).is_dir() and bool(find_captures(source))
+    except MissingDataError:
+        return False
