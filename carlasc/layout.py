@@ -94,8 +94,21 @@ class Field:
         Raises:
             FormatError: the array's shape or values do not fit the field.
         """
+        self.check(array, where)
         if self.suffix == ".votes.npz":
             return _encode_votes(array)
+        return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
+
+    def check(self, array: NDArray[Any], where: str) -> None:
+        """Check that an array may be a frame of the field.
+
+        Raises:
+            FormatError: its shape or type does not fit; `where` is the file named there.
+        """
+        if self.suffix == ".votes.npz":
+            if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
+                raise FormatError(f"{where}: expected a table of voxel, label and votes, found {array.dtype}")
+            return
         if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
             raise FormatError(f"{where}: expected shape (N, {self.columns}), found {array.shape}")
         dtype = np.dtype(self.dtype)
@@ -103,7 +116,6 @@ class Field:
             raise FormatError(f"{where}: expected unsigned integers, found {array.dtype}")
         if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
             raise FormatError(f"{where}: expected at most {dtype.name}, found {array.dtype}")
-        return np.ascontiguousarray(array, dtype).reshape(-1).view(np.uint8).data
 
 
 SCAN_FIELDS: dict[str, Field] = {

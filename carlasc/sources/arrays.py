@@ -288,7 +288,7 @@ class _StoredColumn:
 
 
 def _nothing(column: Column) -> NDArray[Any]:
-    return np.empty((column.rows, 0) if column.rows else 0, column.dtype)
+    return np.empty((column.room or column.rows, 0) if column.rows else 0, column.dtype)
 
 
 def check_root(attributes: Mapping[str, Any] | None, where: str) -> Mapping[str, Any]:

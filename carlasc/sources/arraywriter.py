@@ -219,6 +219,7 @@ class _FieldWriter:
     def append(self, frame: int, array: NDArray[Any]) -> None:
         if self.frames and frame <= next(reversed(self.frames)):
             raise FormatError(f"expected frames in rising order, found {frame} after {next(reversed(self.frames))}")
+        self.packing.entry.check(array, "its array")
         parts = self.packing.split(array)
         for name, column in self.columns.items():
             column.append(parts.get(name))
@@ -270,7 +271,7 @@ class _ColumnWriter:
             self._put(values[None].astype(self.dtype, copy=False))
             return
         count = values.shape[-1]
-        self.step = self.step or _round_up(int(count * _HEADROOM), values.itemsize)
+        self.step = self.step or _round_up(max(int(count * _HEADROOM), self.column.least))
         start = self.chunks * self.step
         for first in range(0, count, self.step):
             part = values[..., first : first + self.step]
@@ -317,10 +318,9 @@ class _ColumnWriter:
         self.store.remove(place)
 
 
-def _round_up(count: int, itemsize: int) -> int:
-    """Round a chunk's elements up: to whole KiB, and not below one."""
-    unit = max(1, 1024 // itemsize)
-    return -(-max(count, 1) // unit) * unit
+def _round_up(count: int) -> int:
+    """Round a chunk's elements up to a multiple of 256, whole pages of memory in every type."""
+    return -(-count // 256) * 256
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

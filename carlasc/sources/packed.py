@@ -54,7 +54,8 @@ class Column:
         unit: of its values.
         rows: leading dimension of a (rows, N) column; None for a flat one.
         room: rows to make room for when it is read; the ones that are not stored are zero.
-        step: elements of a chunk; None takes them from the first frame, which then fills one chunk.
+        step: elements of a chunk; None takes them from the first frame that has any, which then fills one chunk.
+        least: the least of that: a first scan of three points must not make chunks of three.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Column:
     rows: int | None = None
     room: int | None = None
     step: int | None = None
+    least: int = 1 << 14
 
 
 class Packing(ABC):
@@ -155,7 +157,7 @@ class Flow(Packing):
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
-        return Column("index", "u1", encoding), Column("palette", "<f4", encoding, self.entry.unit, rows=3)
+        return Column("index", "u1", encoding), Column("palette", "<f4", encoding, self.entry.unit, rows=3, least=256)
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Tell the vectors apart; most repeat the one before, so only the first of each run is looked at."""

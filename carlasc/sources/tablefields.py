@@ -170,7 +170,12 @@ _GRIDS: dict[str, TableField] = {
 
 
 def table_field(name: str) -> TableField:
-    """Return how a field stands in a table."""
+    """Return how a field stands in a table.
+
+    Raises:
+        FormatError: the layout has no such field.
+    """
+    layout.field_named(name)
     return _GRIDS[name.rpartition("/")[2]] if "/" in name else _SCANS[name]
 
 

@@ -174,6 +174,7 @@ class _TableWriter:
             raise FormatError(
                 f"{self.path}: frame {frame}: expected frames in rising order, found it after {next(reversed(self.rows))}"
             )
+        layout.field_named(self.field).check(array, f"{self.path}: frame {frame}")
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)
