@@ -62,15 +62,20 @@ def _write_png(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
 
 
 def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    module = import_extra("PIL.Image", "render")
-
-    def reduced(picture: NDArray[np.uint8]) -> Any:
-        return module.fromarray(picture).quantize(256, dither=module.Dither.NONE)
-
-    first = reduced(next(pictures))
-    rest = (reduced(picture) for picture in pictures)
+    first, rest = _to_palette(next(pictures)), (_to_palette(picture) for picture in pictures)
     hundredths = max(2, round(100 / fps))  # what the format counts in; viewers slow down below 2
     first.save(file, format="GIF", save_all=True, append_images=rest, duration=10 * hundredths, loop=0, disposal=1)
+
+
+def _to_palette(picture: NDArray[np.uint8]) -> Any:
+    """Return a picture in 256 colours, chosen so that small things keep theirs: a colour weighs less than it is frequent."""
+    module = import_extra("PIL.Image", "render")
+    packed = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    colors, counts = np.unique(packed, return_counts=True)
+    weighed = np.repeat(colors, np.ceil(counts**0.7).astype(np.int64))
+    sample = np.stack([weighed >> 16, weighed >> 8 & 255, weighed & 255], axis=-1).astype(np.uint8)
+    palette = module.fromarray(sample[None]).quantize(256, kmeans=1)
+    return module.fromarray(picture).quantize(palette=palette, dither=module.Dither.NONE)
 
 
 def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:

@@ -203,7 +203,7 @@ def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: Ar
     right = np.cross(forward, helper)
     right /= np.linalg.norm(right, axis=1)[:, None]
     up = np.cross(right, forward)
-    head = np.minimum(4.5 * width, 0.6 * lengths)
+    head = np.minimum(4.5 * width, 0.5 * lengths)
     neck, tip = tails + vectors - head * forward, tails + vectors
     angles = np.arange(7) * (np.pi / 3)
     faces = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -155,8 +156,10 @@ def render(
         shot = replace(shot, legend=merge_legends(shot.legend_of(number) for number in chosen))
 
     tasks = _plan(shot, chosen, viewpoint or Viewpoint(), orbit, film_wanted)
-    pictures = _reported(run_all(_draw, tasks, workers=workers), len(tasks), progress)
-    write_pictures(target, pictures, fps or (_ORBIT_FPS if orbit and len(chosen) == 1 else _DRIVE_FPS))
+    if fps is None:
+        fps = _ORBIT_FPS if orbit and len(chosen) == 1 else _DRIVE_FPS
+    with closing(run_all(_draw, tasks, workers=workers)) as pictures:
+        write_pictures(target, _reported(pictures, len(tasks), progress), fps)
     notes = [data.note] if data.note else []
     if len(chosen) == 1 and not orbit:
         notes += [f"{kind}: {note}" for kind in kinds if (note := shot.scene(kind, chosen[0]).note)]

@@ -148,7 +148,7 @@ def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
     tails, vectors = motion_arrows(points.select(moving))
     meshes = [_ego_vehicle()] if ego else []
     if len(tails):
-        meshes.append(arrows(tails, vectors, palette.ARROW, 0.28))
+        meshes.append(arrows(tails, vectors, palette.ARROW, 0.24))
         legend.append(Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES))
     note = None if len(tails) else "nothing moves"
     return Scene(extent, join(meshes) if meshes else None, points.points, point_colors, legend, note)
