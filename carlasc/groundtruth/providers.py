@@ -13,6 +13,7 @@ from carlasc.groundtruth.inputs import FrameRange, SequenceInputs, capture_input
 from carlasc.groundtruth.resample import grid_inputs
 from carlasc.groundtruth.scans import scan_inputs
 from carlasc.groundtruth.windows import Merging
+from carlasc.sources import open as open_source
 
 Observations = Literal["capture", "scans", "grid"]
 
@@ -45,7 +46,7 @@ def find_inputs(
         MissingDataError: there is no sequence, or none of its frames is in the range.
     """
     if observations is None:
-        observations = "capture" if _holds_capture(source) else "scans"
+        observations = _what_is_there(source)
     if observations not in get_args(Observations):
         raise ArgumentError(
             f"observations: expected one of {', '.join(get_args(Observations))}, found {observations!r}"
@@ -61,6 +62,25 @@ def find_inputs(
     if observations == "scans":
         return scan_inputs(source, frames, merging or Merging(), estimate_poses=estimate_poses, force=force)
     return grid_inputs(source, frames, spec, from_grid)
+
+
+def _what_is_there(source: str | os.PathLike[str]) -> Observations:
+    """Return "capture" where there is one, else "scans".
+
+    Raises:
+        MissingDataError: there is neither.
+    """
+    if _holds_capture(source):
+        return "capture"
+    there = open_source(source)
+    try:
+        there.sequences()
+    except MissingDataError as error:
+        raise MissingDataError(
+            f"{source}: expected a capture (a folder raw/ with velodyne0/, labels0/, ...) or sequences with scans (velodyne/, poses.txt, ...),"
+            " found neither: give a sequence's folder, or a folder of sequences"
+        ) from error
+    return "scans"
 
 
 def _holds_capture(source: str | os.PathLike[str]) -> bool:

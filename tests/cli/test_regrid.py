@@ -113,7 +113,10 @@ def test_a_folder_without_a_capture_is_1(tmp_path):
     result = _regrid(tmp_path, "--res", 0.2)
     assert result.exit_code == 1
     assert "expected a capture" in result.stderr
-    assert "expected a folder, found nothing" in _regrid(tmp_path / "nowhere", "--res", 0.2).stderr
+    assert (
+        "nowhere: expected a folder, a zip or a packed store, found nothing"
+        in _regrid(tmp_path / "nowhere", "--res", 0.2).stderr
+    )
 
 
 def test_presets_are_the_published_grids_in_the_coordinates_asked_for():

@@ -78,8 +78,10 @@ def test_the_first_pose_is_the_origin_without_which_nothing_is_written(tmp_path)
 
 
 def test_no_capture_and_no_sensor_are_said(tmp_path):
-    with pytest.raises(MissingDataError, match="expected a capture .*, found none"):
+    with pytest.raises(MissingDataError, match="expected a capture .* or sequences with scans .*, found neither"):
         regrid(tmp_path, None, SMALL)
+    with pytest.raises(MissingDataError, match="expected a capture .*, found none"):
+        regrid(tmp_path, None, SMALL, observations="capture")
     (tmp_path / "raw").mkdir()
     with pytest.raises(MissingDataError, match="expected the ego sensor's folder velodyne0, found no sensor"):
         regrid(tmp_path, None, SMALL)
