@@ -143,9 +143,9 @@ def test_the_command_records_and_prints_its_figures_as_json(tmp_path: Path) -> N
 
     from carlasc.cli import app
 
-    arguments = ["--frames", "1", "--sensors", "1", "--seed", "4", "--traffic", "light", "--channels", "4"]
-    more = ["--points", "200", "--no-bev", "--workers", "1", "--json"]
-    result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments, *more])
+    arguments = ["--frames", "1", "--sensors", "1", "--seed", "4", "--traffic", "light", "--channels", "8"]
+    arguments += ["--points", "800", "--workers", "1"]
+    result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments, "--no-bev", "--json"])
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)
     assert figures["written"] == 1
@@ -153,4 +153,4 @@ def test_the_command_records_and_prints_its_figures_as_json(tmp_path: Path) -> N
     assert not Capture(tmp_path / "out").has_bev(0)
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--frames", "0"]).exit_code == 2
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--traffic", "jam"]).exit_code == 2
-    assert CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments, "--no-bev"]).exit_code == 1
+    assert CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments]).exit_code == 1

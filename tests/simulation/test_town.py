@@ -9,8 +9,8 @@ from carlasc.simulation.plots import Land, Rectangle
 from carlasc.simulation.town import build_town
 
 
-def test_the_same_seed_builds_the_same_town(drive: Drive) -> None:
-    again = Drive(seed=drive.seed, traffic="light").town
+def test_the_same_seed_builds_the_same_town(drive: Drive, twin: Drive) -> None:
+    again = twin.town
     np.testing.assert_array_equal(again.mesh.vertices, drive.town.mesh.vertices)
     np.testing.assert_array_equal(again.mesh.faces, drive.town.mesh.faces)
     np.testing.assert_array_equal(again.mesh.labels, drive.town.mesh.labels)

@@ -84,11 +84,10 @@ def test_the_ego_vehicle_turns_smoothly(drive: Drive) -> None:
     assert np.ptp(yaw) > 1.0
 
 
-def test_a_frame_is_the_same_whether_it_is_asked_for_first_or_last() -> None:
-    first, last = Drive(8, "light"), Drive(8, "light")
+def test_a_frame_is_the_same_whether_it_is_asked_for_first_or_last(drive: Drive, twin: Drive) -> None:
     for frame in range(0, 60, 7):
-        last.actors(frame)
-    for one, other in zip(first.actors(60), last.actors(60), strict=True):
+        drive.actors(frame)
+    for one, other in zip(twin.actors(60), drive.actors(60), strict=True):
         np.testing.assert_array_equal(one.world_T_actor, other.world_T_actor)
 
 
