@@ -149,7 +149,7 @@ def render(
     standpoint = still_standpoint(data, chosen, extent) if still else None
     shot = Shot(
         data, reference, kinds, views, grid, truth_grid, ClassColors(data.table, palette), extent, size, ego,
-        standpoint=standpoint,
+        standpoint=standpoint, orbit=orbit,
     )  # fmt: skip
     check_cells(shot, chosen[0])
     if legend:

@@ -45,6 +45,7 @@ class Shot:
         ego: draw the ego vehicle.
         legend: its entries, the same in all frames; empty for none.
         standpoint: extent and world_T_standpoint of a camera that stands still while the vehicle drives; or None.
+        orbit: the camera goes round, at one distance from which it sees everything from every side.
     """
 
     data: Input
@@ -59,18 +60,15 @@ class Shot:
     ego: bool = True
     legend: list[Entry] = field(default_factory=list)
     standpoint: tuple[Extent, Transform] | None = None
+    orbit: bool = False
 
     def draw(self, frame: int, viewpoint: Viewpoint) -> NDArray[np.uint8]:
         """Return the picture of a frame, (H, W, 3) uint8."""
-        standpoint = None
-        if self.standpoint is not None:
-            extent, world_T_standpoint = self.standpoint
-            standpoint = extent, np.linalg.inv(self.data.sequence.read_pose(frame)) @ world_T_standpoint
         panels = []
         for kind in self.kinds:
             scene = self.scene(kind, frame)
             title = self._title(kind) if len(self.kinds) > 1 else ""
-            panels += [Panel(scene, view, title, standpoint) for view in self.views]
+            panels += [Panel(scene, view, title, self._standpoint(scene, view, frame)) for view in self.views]
         return draw_panels(
             panels, viewpoint=viewpoint, size=self.size, legend=self.legend, left_handed=self.left_handed
         )
@@ -106,6 +104,15 @@ class Shot:
             else:
                 legends.append(self.scene(kind, frame).legend)
         return merge_legends(legends)
+
+    def _standpoint(self, scene: Scene, view: View, frame: int) -> tuple[Extent, Transform] | None:
+        """What the camera shows, and scene_T_standpoint, where it does not go by the scene alone."""
+        turning = self.orbit and view == "perspective"
+        if self.standpoint is None:
+            return (_turned_all_round(scene.extent), np.eye(4)) if turning else None
+        extent, world_T_standpoint = self.standpoint
+        scene_T_standpoint = np.linalg.inv(self.data.sequence.read_pose(frame)) @ world_T_standpoint
+        return (_turned_all_round(extent) if turning else extent), scene_T_standpoint
 
     def _title(self, kind: str) -> str:
         titles = {"scan": "scan", "flow": "scene flow", "truth": "truth", "errors": "errors"}
@@ -194,3 +201,13 @@ def check_cells(shot: Shot, frame: int) -> None:
     """Raise ArgumentError where a prediction's cells are not the truth's."""
     if shot.truth is not None and "errors" in shot.kinds:
         check_same_spec(shot.data.read_grid(shot.grid, frame), shot.truth.read_grid(shot.truth_grid, frame))
+
+
+def _turned_all_round(extent: Extent) -> Extent:
+    """Return the rims of the upright cylinder around an extent: it looks the same from every side."""
+    lower, upper = extent.min(0), extent.max(0)
+    middle = (lower + upper) / 2
+    radius = np.linalg.norm((extent - middle)[:, :2], axis=1).max()
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rim = middle[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in (lower[2], upper[2])])

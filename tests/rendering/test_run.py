@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 from helpers.films import count_gif, read_mp4
@@ -5,7 +7,7 @@ from helpers.pixels import BLUE, RED, blue_pixels, grid_with, middle_of, red_pix
 from PIL import Image
 
 from carlasc import layout
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, DependencyError, FormatError, MissingDataError
 from carlasc.files import to_json
 from carlasc.geometry import translation
 from carlasc.grids import GridSpec
@@ -96,8 +98,21 @@ def test_an_orbit_goes_once_around(drive, tmp_path):
     for number in range(4):
         film.seek(number)
         sides.append(middle_of(red_pixels(np.asarray(film.convert("RGB"))))[0] > 160)
-    # the block is ahead on the right; seen from behind, from the right, from ahead, from the left
+    # the block is ahead on the right: seen from behind, from the right, from ahead, from the left
     assert sides == [True, True, False, False]
+
+
+def test_an_orbit_keeps_its_distance(tmp_path, monkeypatch):
+    monkeypatch.setattr("carlasc.rendering.run.ORBIT_PICTURES", 8)
+    writer = FolderSink(tmp_path).sequence("s")
+    writer.write_document(f"evaluation/{layout.PARAMS}", to_json(COARSE.to_params()))
+    writer.write("evaluation/labels", 0, grid_with({(0, 0, -0.5): RED}, size_m=2.4).labels)
+    render(tmp_path, tmp_path / "a.gif", orbit=True, size=SIZE, ego=False, legend=False)
+    film, places = Image.open(tmp_path / "a.gif"), []
+    for number in range(8):
+        film.seek(number)
+        places.append(middle_of(red_pixels(np.asarray(film.convert("RGB")))))
+    np.testing.assert_allclose(places, np.broadcast_to(places[0], (8, 2)), atol=1.5)
 
 
 def test_an_orbit_of_one_frame_has_pictures_enough(drive, tmp_path, monkeypatch):
@@ -288,4 +303,17 @@ def test_ctrl_c_leaves_nothing(drive, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         render(drive, tmp_path / "a.mp4", size=SIZE, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "package"), [("embreex", "embreex"), ("PIL", "PIL"), ("imageio_ffmpeg", "imageio_ffmpeg")]
+)
+def test_a_missing_package_is_named_with_the_extra_that_brings_it(drive, tmp_path, monkeypatch, module, package):
+    for name in [name for name in sys.modules if name.partition(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DependencyError, match=rf"{package}.*pip install 'carlasc\[render\]'") as caught:
+        render(drive, tmp_path / "a.mp4", frame=0, size=SIZE)
+    assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
