@@ -47,12 +47,10 @@ class Part:
     def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
         """Return (T, 4, 4) transforms of past sensor frames to that of `frame`; the identity for itself and for None."""
         transforms = np.tile(np.eye(4), (len(past), 1, 1))
-        rows = [row for row, number in enumerate(past) if number is not None and number != frame]
-        if rows:
-            poses = np.stack(
-                [self.scans.read_pose(number) for number in past if number is not None and number != frame]
-            )
-            transforms[rows] = np.linalg.inv(self.scans.read_pose(frame)) @ poses
+        others = {row: number for row, number in enumerate(past) if number is not None and number != frame}
+        if others:
+            first_T_past = np.array([self.scans.read_pose(number) for number in others.values()])
+            transforms[list(others)] = np.linalg.inv(self.scans.read_pose(frame)) @ first_T_past
         return transforms
 
     def check_poses(self) -> None:
