@@ -77,6 +77,7 @@ def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
 
 def _open_remote(tree: RemoteTree) -> Source:
     if tree.size() is not None:
+        tree.check_ranges()
         return _open_file(tree, "")
     source = _open_store(tree)
     if source is None and not tree.entries():

@@ -212,11 +212,7 @@ class RemoteTree(Tree):
             _fail(self.where(path), error)
 
     def size(self, path: str = "") -> int | None:
-        """Return a file's size in bytes, None where there is no such file, or a folder (or a page that lists one).
-
-        Raises:
-            CarlascError: the server answers no range requests, without which nothing can be read in place.
-        """
+        """Return a file's size in bytes, None where there is no such file, or a folder (or a page that lists one)."""
         url = self.where(path)
         try:
             found = self._fs.info(url)
@@ -226,11 +222,36 @@ class RemoteTree(Tree):
             _fail(url, error)
         if found.get("type") == "directory" or found.get("mimetype") == "text/html":
             return None
-        if url.startswith("http") and not found.get("partial"):
+        return found["size"]
+
+    def check_ranges(self, path: str = "") -> None:
+        """Ask for one byte: a server that knows no ranges would send all of the file for each.
+
+        Raises:
+            CarlascError: it knows none.
+        """
+        url = self.where(path)
+        if not url.startswith("http"):
+            return
+        from fsspec.asyn import sync
+
+        fs = self._fs
+
+        async def status() -> int:
+            session = await fs.set_session()
+            settings = dict(fs.kwargs)
+            headers = {**settings.pop("headers", {}), "Range": "bytes=0-0"}
+            async with session.get(fs.encode_url(url), headers=headers, **settings) as answer:
+                return int(answer.status)  # the body is not read
+
+        try:
+            found = sync(fs.loop, status)
+        except Exception as error:  # noqa: BLE001
+            _fail(url, error)
+        if found != 206:
             raise CarlascError(
                 f"{url}: expected a server that answers range requests, found one that does not: download the file first"
             )
-        return found["size"]
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_listed": {}}  # a worker lists what it needs

@@ -139,7 +139,10 @@ def read_index(tree: Tree, path: str) -> _Index:
     """
     where = tree.where(path)
     count, start, size = _find_directory(tree, path)
-    data = bytes(tree.read_range(path, start, start + size))
+    try:
+        data = bytes(tree.read_range(path, start, start + size))
+    except FormatError as error:
+        raise _damaged(where, "one that reaches beyond the end") from error
     positions = _walk(data, count, where)
     columns = _columns(data, positions, where)
     if len(positions) and int((columns["offset"] + _LOCAL.size + columns["packed"]).max()) > start:

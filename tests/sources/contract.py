@@ -137,9 +137,9 @@ class SourceContract:
         sequence = source.sequences()[WHOLE]
         for name in sequence.fields():
             sequence.read(name, 5)
-        location = source.location
-        links = [f"/proc/self/fd/{number}" for number in os.listdir("/proc/self/fd")]
-        assert not [link for link in links if os.path.lexists(link) and os.readlink(link).startswith(location)]
+        links = [Path(f"/proc/self/fd/{number}") for number in os.listdir("/proc/self/fd")]
+        targets = [str(link.readlink()) for link in links if link.is_symlink()]
+        assert not [target for target in targets if target.startswith(source.location)]
 
 
 class SinkContract:

@@ -95,7 +95,8 @@ def test_a_wrong_end_record_is_one_clear_error(archive: Path, offset: int, value
 
 def test_a_damaged_record_of_the_directory_is_one_clear_error(archive: Path) -> None:
     data = bytearray(archive.read_bytes())
-    data[data.index(b"PK\x01\x02", data.index(b"PK\x01\x02") + 4)] ^= 0xFF
+    (start,) = struct.unpack_from("<I", data, data.rindex(b"PK\x05\x06") + 16)
+    data[data.index(b"PK\x01\x02", start + 4)] ^= 0xFF
     archive.write_bytes(data)
     with pytest.raises(FormatError, match="member 1's record"):
         carlasc.open(archive).sequences()
@@ -192,7 +193,9 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 def test_a_big_directory_is_opened_without_touching_its_members(tmp_path: Path) -> None:
     count = 3000
-    files = {f"Train/Town01/cartesian/velodyne/{frame:06d}.bin": np.zeros((1, 4), "<f4").tobytes() for frame in range(count)}
+    files = {
+        f"Train/Town01/cartesian/velodyne/{frame:06d}.bin": np.zeros((1, 4), "<f4").tobytes() for frame in range(count)
+    }
     archive = write_zip(files, tmp_path / "data.zip")
     data = bytearray(archive.read_bytes())
     directory = data.index(b"PK\x01\x02")
