@@ -1,0 +1,104 @@
+"""Latency and memory of a network at batch 1, as the paper measures them: 100 repetitions, warm."""
+
+from __future__ import annotations
+
+import gc
+import resource
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from carlasc import GridSpec
+from completion.inference import Mode, prepare
+from completion.networks import build_network
+
+
+@dataclass(frozen=True)
+class Latency:
+    """What a network takes for one frame, from occupancy to labels.
+
+    Attributes:
+        network: its name.
+        history: T.
+        mode: "eager" or "compile".
+        median_ms: of the repetitions.
+        fastest_ms: of the repetitions; on a machine that does other work, too, the better figure for ratios.
+        memory_mb: peak of the GPU's memory, or of the whole process on a CPU.
+        speedup: against eager float32 of the same run, fastest against fastest.
+        same_labels: share of voxels with the labels of eager float32.
+    """
+
+    network: str
+    history: int
+    mode: Mode
+    median_ms: float
+    fastest_ms: float
+    memory_mb: float
+    speedup: float
+    same_labels: float
+
+
+def measure_network(
+    name: str, history: int, device: torch.device, *, spec: GridSpec, num_classes: int = 11, repetitions: int = 100
+) -> list[Latency]:
+    """Measure a network eagerly in float32, then as `prepare` makes it fast.
+
+    Weights are random: they do not change the time. Occupancy is as dense as a scan's: 1 voxel in 20.
+    """
+    rng = np.random.default_rng(0)
+    occupancy = torch.from_numpy((rng.random((1, history, *spec.size)) < 0.05).astype(np.uint8)).to(device)
+    results: list[Latency] = []
+    reference = None
+    for mode in ("eager", "compile"):
+        torch.manual_seed(0)
+        run = prepare(randomise(build_network(name, num_classes, spec, history)), device, mode)
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device)
+        labels = run(occupancy).clone()
+        reference = labels if reference is None else reference
+        times_ms = np.array([_time_ms(run, occupancy, device) for _ in range(repetitions)])
+        baseline = results[0].fastest_ms if results else times_ms.min()
+        results.append(
+            Latency(
+                name,
+                history,
+                mode,
+                float(np.median(times_ms)),
+                float(times_ms.min()),
+                _peak_mb(device),
+                float(baseline / times_ms.min()),
+                float((labels == reference).double().mean()),
+            )
+        )
+        del run
+        gc.collect()
+    return results
+
+
+def randomise(network: nn.Module) -> nn.Module:
+    """Give batch norms the statistics of random features, so that logits spread and no two classes tie."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
+            for tensor, spread in ((module.running_mean, 0.1), (module.running_var, 0.3)):
+                if tensor is not None:
+                    tensor.add_(spread * torch.rand_like(tensor))
+    return network
+
+
+def _time_ms(run: object, occupancy: torch.Tensor, device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    start = time.perf_counter()
+    run(occupancy)  # type: ignore[operator]
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return 1000 * (time.perf_counter() - start)
+
+
+def _peak_mb(device: torch.device) -> float:
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10

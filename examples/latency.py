@@ -1,0 +1,42 @@
+"""Measure what networks take for a frame: `python examples/latency.py motionsc:1 motionsc:16 lmscnet_ss sscnet_full`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Annotated
+
+import torch
+import typer
+from completion.command import run
+from completion.latency import measure_network
+
+from carlasc import GridSpec
+
+
+def main(
+    networks: Annotated[list[str], typer.Argument(help="Names, with :T for a history.")],
+    device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
+    repetitions: Annotated[int, typer.Option(help="Timed calls, after a first one.", min=1)] = 100,
+    grid: Annotated[str, typer.Option(help="A published grid.")] = "cartesian",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Print latency and peak memory at batch 1, eagerly in float32 and compiled."""
+    own = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
+    results = []
+    for text in networks:
+        name, _, history = text.partition(":")
+        measured = measure_network(name, int(history or 1), own, spec=GridSpec.published(grid), repetitions=repetitions)
+        results += measured
+        for r in measured if not as_json else ():
+            print(
+                f"{r.network} T={r.history} {r.mode:8s} median {r.median_ms:8.2f} ms  fastest {r.fastest_ms:8.2f} ms"
+                f"  {r.memory_mb:6.0f} MB  x{r.speedup:.2f}  same labels {100 * r.same_labels:.4f} %",
+                flush=True,
+            )
+    if as_json:
+        print(json.dumps([dataclasses.asdict(result) for result in results]))
+
+
+if __name__ == "__main__":
+    run(main)
