@@ -16,6 +16,7 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.files import to_json
 from carlasc.grids import GridSpec
 from carlasc.labels import CARLA, REMAPS, SEMANTICKITTI
+from carlasc.packing import pack
 from carlasc.sources import FolderSource
 
 SMALL = GridSpec("cartesian", (16, 16, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
@@ -307,6 +308,17 @@ def test_a_zip_is_read_in_place(world, tmp_path):
     for i in (7, 0, 3):
         for name, value in plain[i].items():
             np.testing.assert_array_equal(zipped[i][name], value)
+
+
+@pytest.mark.parametrize("ending, package", [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")])
+def test_a_packed_store_gives_the_samples_of_the_files(world, tmp_path, ending, package):
+    pytest.importorskip(package)
+    pack(world, tmp_path / f"packed.{ending}")
+    plain, packed = (Dataset(root, history=3, fields=FIELDS) for root in (world, tmp_path / f"packed.{ending}"))
+    assert len(plain) == len(packed)
+    for i in (5, 0, 12, 7):
+        for name, value in plain[i].items():
+            np.testing.assert_array_equal(packed[i][name], value)
 
 
 def test_scans_read_in_order_are_read_once(world, monkeypatch):
