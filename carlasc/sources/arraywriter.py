@@ -20,6 +20,7 @@ from carlasc.sources.chunks import Encoding, StoredArray
 from carlasc.sources.packed import VERSION, Column, Options, PackedSink, PackedWriter, Packing, common_type, packing_of
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
+UNFINISHED_MARK = "unfinished.json"  # the one beside it until the store is whole
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _HEADROOM = 1.125  # a chunk holds the first frame and this much more: later frames seldom need a second chunk
 

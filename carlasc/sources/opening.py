@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.sources.arraywriter import TABLES_MARK
+from carlasc.sources.arraywriter import TABLES_MARK, UNFINISHED_MARK
 from carlasc.sources.base import Source
 from carlasc.sources.folder import FolderSource
 from carlasc.sources.packed import Options, PackedSink
@@ -93,6 +93,10 @@ def _open_store(tree: Tree) -> Source | None:
         from carlasc.sources.zarr_store import ZarrSource
 
         return ZarrSource(tree)
+    if tree.is_file(UNFINISHED_MARK):
+        raise FormatError(
+            f"{tree.location}: expected a finished store, found one whose packing was cut off: run the same command again"
+        )
     if tree.is_file(TABLES_MARK):
         from carlasc.sources.tables import ParquetSource
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +28,7 @@ from carlasc.sources.trees import RemoteTree, Tree
 
 SEQUENCE = "sequence.json"  # written last: a sequence is whole where it stands
 FRAMES = "frames.parquet"  # one row a frame
+DOCUMENTS = "documents.parquet"  # one row a text file
 
 
 class ParquetSource(PackedSource):
@@ -55,7 +57,7 @@ class ParquetSource(PackedSource):
         sizes: Counter[str] = Counter()
         for sequence in cast(Iterable[ParquetSequence], self.sequences().values()):
             folder = Path(self.location) / sequence.folder
-            sizes["documents"] += sum((folder / "documents" / name).stat().st_size for name in sequence.documents())
+            sizes["documents"] += (folder / DOCUMENTS).stat().st_size
             for field in sequence.fields():
                 sizes[field] += (folder / f"{field}.parquet").stat().st_size
         files = (Path(folder) / name for folder, _, names in os.walk(self.location) for name in names)
@@ -100,7 +102,12 @@ class ParquetSequence(Sequence):
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
-        return bytes(self.tree.read(f"{self.folder}/documents/{name}"))
+        if name not in self._documents:
+            found = ", ".join(self._documents) or "none"
+            raise MissingDataError(f"{self.location}: expected the text file {name}, found {found}")
+        with opened(self.tree, f"{self.folder}/{DOCUMENTS}") as file:
+            rows = file.read(use_threads=False).to_pylist()
+        return next(row["data"] for row in rows if row["name"] == name)
 
     def _table(self, field: str) -> _Table:
         if field not in self._tables:
@@ -119,8 +126,7 @@ class _Table:
         self.path = path
         self.field = field
         self.where = tree.where(path)
-        self._metadata = None
-        with self._open() as file:
+        with opened(tree, path) as file:
             self._metadata = file.metadata
             about = json.loads(file.metadata.metadata[b"carlasc"])
         self.attributes = about
@@ -139,7 +145,7 @@ class _Table:
         }
         if rows:
             try:
-                with self._open() as file:
+                with opened(self.tree, self.path, self._metadata) as file:
                     table = file.read_row_group(group, columns=list(columns), use_threads=False)
             except FormatError as error:
                 raise FormatError(f"{error} (field {self.field}, frame {frame})") from error
@@ -155,36 +161,26 @@ class _Table:
             )
         return array if shape is None else array.reshape(shape)
 
-    def _open(self) -> Any:
-        return _Opened(self)
 
+@contextmanager
+def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
+    """Open a Parquet file for one look; its footer need not be read again where it is known.
 
-class _Opened:
-    """A Parquet file, open for one look."""
-
-    def __init__(self, table: _Table) -> None:
-        self.table = table
-
-    def __enter__(self) -> Any:
-        parquet = import_extra("pyarrow.parquet", "parquet")
-        table = self.table
-        try:
-            where = table.tree.open(table.path) if isinstance(table.tree, RemoteTree) else table.where
-            self.file = parquet.ParquetFile(where, metadata=table._metadata, page_checksum_verification=True)
-        except FileNotFoundError as error:
-            raise FormatError(
-                f"{table.where}: expected the table that the sequence lists, found nothing: damaged store"
-            ) from error
-        except (OSError, ValueError) as error:
-            raise FormatError(f"{table.where}: cannot be read as Parquet: {error}") from error
-        return self.file
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        self.file.close(force=True)
-        if isinstance(error, OSError | ValueError):
-            raise FormatError(
-                f"{self.table.where}: cannot be decoded: {error}: corrupted, fetch or pack it again"
-            ) from error
+    Raises:
+        FormatError: it is not there, cut short, or a page's checksum does not fit.
+    """
+    parquet = import_extra("pyarrow.parquet", "parquet")
+    where = tree.where(path)
+    try:
+        place = tree.open(path) if isinstance(tree, RemoteTree) else where
+        with parquet.ParquetFile(place, metadata=metadata, page_checksum_verification=True) as file:
+            yield file
+    except FileNotFoundError as error:
+        raise FormatError(
+            f"{where}: expected the table that the sequence lists, found nothing: damaged store"
+        ) from error
+    except (OSError, ValueError) as error:  # pyarrow's errors are kinds of these
+        raise FormatError(f"{where}: cannot be read as Parquet: {error}: cut short or corrupted") from error
 
 
 def _to_numpy(column: Any) -> NDArray[Any]:

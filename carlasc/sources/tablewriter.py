@@ -14,13 +14,12 @@ from carlasc import layout
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.files import to_json, write_atomic
 from carlasc.sources.arrays import STORE
-from carlasc.sources.arraywriter import TABLES_MARK, put_in_place, refuse_existing, remove
+from carlasc.sources.arraywriter import TABLES_MARK, UNFINISHED_MARK, put_in_place, refuse_existing, remove
 from carlasc.sources.base import identity_of
 from carlasc.sources.packed import VERSION, Options, PackedSink, PackedWriter
 from carlasc.sources.tablefields import statistics, table_field
-from carlasc.sources.tables import FRAMES, SEQUENCE
+from carlasc.sources.tables import DOCUMENTS, FRAMES, SEQUENCE
 
-_RUN = "unfinished.json"  # how a store that is being written is packed
 _LEVEL = 12  # of Zstandard: from 11 on points pack better by 2 %, above 12 it takes several times longer
 _PAGE = 8 << 20  # bytes: a scan's column in one page
 
@@ -48,9 +47,9 @@ class ParquetSink(PackedSink):
         refuse_existing(self.path, overwrite)
         self._part = self.path.with_name(f"{self.path.name}.part")
         run = to_json({"lossy_mm": self.options.lossy_mm})
-        if not (self._part / _RUN).is_file() or (self._part / _RUN).read_bytes() != run:
+        if not (self._part / UNFINISHED_MARK).is_file() or (self._part / UNFINISHED_MARK).read_bytes() != run:
             remove(self._part)
-            write_atomic(self._part / _RUN, run)
+            write_atomic(self._part / UNFINISHED_MARK, run)
         done = sorted(self._part.rglob(SEQUENCE))
         self._sequences = {
             json.loads(file.read_bytes())["path"]: file.parent.relative_to(self._part).as_posix() for file in done
@@ -77,7 +76,7 @@ class ParquetSink(PackedSink):
             "lossy_mm": self.options.lossy_mm,
         }
         write_atomic(self._part / TABLES_MARK, to_json(root))
-        (self._part / _RUN).unlink()
+        (self._part / UNFINISHED_MARK).unlink()
         put_in_place(self._part, self.path, self.overwrite)
 
 
@@ -108,13 +107,15 @@ class ParquetWriter(PackedWriter):
         """
         if field not in self._tables:
             self._tables[field] = _TableWriter(self._folder / f"{field}.parquet", field, self._options)
-        self._tables[field].append(frame, array)
+        try:
+            self._tables[field].append(frame, array)
+        except FormatError as error:
+            raise FormatError(f"{self.location}: field {field}, frame {frame}: {error}") from error
         self._statistics.setdefault(frame, {}).update(statistics(field, array))
 
     def write_document(self, name: str, data: bytes) -> None:
-        """Write a text file as it is."""
+        """Keep a text file's bytes."""
         self._documents[name] = data
-        write_atomic(self._folder / "documents" / name, data)
 
     def read_document(self, name: str) -> bytes | None:
         """Return a text file's bytes, None if it is not there."""
@@ -125,11 +126,20 @@ class ParquetWriter(PackedWriter):
         for table in self._tables.values():
             table.close()
         self._write_frames()
+        self._write_documents()
         split, name, coordinates = self.identity
         about: dict[str, Any] = {"path": self._path, "split": split, "name": name, "coordinates": coordinates}
         about |= {"fields": sorted(self._tables), "documents": sorted(self._documents)}
         write_atomic(self._folder / SEQUENCE, to_json(about))
         self._finished[self._path] = self._name
+
+    def _write_documents(self) -> None:
+        """Write the table with one row a text file: its name and its bytes."""
+        pa, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
+        columns = {"name": pa.array(list(self._documents), pa.string())}
+        columns["data"] = pa.array(list(self._documents.values()), pa.binary())
+        self._folder.mkdir(parents=True, exist_ok=True)
+        parquet.write_table(pa.table(columns), self._folder / DOCUMENTS, compression="zstd", write_page_checksum=True)
 
     def _write_frames(self) -> None:
         """Write the table with one row a frame: pose, time, statistics."""
@@ -171,10 +181,8 @@ class _TableWriter:
 
     def append(self, frame: int, array: NDArray[Any]) -> None:
         if self.rows and frame <= next(reversed(self.rows)):
-            raise FormatError(
-                f"{self.path}: frame {frame}: expected frames in rising order, found it after {next(reversed(self.rows))}"
-            )
-        layout.field_named(self.field).check(array, f"{self.path}: frame {frame}")
+            raise FormatError(f"expected frames in rising order, found {frame} after {next(reversed(self.rows))}")
+        layout.field_named(self.field).check(array, "its array")
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)
