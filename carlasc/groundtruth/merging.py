@@ -135,16 +135,24 @@ class Merger:
         if self.dynamic != "align":
             return regions
         world_T_grid = self.scans[frame].world_T_sensor
-        centers = spec.from_axes(spec.centers().reshape(-1, 3))
-        half = spec.voxel_size / 2
+        centers = spec.from_axes(spec.centers())
+        columns, heights = centers[:, :, 0, :2].reshape(-1, 2), centers[0, 0, :, 2]
+        across, up = _half_cells(spec, columns)
+        by_column = regions.reshape(len(columns), len(heights))
         for i in sorted(range(len(self.tracks)), key=lambda i: -float(np.prod(self.tracks[i].size))):
             track, pose = self.tracks[i], self.tracks[i].pose(frame)
             if pose is None:
                 continue
             actor_T_grid = invert(pose) @ world_T_grid
-            slack = np.abs(actor_T_grid[:3, :3]) @ half
-            body = transform_points(actor_T_grid, centers)
-            regions[((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)] = i + 1
+            turned = np.abs(actor_T_grid[:3, :3])
+            middle = invert(actor_T_grid)[:2, 3]
+            reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
+            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
+            cells = np.column_stack([np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))])
+            slack = np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1) + up * turned[:, 2]
+            body = transform_points(actor_T_grid, cells)
+            inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
+            by_column[near] = np.where(inside.reshape(len(near), len(heights)), np.uint16(i + 1), by_column[near])
         return regions
 
     def observations(self, frame: int, window: Iterable[int], regions: NDArray[np.uint16]) -> Iterator[Observation]:
@@ -207,3 +215,11 @@ class Merger:
         if frame in track.segments:
             hits = hits | np.isin(rays, track.segments[frame].members)
         return Observation(scan.points[rays], scan.labels[rays], actor_T_sensor, hits)
+
+
+def _half_cells(spec: GridSpec, columns: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    """Return half the greatest width of the cells of each column (C, 2), and half their height: metres."""
+    size = spec.voxel_size
+    if spec.coordinates == "cartesian":
+        return np.full(len(columns), max(size[0], size[1]) / 2), float(size[2] / 2)
+    return np.maximum(size[0], np.hypot(columns[:, 0], columns[:, 1]) * size[1]) / 2, float(size[2] / 2)

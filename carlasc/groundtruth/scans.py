@@ -19,7 +19,8 @@ from carlasc.sources import open as open_source
 from carlasc.sources.base import Sequence
 
 _FASTEST_M_S, _SHARPEST_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster: its poses jump
-_STANDING_WEIGHT, _MOVABLE_WEIGHT = 0.5, 3.0
+# Points on a square metre that outweigh one scan which saw free space there.
+_STANDING_POINTS_M2, _MOVABLE_POINTS_M2 = 3.0, 24.0
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,15 @@ def free_weight(recipe: Recipe, merging: Merging) -> NDArray[np.float64] | None:
     """Return (K,) how many points of each class one scan that saw free space outweighs; None for plain votes.
 
     A thin surface that scans graze is free in most of them and there all the same, so a few points are enough for what stands. What may
-    move may also have left unnoticed, so it takes more of them.
+    move may also have left unnoticed, so it takes more of them. Smaller voxels have fewer points on them.
     """
     if recipe.vote != "point":
         return None
     if merging.dynamic == "tube":
         return np.zeros(recipe.classes.num_channels)
-    weight = np.full(recipe.classes.num_channels, _STANDING_WEIGHT)
-    weight[sorted(recipe.classes.movable)] = _MOVABLE_WEIGHT
+    face_m2 = float(recipe.spec.voxel_size[0] * recipe.spec.voxel_size[2])
+    weight = np.full(recipe.classes.num_channels, _STANDING_POINTS_M2 * face_m2)
+    weight[sorted(recipe.classes.movable)] = _MOVABLE_POINTS_M2 * face_m2
     return weight
 
 
