@@ -8,6 +8,7 @@ than a full one, as long as enough of them are known.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,8 @@ from carlasc.grids import Grid, GridSpec
 
 _MIN_POINTS = 100
 _MAX_POINTS = 20_000
-_INSIDE = 0.1  # a mistake undone must bring into known space at least this share of what stands there now
 _GAIN = 0.01  # a mistake undone must put this share of the points right, more than chance could,
-_MISSES = 1.5  # leave so many times fewer wrong,
+_MISSES = 1.15  # leave so many times fewer wrong,
 _WINS = 0.75  # and do better on this share of the frames
 _TIE = 0.005
 
@@ -64,9 +64,11 @@ class GridEvidence:
     """Gathers, frame by frame, how well scans lie in a grid as they stand and with each mistake undone."""
 
     spec: GridSpec
-    _shares: list[NDArray[np.float64]] = field(default_factory=list)
+    _right: list[NDArray[np.int64]] = field(
+        default_factory=list
+    )  # a frame: points in voxels of their class, by candidate
+    _known: list[NDArray[np.int64]] = field(default_factory=list)  # and points in known voxels
     _occupied: list[float] = field(default_factory=list)
-    _points: int = 0
 
     def add(self, points: NDArray[np.floating], labels: NDArray[np.integer] | None, grid: Grid) -> None:
         """Measure one frame.
@@ -81,33 +83,43 @@ class GridEvidence:
         step = max(1, len(points) // _MAX_POINTS)
         points, labels = points[::step], None if labels is None else labels[::step]
         as_is = _place(points, self.spec)
-        candidates = [_score(as_is, labels, grid)]
-        candidates += [_score(_place(points @ matrix.T, self.spec), labels, grid) for _, matrix in _AXES]
-        if max(score.known for score in candidates) < _MIN_POINTS:
+        own = _look_up(as_is, labels, grid)
+        verdicts = [own, *(_look_up(_place(points @ matrix.T, self.spec), labels, grid) for _, matrix in _AXES)]
+        if max(verdict.known.sum() for verdict in verdicts) < _MIN_POINTS:
             return
-        candidates += [_score(as_is.shifted(shift, self.spec), labels, grid) for shift in _SHIFTS]
-        enough = max(_MIN_POINTS, _INSIDE * candidates[0].known)
-        self._points += candidates[0].known
-        self._shares.append(np.array([score.share if score.known >= enough else 0.0 for score in candidates]))
-        self._occupied.append(_score(as_is, None, grid).share)
+        for shift in _SHIFTS:
+            shifted, within = as_is.shifted(shift, self.spec)
+            there = _look_up(shifted, labels, grid)
+            # points whose content the shift has pushed out of the grid speak neither for it nor against it
+            verdicts.append(_Verdicts(*(np.append(n, o[~within]) for n, o in zip(there, own, strict=True))))
+        self._right.append(np.array([np.count_nonzero(verdict.right) for verdict in verdicts]))
+        self._known.append(np.array([np.count_nonzero(verdict.known) for verdict in verdicts]))
+        occupied = _look_up(as_is, None, grid)
+        self._occupied.append(float(occupied.right.sum() / max(occupied.known.sum(), 1)))
 
     def diagnose(self) -> GridDiagnosis:
-        """Say which mistake, if any, explains the frames seen so far."""
-        if not self._shares:
+        """Say which mistake, if any, explains the frames seen so far.
+
+        A point votes where it is, so the right candidate has the most points in known space. Candidates are compared by the points that they put
+        right among so many: one that throws most of them out of the grid is not better for the few that it keeps.
+        """
+        if not self._right:
             return GridDiagnosis(float("nan"), float("nan"), 0)
-        shares = np.stack(self._shares)
-        own, means = shares[:, 0], shares.mean(axis=0)
-        chance = 3 * float(np.sqrt(max(means[0] * (1 - means[0]), 1e-4) / max(self._points, 1)))
+        right, known = np.stack(self._right), np.stack(self._known)
+        shares = right / known.max(axis=1, keepdims=True)
+        means = shares.mean(axis=0)
+        chance = 3 * float(np.sqrt(max(means[0] * (1 - means[0]), 1e-4) / known.max(axis=1).sum()))
         best = 0
         for column in range(1, shares.shape[1]):
             clear = means[column] - means[0] > max(_GAIN, chance) and 1 - means[0] > _MISSES * (1 - means[column])
             better = best == 0 or means[column] > means[best] + _TIE
-            if clear and better and (shares[:, column] > own).mean() >= _WINS:
+            if clear and better and (shares[:, column] > shares[:, 0]).mean() >= _WINS:
                 best = column
-        own_share, occupied = float(means[0]), float(np.mean(self._occupied))
+        own, corrected = (float((right[:, i] / np.maximum(known[:, i], 1)).mean()) for i in (0, best))
+        occupied = float(np.mean(self._occupied))
         if best == 0:
-            return GridDiagnosis(own_share, occupied, len(shares))
-        return GridDiagnosis(own_share, occupied, len(shares), _mistake(best, self.spec), float(means[best]))
+            return GridDiagnosis(own, occupied, len(right))
+        return GridDiagnosis(own, occupied, len(right), _mistake(best, self.spec), corrected)
 
 
 @dataclass(frozen=True)
@@ -117,23 +129,20 @@ class _Placement:
     cells: NDArray[np.int32]
     points: NDArray[np.int64]
 
-    def shifted(self, shift: tuple[int, int, int], spec: GridSpec) -> _Placement:
-        """The same where the grid's content stands `shift` cells too far along its axes."""
+    def shifted(self, shift: tuple[int, int, int], spec: GridSpec) -> tuple[_Placement, NDArray[np.bool_]]:
+        """The same where the grid's content stands `shift` cells too far along its axes, and which of the cells still exist then."""
         cells = self.cells + np.array(shift, np.int32)
         if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
             cells[:, 1] %= spec.size[1]  # the azimuth goes round
         within = np.all((cells >= 0) & (cells < np.array(spec.size)), axis=1)
-        return _Placement(cells[within], self.points[within])
+        return _Placement(cells[within], self.points[within]), within
 
 
-@dataclass(frozen=True)
-class _Score:
-    known: int  # points in known voxels
-    right: int  # of these, those in a voxel of their class
+class _Verdicts(NamedTuple):
+    """For each placed point, whether its voxel is known, and whether it is known and of the point's class."""
 
-    @property
-    def share(self) -> float:
-        return self.right / self.known if self.known else 0.0
+    known: NDArray[np.bool_]
+    right: NDArray[np.bool_]
 
 
 def _place(points: NDArray[np.floating], spec: GridSpec) -> _Placement:
@@ -141,12 +150,11 @@ def _place(points: NDArray[np.floating], spec: GridSpec) -> _Placement:
     return _Placement(cells[inside], np.flatnonzero(inside))
 
 
-def _score(placement: _Placement, labels: NDArray[np.integer] | None, grid: Grid) -> _Score:
+def _look_up(placement: _Placement, labels: NDArray[np.integer] | None, grid: Grid) -> _Verdicts:
     index = np.ravel_multi_index(tuple(placement.cells.T), grid.spec.size)
     voxels = grid.labels.reshape(-1)[index]
     known = np.ones(len(voxels), np.bool_) if grid.counts is None else grid.counts.reshape(-1)[index] > 0
-    right = voxels != 0 if labels is None else voxels == labels[placement.points]
-    return _Score(int(np.count_nonzero(known)), int(np.count_nonzero(right & known)))
+    return _Verdicts(known, known & (voxels != 0 if labels is None else voxels == labels[placement.points]))
 
 
 def _mistake(column: int, spec: GridSpec) -> str:

@@ -27,7 +27,8 @@ _DIFFERENT_M = 0.3
 _MIN_POINTS = 150
 _MAX_POINTS = 6000
 _OFFSET_POINTS = 1500
-_OFFSET_PAIRS = 8
+_OFFSET_PAIRS = 12
+_OFFSET_SHARE = 0.3  # of the pairs must be off, and clearly: the sensor may stand for most of a drive
 _GOOD = 0.75  # poses that put this much of the structure in place are not searched for an offset
 _STRIDE_M = 2.0  # scans of a pair are this far apart, in metres or
 _STRIDE_RAD = np.deg2rad(10.0)  # in angle: enough to tell, not so far that they see different things
@@ -166,24 +167,27 @@ def _common_offset(
 ) -> tuple[float, float, float] | None:
     """Slide each later scan beside where the poses put it: where does most of it find structure, pair for pair?"""
     steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * _VOXEL_M
-    offsets = []
-    for earlier, later in pairs[:: max(1, len(pairs) // _OFFSET_PAIRS)]:
+    offsets, chosen = [], pairs[:: max(1, len(pairs) // _OFFSET_PAIRS)]
+    for earlier, later in chosen:
         occupied = _occupancy(structure(earlier))
         moved = transform_points(relative(poses, earlier, later), _thin(structure(later), _OFFSET_POINTS))
         shares = np.array([_share(occupied, moved + step) for step in steps])
         if shares.max() > shares[len(steps) // 2] + 2 * _GAIN:
             offsets.append(-steps[shares.argmax()])
-        else:
-            offsets.append(np.zeros(3))
+    offsets = [offset for offset in offsets if np.abs(offset).max() > 1.5 * _VOXEL_M]
+    if len(offsets) < max(1, _OFFSET_SHARE * len(chosen)):
+        return None
     x, y, z = np.median(offsets, axis=0).tolist()
-    return (x, y, z) if max(abs(x), abs(y), abs(z)) > 1.5 * _VOXEL_M else None
+    return (x, y, z)
 
 
 def _partner(poses: Poses, first: int) -> int:
-    """The next scan a stride away, or the last within reach; the one after next where the sensor, says the pose, stands."""
+    """The next scan a stride away, or the last within reach; one of the next where the sensor, says the pose, stands."""
     last = min(first + _REACH, len(poses) - 1)
     if _distance(poses[first], poses[last]) < _DIFFERENT_M:
-        return min(first + 2, last)
+        return min(
+            first + (1, 4)[first % 2], last
+        )  # it may not: near enough to find a fast one, far enough for a slow one
     for second in range(first + 1, last):
         motion = relative(poses, first, second)
         if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or _angle(motion) >= _STRIDE_RAD:
