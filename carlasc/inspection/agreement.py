@@ -18,7 +18,8 @@ from carlasc.grids import Grid, GridSpec
 _MIN_POINTS = 100
 _MAX_POINTS = 20_000
 _GAIN = 0.01  # a mistake undone must put this share of the points right, more than chance could,
-_MISSES = 1.15  # leave so many times fewer wrong,
+_MISSES = 1.15  # leave so many times fewer wrong, or
+_LARGE_GAIN = 0.05  # put as many right as this,
 _WINS = 0.75  # and do better on this share of the frames
 _TIE = 0.005
 
@@ -111,7 +112,9 @@ class GridEvidence:
         chance = 3 * float(np.sqrt(max(means[0] * (1 - means[0]), 1e-4) / known.max(axis=1).sum()))
         best = 0
         for column in range(1, shares.shape[1]):
-            clear = means[column] - means[0] > max(_GAIN, chance) and 1 - means[0] > _MISSES * (1 - means[column])
+            gain = means[column] - means[0]
+            fewer = 1 - means[0] > _MISSES * (1 - means[column])
+            clear = gain > max(_GAIN, chance) and (fewer or gain > _LARGE_GAIN)
             better = best == 0 or means[column] > means[best] + _TIE
             if clear and better and (shares[:, column] > shares[:, 0]).mean() >= _WINS:
                 best = column
