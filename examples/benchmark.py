@@ -1,0 +1,184 @@
+"""A mini benchmark that can be run again: `python examples/benchmark.py OUT` (`--size full` on a GPU).
+
+Simulates towns for training, validation and test, makes their ground truth, trains LMSCNet SS, SSCNet-full, MotionSC T=1 and T=5, and prints the
+paper's two tables. Beside them, MotionSC T=5 with its history shuffled and with pose alignment off, three seeds each. Seeds and settings are fixed
+here; the towns are never changed to suit a network. A run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import typer
+from completion.command import run
+from completion.config import Config
+from completion.data import eval_loader, open_split
+from completion.networks import build_network
+from completion.processes import Processes, join_processes
+from completion.scoring import score
+from completion.towns import Town, build_towns
+from completion.training import BEST, LAST, train
+from completion.weights import load_weights, read_weights
+
+from carlasc import GridSpec
+from carlasc.labels import CARLASC11
+from carlasc.metrics import Evaluation, geometric_table, semantic_table
+
+TRAFFIC = ("light", "medium", "heavy")
+SPLITS = (("Train", 100), ("Val", 200), ("Test", 300))  # and the seed of its first town
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is simulated and trained.
+
+    Attributes:
+        towns: drives in Train, Val and Test.
+        frames: of each drive.
+        sensors: LiDARs a frame.
+        points: rays a scan.
+        cells: of the grid over the published volume.
+        epochs: of every network.
+        batch_size: samples a step.
+        seeds: runs of each setting of the study of history.
+        workers: processes that load data.
+    """
+
+    towns: tuple[int, int, int]
+    frames: int
+    sensors: int
+    points: int
+    cells: tuple[int, int, int]
+    epochs: int
+    batch_size: int
+    seeds: int = 3
+    workers: int = 0
+
+
+SIZES = {
+    "tiny": Size((2, 1, 1), 6, 4, 20_000, (32, 32, 8), 2, 4, seeds=1),
+    "small": Size((6, 2, 3), 12, 12, 65_000, (64, 64, 8), 8, 4),
+    "full": Size((24, 3, 6), 100, 20, 130_000, (128, 128, 8), 10, 8, workers=8),
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of the tables: a name and the settings of its run."""
+
+    name: str
+    config: Config
+
+
+def list_entries(size: Size) -> list[Entry]:
+    """Return the networks of the tables, with the optimizers and losses of their papers."""
+    shared = {"epochs": size.epochs, "batch_size": size.batch_size, "workers": size.workers}
+    motionsc = Config("motionsc", **shared)  # type: ignore[arg-type]
+    return [
+        Entry("LMSCNet SS", replace(motionsc, network="lmscnet_ss", decay=0.98)),
+        Entry("SSCNet full", replace(motionsc, network="sscnet_full", decay=1.0, free_ratio=2.0)),
+        Entry("MotionSC T=1", motionsc),
+        Entry("MotionSC T=5", replace(motionsc, history=5)),
+    ]
+
+
+def list_history_entries(size: Size) -> list[Entry]:
+    """Return MotionSC T=5 as it is, with its history shuffled, and with alignment off, a run a seed."""
+    plain = list_entries(size)[3].config
+    variants = {
+        "T=5": plain,
+        "T=5, history shuffled": replace(plain, shuffle_history=True),
+        "T=5, not aligned": replace(plain, align=False),
+    }
+    return [
+        Entry(f"{name}, seed {seed}", replace(config, seed=seed))
+        for name, config in variants.items()
+        for seed in range(size.seeds)
+    ]
+
+
+def build_data(out: Path, size: Size, workers: int | None) -> None:
+    """Simulate the towns of every split and make their ground truth."""
+    towns = [
+        Town(f"Town{seed + index}_{TRAFFIC[index % 3].title()}", split, seed + index, TRAFFIC[index % 3], 50)
+        for (split, seed), count in zip(SPLITS, size.towns, strict=True)
+        for index in range(count)
+    ]
+    build_towns(
+        out,
+        towns,
+        frames=size.frames,
+        sensors=size.sensors,
+        points=size.points,
+        spec=GridSpec.published().with_size(size.cells),
+        workers=workers,
+        progress=lambda done, total: print(f"towns: {done}/{total}", file=sys.stderr),
+    )
+
+
+def run_entry(entry: Entry, data: Path, out: Path, processes: Processes) -> Evaluation:
+    """Train a network, unless it is trained already, and score its best weights on the test split."""
+    print(entry.name, file=sys.stderr)
+    train(data, entry.config, out, processes, resume=(out / LAST).exists())
+    test = open_split(data, entry.config.test, entry.config)
+    num_classes = max(test.classes.names) + 1
+    network = build_network(entry.config.network, num_classes, test.spec, entry.config.history)
+    load_weights(network, read_weights(out / BEST), str(out / BEST))
+    loader = eval_loader(test, entry.config, processes.rank, processes.world)
+    matrix = score(network.to(processes.device), loader, num_classes, processes)
+    return Evaluation(entry.name, CARLASC11, matrix, {}, len(test), "known", "zero", [])
+
+
+def print_tables(evaluations: Sequence[Evaluation]) -> None:
+    """Print the paper's two tables as Markdown."""
+    for table in (semantic_table(evaluations), geometric_table(evaluations)):
+        rows = [list(table.header), ["---"] * len(table.header), *table.texts()]
+        print(f"\n{table.title}\n", *(f"| {' | '.join(row)} |" for row in rows), sep="\n")
+
+
+def main(
+    out: Annotated[Path, typer.Argument(help="Folder for data, runs and results.")],
+    size: Annotated[
+        Literal["tiny", "small", "full"], typer.Option(help="tiny and small: on a CPU; full: on a GPU.")
+    ] = "tiny",
+    history: Annotated[
+        bool, typer.Option("--history", help="Also the study of history: shuffled, and not aligned.")
+    ] = False,
+    device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
+    workers: Annotated[int | None, typer.Option(help="Processes that simulate; all cores if not given.")] = None,
+) -> None:
+    """Simulate, train, score, and print the tables."""
+    chosen = SIZES[size]
+    data = out / "data"
+    entries = list_entries(chosen) + (list_history_entries(chosen) if history else [])
+    with join_processes(device) as processes:
+        if processes.first:
+            build_data(data, chosen, workers)
+        processes.wait()
+        results = [run_entry(entry, data, out / "runs" / entry.name.replace(" ", "_"), processes) for entry in entries]
+        if processes.first:
+            print_tables(results[:4])
+            if history:
+                print_tables(results[4:])
+            figures = {
+                "size": size,
+                "device": _describe(processes),
+                "results": [result.figures() for result in results],
+            }
+            (out / "results.json").write_text(json.dumps(figures, indent=1))
+
+
+def _describe(processes: Processes) -> str:
+    if processes.device.type == "cuda":
+        return f"{processes.world} x {torch.cuda.get_device_name(processes.device)}"
+    return f"CPU, {torch.get_num_threads()} threads"
+
+
+if __name__ == "__main__":
+    run(main)
