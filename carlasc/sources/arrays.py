@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +17,7 @@ from carlasc import layout
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.grids import Coordinates
 from carlasc.sources.base import Sequence
-from carlasc.sources.chunks import StoredArray, parallel
+from carlasc.sources.chunks import StoredArray, parallel, scratch
 from carlasc.sources.packed import VERSION, Column, PackedSource, Packing, packing_of
 
 STORE, SEQUENCE, FIELD, COLUMN, DOCUMENT = (
@@ -184,10 +183,15 @@ class _PackedField:
                 for name, column in self.columns.items():
                     column.fetch(tasks[name])
 
+        main = self.columns.get(self.packing.columns[0].name)
+        rooms = self.packing.make_room([main.count(position) if main else 0 for position in positions])
+
         def assemble(k: int) -> NDArray[Any]:
             with self._naming([frames[k]]):
                 parts = {name: column.decode(tasks[name][k]) for name, column in self.columns.items()}
-                return self.packing.join({c.name: parts.get(c.name, _nothing(c)) for c in self.packing.columns})
+                return self.packing.join(
+                    {c.name: parts.get(c.name, _nothing(c)) for c in self.packing.columns}, rooms[k]
+                )
 
         return parallel(assemble, range(len(frames)))
 
@@ -213,13 +217,11 @@ class _Task:
     Attributes:
         chunks: the chunks that it is in.
         count: elements of the frame.
-        room: (rows, elements of all its chunks), where they go.
         fetched: the chunks' bytes, where they were asked for beforehand.
     """
 
     chunks: range
     count: int
-    room: NDArray[Any]
     fetched: list[memoryview] | None = None
 
 
@@ -241,25 +243,16 @@ class _StoredColumn:
                 f"{node}: expected offsets of {frames} frames inside the array, found others: damaged store"
             )
 
-    def tasks(self, positions: list[int]) -> list[_Task]:
-        """Return what is to be read for some frames.
+    def count(self, position: int) -> int:
+        """Return how many elements a frame has."""
+        start, end = self.spans[position].tolist()
+        return end - start
 
-        The room for all of them is one block: the system hands out large blocks in large pages, and touching the small ones of
-        sixteen scans' arrays takes longer than decoding what goes there.
-        """
-        step, unit = self.array.step, math.prod(self.array.chunk) // self.array.step
-        rows = self.column.room or unit
-        spans = [self.spans[position].tolist() for position in positions]
-        chunks = [range(start // step, -(-end // step)) for start, end in spans]
-        ends = np.cumsum([rows * len(numbers) * step for numbers in chunks]).tolist()
-        block = np.empty(ends[-1] if ends else 0, self.array.dtype)
-        rooms = [
-            block[end - rows * len(numbers) * step : end].reshape(rows, -1)
-            for end, numbers in zip(ends, chunks, strict=True)
-        ]
-        return [
-            _Task(numbers, end - start, room) for numbers, (start, end), room in zip(chunks, spans, rooms, strict=True)
-        ]
+    def tasks(self, positions: list[int]) -> list[_Task]:
+        """Return what is to be read for some frames."""
+        spans = (self.spans[position].tolist() for position in positions)
+        step = self.array.step
+        return [_Task(range(start // step, -(-end // step)), end - start) for start, end in spans]
 
     def fetch(self, tasks: list[_Task]) -> None:
         """Fetch the chunks of all tasks at once."""
@@ -268,27 +261,29 @@ class _StoredColumn:
             task.fetched = [next(parts) for _ in task.chunks]
 
     def decode(self, task: _Task) -> NDArray[Any]:
-        """Decode a frame's chunks into their room."""
+        """Decode a frame's chunks."""
         parts = task.fetched if task.fetched is not None else self.array.fetch(task.chunks)
         if self.is_grid:
-            values = task.room.reshape(self.array.chunk)
-            self.array.decode(parts[0], task.chunks[0], values)
-            return values[0]
-        step, stored = self.array.step, self.column.rows or 1
-        task.room[stored:] = 0
-        for place, (number, part) in enumerate(zip(task.chunks, parts, strict=True)):
-            if len(parts) == 1:  # the rule: decode into place
-                self.array.decode(part, number, task.room[:stored].reshape(self.array.chunk))
-            else:
-                out = np.empty(self.array.chunk, self.array.dtype)
-                self.array.decode(part, number, out)
-                task.room[:stored, place * step : (place + 1) * step] = out
-        values = task.room[:, : task.count]
+            return self._decode_chunk(parts[0], task.chunks[0], np.empty(self.array.chunk, self.array.dtype))[0]
+        step, rows = self.array.step, self.column.rows or 1
+        shape, dtype = (rows, len(parts) * step), self.array.dtype
+        whole = scratch(shape, dtype) if self.column.scratch else np.empty(shape, dtype)
+        if len(parts) == 1:  # the rule: decode into place
+            self._decode_chunk(parts[0], task.chunks[0], whole.reshape(self.array.chunk))
+        else:
+            chunk = np.empty(self.array.chunk, dtype)
+            for place, (number, part) in enumerate(zip(task.chunks, parts, strict=True)):
+                whole[:, place * step : (place + 1) * step] = self._decode_chunk(part, number, chunk)
+        values = whole[:, : task.count]
         return values if self.column.rows else values[0]
+
+    def _decode_chunk(self, part: memoryview, number: int, out: NDArray[Any]) -> NDArray[Any]:
+        self.array.decode(part, number, out)
+        return out
 
 
 def _nothing(column: Column) -> NDArray[Any]:
-    return np.empty((column.room or column.rows, 0) if column.rows else 0, column.dtype)
+    return np.empty((column.rows, 0) if column.rows else 0, column.dtype)
 
 
 def check_root(attributes: Mapping[str, Any] | None, where: str) -> Mapping[str, Any]:

@@ -7,8 +7,10 @@ No handle stays open, so all of this may be pickled and used on both sides of a 
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -148,6 +150,21 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     if len(items) < 2 or multiprocessing.parent_process() is not None:
         return [function(item) for item in items]
     return list(_pool(os.getpid()).map(function, items))
+
+
+def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return memory of this thread, as it was left: the next call hands it out again."""
+    size = math.prod(shape) * dtype.itemsize
+    if _scratch.memory.size < size:
+        _scratch.memory = np.empty(size, np.uint8)
+    return _scratch.memory[:size].view(dtype).reshape(shape)
+
+
+class _Scratch(threading.local):
+    memory: NDArray[np.uint8] = np.empty(0, np.uint8)
+
+
+_scratch = _Scratch()
 
 
 @cache

@@ -53,7 +53,7 @@ class Column:
         encoding: how its chunks are written.
         unit: of its values.
         rows: leading dimension of a (rows, N) column; None for a flat one.
-        room: rows to make room for when it is read; the ones that are not stored are zero.
+        scratch: whether a frame is decoded only to be copied on: into memory that the next frame takes again.
         step: elements of a chunk; None takes them from the first frame that has any, which then fills one chunk.
         least: the least of that: a first scan of three points must not make chunks of three.
     """
@@ -63,7 +63,7 @@ class Column:
     encoding: Encoding
     unit: str = ""
     rows: int | None = None
-    room: int | None = None
+    scratch: bool = False
     step: int | None = None
     least: int = 1 << 14
 
@@ -94,8 +94,12 @@ class Packing(ABC):
         """Return a frame's columns; those it does not need are left out."""
 
     @abstractmethod
-    def join(self, columns: Columns) -> NDArray[Any]:
-        """Return a frame's array; columns that it did not need are empty."""
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return a frame's array, in `into` if it has made room; columns that the frame did not need are empty."""
+
+    def make_room(self, counts: list[int]) -> list[NDArray[Any] | None]:
+        """Return arrays that `join` may write frames of so many elements to; None where it makes its own."""
+        return [None] * len(counts)
 
 
 class Points(Packing):
@@ -108,7 +112,7 @@ class Points(Packing):
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
         return (
-            Column("xyz", dtype, encoding, unit, rows=3, room=4, step=_PCODEC_STEP if options.small else None),
+            Column("xyz", dtype, encoding, unit, rows=3, scratch=True, step=_PCODEC_STEP if options.small else None),
             Column("fourth", "<f4", Encoding(shuffle=BITSHUFFLE)),
         )
 
@@ -120,14 +124,25 @@ class Points(Packing):
         fourth = np.ascontiguousarray(array[:, 3], "<f4")
         return {"xyz": xyz} | ({"fourth": fourth} if fourth.view(np.uint32).any() else {})
 
-    def join(self, columns: Columns) -> NDArray[Any]:
-        """Return (N, 4) float32, each column contiguous in memory (Fortran order)."""
-        points, fourth = columns["xyz"], columns["fourth"]
-        if "scale_m" in self.attributes:
-            points = (points * self.attributes["scale_m"]).astype(np.float32)
-        if fourth.size:
-            points[3] = fourth
-        return points.T
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return (N, 4) float32 rows, as the published file has them."""
+        xyz, fourth = columns["xyz"], columns["fourth"]
+        points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
+        scale = self.attributes.get("scale_m")
+        for axis in range(3):
+            points[:, axis] = xyz[axis] if scale is None else xyz[axis] * scale
+        points[:, 3] = fourth if fourth.size else 0
+        return points
+
+    def make_room(self, counts: list[int]) -> list[NDArray[Any] | None]:
+        """Return a stack's scans as parts of one block.
+
+        The system hands out large blocks in large pages: touching the small pages of sixteen arrays takes longer than decoding what
+        goes there.
+        """
+        ends = np.cumsum(counts).tolist()
+        block = np.empty((ends[-1] if ends else 0, 4), np.float32)
+        return [block[end - count : end] for count, end in zip(counts, ends, strict=True)]
 
 
 class Values(Packing):
@@ -144,7 +159,7 @@ class Values(Packing):
         """Narrow the values."""
         return {"values": narrow(array)}
 
-    def join(self, columns: Columns) -> NDArray[Any]:
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return (N,) unsigned integers."""
         values = columns["values"]
         return values.astype(np.uint32) if self.entry.name == "instances" else values
@@ -168,7 +183,7 @@ class Flow(Packing):
         index = np.repeat(of_run.reshape(-1), np.diff(starts, append=len(bits)))
         return {"index": narrow(index.astype(np.uint32)), "palette": palette.view("<f4").T}
 
-    def join(self, columns: Columns) -> NDArray[Any]:
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return (N, 3) float32."""
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
@@ -189,7 +204,7 @@ class Cells(Packing):
         """Narrow the values."""
         return {"values": narrow(array)}
 
-    def join(self, columns: Columns) -> NDArray[Any]:
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return (X, Y, Z), unsigned integers, or float32 where counts are no whole numbers."""
         return columns["values"]
 
@@ -210,7 +225,7 @@ class Votes(Packing):
         """Take the table apart."""
         return {column.name: np.ascontiguousarray(array[column.name]) for column in self.columns}
 
-    def join(self, columns: Columns) -> NDArray[Any]:
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Put the table together."""
         wide = columns["label"].dtype.itemsize > 1
         votes = np.empty(len(columns["voxel"]), layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)

@@ -63,13 +63,13 @@ class PointsTable(TableField):
         return columns
 
     def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return (N, 4) float32, each column contiguous in memory (Fortran order)."""
-        points = np.empty((4, len(columns["x"])), np.float32)
-        for row, name in zip(points, ("x", "y", "z", "fourth"), strict=True):
-            row[:] = (
-                columns[name] * attributes["scale_m"] if "scale_m" in attributes and name != "fourth" else columns[name]
-            )
-        return points.T
+        """Return (N, 4) float32 rows."""
+        points = np.empty((len(columns["x"]), 4), np.float32)
+        scale = attributes.get("scale_m")
+        for axis, name in enumerate("xyz"):
+            points[:, axis] = columns[name] if scale is None else columns[name] * scale
+        points[:, 3] = columns["fourth"]
+        return points
 
 
 class FlowTable(TableField):
