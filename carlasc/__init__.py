@@ -21,6 +21,7 @@ _HOME = {  # public name -> module
     "Sink": "sources",
     "Dataset": "dataset",
     "collate": "dataset",
+    "Flip": "transforms",
     "regrid": "groundtruth",
     "simulate": "simulation",
     "render": "rendering",
