@@ -190,12 +190,13 @@ def _judge_grid(sequence: Sequence, grid: str, diagnosis: GridDiagnosis) -> Iter
     share = f"{diagnosis.share:.1%} of the points in known space do, over {diagnosis.frames} frames"
     if not diagnosis.frames:
         return
-    if diagnosis.mistake is not None:
+    other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2)
+    if diagnosis.mistake is not None and not (other_classes and diagnosis.corrected_share < _POOR_SHARE):
         found = f"{share}; this looks like {diagnosis.mistake}: with it undone, {diagnosis.corrected_share:.1%}"
         advice = "mend what writes the points or the grid, or make the grid again (carlasc regrid)"
         yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
     elif diagnosis.share < _DOUBTFUL_SHARE:
-        if diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2):
+        if other_classes:
             found = f"{share}, but {diagnosis.occupied_share:.1%} in voxels of some class: this looks like labels of another class table, or out of order"
         else:
             found = f"{share}, and no known mistake undone makes it better: this looks like scans and grids of different frames"
