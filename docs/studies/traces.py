@@ -1,0 +1,167 @@
+"""Do merged scans leave traces of what moves? `python docs/studies/traces.py [FOLDER [SEED ...]]` prints the tables and draws the picture.
+
+A simulated drive of 100 frames in heavy traffic; ten frames spread over it are made from the ego sensor's scans alone, by each rule for
+what moves, and compared with what 60 sensors around the scene see at that very instant, over the voxels known to both.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+import carlasc
+from carlasc import Grid, GridSpec, layout
+from carlasc.geometry import invert, relative_to
+from carlasc.groundtruth import Observation, count_votes
+from carlasc.groundtruth.windows import Merging
+from carlasc.labels import CARLA
+from carlasc.metrics import TruthScore, score_truth
+from carlasc.rendering import ClassColors, Panel, draw_panels, grid_scene
+from carlasc.simulation import Drive
+from carlasc.sources import FolderSink
+
+FRAMES = 101
+JUDGED = [int(frame) for frame in np.linspace(0, FRAMES - 1, 10)]
+GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
+CLASSES = ("Vehicle", "Pedestrian", "Road", "Building", "Sidewalk", "Vegetation", "Pole")
+VEHICLE = CARLA.id_of("Vehicle")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One way to make the ground truth."""
+
+    name: str
+    field: str  # what tells how things move
+    merging: Merging
+    vote: str | None = None
+
+
+RUNS = (
+    Run("tube", "flow", Merging(dynamic="tube")),
+    Run("drop", "flow", Merging(dynamic="drop")),
+    Run("current", "flow", Merging(dynamic="current")),
+    Run("current, plain votes", "flow", Merging(dynamic="current"), "sensor"),
+    Run("align, plain votes", "flow", Merging(), "sensor"),
+    Run("align", "flow", Merging()),
+    Run("align, by instances", "instances", Merging()),
+)
+
+
+def record_drive(drive: Drive, folder: Path) -> None:
+    """Write the ego scans of a drive twice: with flow, and with instances instead."""
+    writers = {field: FolderSink(folder).sequence(f"{field}/cartesian") for field in ("flow", "instances")}
+    poses = np.stack([drive.sensor_poses(frame, 1)[0] for frame in range(FRAMES)])
+    for writer in writers.values():
+        writer.write_document(layout.POSES, layout.encode_poses(relative_to(poses[0], poses)))
+        writer.write_document(layout.TIMES, layout.encode_times(np.arange(FRAMES) * layout.FRAME_PERIOD_S))
+    for frame in range(FRAMES):
+        scan = drive.scan(frame)
+        points = np.column_stack([scan.points, np.zeros(len(scan), np.float32)])
+        for field, writer in writers.items():
+            writer.write("points", frame, points)
+            writer.write("labels", frame, scan.labels)
+            writer.write(field, frame, getattr(scan, field))
+
+
+def reference(drive: Drive, frame: int, spec: GridSpec) -> Grid:
+    """Return what 60 sensors see at the instant of a frame, in the ego sensor's grid."""
+    grid_T_world = invert(drive.sensor_poses(frame, 1)[0])
+    seen = drive.reference_observations(frame, 60)
+    observations = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in seen]
+    return count_votes(observations, spec).to_grid()
+
+
+def score(run: Run, folder: Path, name: str, spec: GridSpec, truths: dict[int, Grid]) -> TruthScore:
+    """Make the judged frames in one way, and score them."""
+    sequence = folder / run.field
+    total = None
+    for frame in JUDGED:
+        options = {
+            "observations": "scans",
+            "merging": run.merging,
+            "vote": run.vote,
+            "workers": 1,
+            "name": folder_of(run, name),
+        }
+        carlasc.regrid(sequence, None, spec, frames=(frame, frame + 1), **options)
+        grid = load(sequence, run, name, frame)
+        one = score_truth(grid, truths[frame], CARLA.num_channels)
+        total = one if total is None else total + one
+    assert total is not None
+    return total
+
+
+def folder_of(run: Run, name: str) -> str:
+    """Return the folder of a run's grids."""
+    return f"{run.name}_{name}".replace(" ", "_").replace(",", "")
+
+
+def load(sequence: Path, run: Run, name: str, frame: int) -> Grid:
+    """Read a grid that a run has made."""
+    return next(iter(carlasc.open(sequence).sequences().values())).grid(folder_of(run, name), frame)
+
+
+def row(name: str, total: TruthScore, tube: TruthScore) -> str:
+    """Return a row of the table."""
+    matrix, iou = total.matrix, total.matrix.iou
+    wrong = int(matrix.false_positives[VEHICLE])
+    ratio = int(tube.matrix.false_positives[VEHICLE]) / max(wrong, 1)
+    cells = [f"{iou[CARLA.id_of(label)]:.3f}" for label in CLASSES]
+    cells += [f"{matrix.recall[VEHICLE]:.2f}", f"{wrong} (1/{ratio:.0f})", f"{total.coverage:.1%}"]
+    return f"| {name} | " + " | ".join(cells) + " |"
+
+
+def study(seed: int, folder: Path, out: Path) -> list[str]:
+    """Return the tables of one drive; draw its picture."""
+    drive = Drive(seed, "heavy")
+    record_drive(drive, folder)
+    lines = []
+    for name, spec in GRIDS.items():
+        truths = {frame: reference(drive, frame, spec) for frame in JUDGED}
+        scores = {run.name: score(run, folder, name, spec, truths) for run in RUNS}
+        lines += ["", f"Seed {seed}, {name}:", ""]
+        lines += [
+            f"| rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle | coverage |",
+            "|---|" + "---:|" * 10,
+        ]
+        lines += [row(run, total, scores["tube"]) for run, total in scores.items()]
+        if name == "0.2 m":
+            draw(folder, truths, out / f"traces_{seed}.png")
+    return lines
+
+
+def draw(folder: Path, truths: dict[int, Grid], path: Path) -> None:
+    """Draw the frame with the longest tubes: tube, align and reference side by side."""
+    runs = {run.name: run for run in RUNS}
+    tubes = {frame: load(folder / "flow", runs["tube"], "0.2 m", frame) for frame in JUDGED}
+    wrong = {
+        f: int(((tubes[f].labels == VEHICLE) & (truths[f].labels != VEHICLE) & truths[f].known).sum()) for f in JUDGED
+    }
+    frame = max(JUDGED, key=lambda f: wrong[f])
+    grids = {
+        "SemanticKITTI's rule (tube)": tubes[frame],
+        "carlasc (align)": load(folder / "flow", runs["align"], "0.2 m", frame),
+        "reference: 60 sensors at that instant": truths[frame],
+    }
+    panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
+    Image.fromarray(draw_panels(panels, size=(1800, 640))).save(path)
+
+
+def main(out: Path, seeds: list[int]) -> None:
+    """Study each drive."""
+    out.mkdir(parents=True, exist_ok=True)
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as folder:
+            lines = study(seed, Path(folder), out)
+        print("\n".join(lines), flush=True)
+        (out / f"traces_{seed}.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images"), [int(seed) for seed in sys.argv[2:]] or [1, 2])
