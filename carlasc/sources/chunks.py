@@ -27,7 +27,9 @@ _T = TypeVar("_T")
 _R = TypeVar("_R")
 
 NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
-BLOCK = 1 << 20  # bytes that Blosc compresses in one go: larger ones gain nothing, smaller ones cost half a per cent
+BLOCK = (
+    1 << 19
+)  # bytes that Blosc compresses in one go: a scan in several, which its threads share; smaller ones cost size
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ def read_sum(sequence: Sequence) -> float:
 class SourceContract:
     """Reads what `write_dataset` wrote, however the store keeps it."""
 
-    processes = ("fork", "spawn")
+    processes = ("fork", "spawn")  # ways to start processes that are worth a test: a spawn takes two seconds
 
     def build(self, published: Path, folder: Path) -> Source:
         """Return a source of the same sequences, made in `folder`."""
@@ -126,7 +126,7 @@ class SourceContract:
     @pytest.mark.parametrize("method", ["fork", "spawn"])
     def test_reads_in_other_processes_after_reading_in_this_one(self, source: Source, method: str) -> None:
         if method not in self.processes:
-            pytest.skip(f"this store is in the memory of one process: nothing to read after {method}")
+            pytest.skip("in the memory of this process only, or tried with another store of the kind")
         sequence = source.sequences()[WHOLE]
         wanted = read_sum(sequence)
         with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(method)) as pool:

@@ -134,6 +134,8 @@ class TestMemoryParquet(SourceContract):
 
 
 class TestFileURL(SourceContract):
+    processes = ("fork",)
+
     def build(self, published: Path, folder: Path) -> Source:
         return carlasc.open(published.as_uri())
 

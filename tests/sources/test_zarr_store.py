@@ -28,12 +28,16 @@ class TestZarrSource(SourceContract):
 
 
 class TestSmallZarrSource(SourceContract):
+    processes = ("fork",)
+
     def build(self, published: Path, folder: Path) -> Source:
         pack(published, folder / "x.zarr", small=True)
         return carlasc.open(folder / "x.zarr")
 
 
 class TestZippedZarrSource(SourceContract):
+    processes = ("fork",)
+
     def build(self, published: Path, folder: Path) -> Source:
         pack(published, folder / "x.zarr")
         with zipfile.ZipFile(folder / "x.zarr.zip", "w") as archive:

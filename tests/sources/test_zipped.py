@@ -29,11 +29,15 @@ class TestStoredZip(SourceContract):
 
 
 class TestDeflatedZip(SourceContract):
+    processes = ("fork",)
+
     def build(self, published: Path, folder: Path) -> Source:
         return carlasc.open(write_zip(files_of(published), folder / "data", zipfile.ZIP_DEFLATED))  # by its signature
 
 
 class TestZipWithAFolderAroundAndFolderEntries(SourceContract):
+    processes = ("fork",)
+
     def build(self, published: Path, folder: Path) -> Source:
         files = {f"Cartesian/{name}": data for name, data in files_of(published).items()}
         folders = {f"{Path(name).parent.as_posix()}/": b"" for name in files}
