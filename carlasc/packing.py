@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import layout
-from carlasc.errors import ConflictError
+from carlasc.errors import CarlascError, ConflictError
 from carlasc.sources.arraywriter import put_in_place
 from carlasc.sources.base import Sequence, SequenceWriter, Source
 from carlasc.sources.folder import FolderSink
@@ -108,7 +108,7 @@ def pack(
     _refuse_overlap(result.out, source)
     sequences = source.sequences()
     step = _steps(sequences, progress)
-    with open_sink(result.out, options, overwrite) as sink:
+    with _writing(result.out), open_sink(result.out, options, overwrite) as sink:
         for path, sequence in sequences.items():
             result.sequences.append(path)
             result.frames += len(sequence.scan_frames())
@@ -177,6 +177,17 @@ def unpack(
     if folder != result.out:
         put_in_place(folder, result.out, overwrite=False)
     return result
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    """Say what could not be written; sources have errors of their own."""
+    try:
+        yield
+    except OSError as error:
+        raise CarlascError(
+            f"{out}: cannot be written: {error.strerror or error}: mend that and run the same command again to go on"
+        ) from error
 
 
 def _pack_sequence(

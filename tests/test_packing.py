@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import carlasc
 from carlasc.cli import app
-from carlasc.errors import ArgumentError, ConflictError, FormatError
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.packing import pack, unpack
 from carlasc.sources import FolderSink, FolderSource
 
@@ -214,6 +214,24 @@ def test_a_grid_whose_size_changes_is_an_error(tmp_path: Path, kind: str) -> Non
     with pytest.raises(FormatError, match=r"evaluation/000001\.label: expected 120 bytes"):
         pack(tmp_path / "data", tmp_path / f"x.{kind}")
     assert not (tmp_path / f"x.{kind}").exists()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_place_that_cannot_be_written_is_one_clear_error(data: Path, tmp_path: Path, kind: str) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(CarlascError, match=rf"x\.{kind}: cannot be written: (Not a directory|File exists)"):
+        pack(data / "Val", tmp_path / "file" / f"x.{kind}")
+
+
+@pytest.mark.parametrize("path", ["../evil", "/tmp/evil", "Train/../../evil"])
+def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(data: Path, tmp_path: Path, path: str) -> None:
+    root = pack(data / "Val", tmp_path / "x.zarr").out / "zarr.json"
+    node = json.loads(root.read_bytes())
+    node["attributes"]["sequences"] = {path: next(iter(node["attributes"]["sequences"].values()))}
+    root.write_text(json.dumps(node))
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        unpack(tmp_path / "x.zarr", tmp_path / "files")
+    assert not list(tmp_path.parent.rglob("evil"))
 
 
 KILLED = """

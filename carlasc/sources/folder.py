@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc import layout
-from carlasc.errors import MissingDataError
+from carlasc.errors import FormatError, MissingDataError
 from carlasc.files import remove_stale, write_atomic
 from carlasc.sources.base import Sequence, SequenceWriter, Sink
 from carlasc.sources.published import PublishedSequence, PublishedSource
@@ -67,7 +67,7 @@ class FolderSink(Sink):
     def sequence(self, path: str) -> FolderWriter:
         """Start, or go on with, a sequence's folder; what a killed run left half-written there is removed."""
         remove_stale(self.root / path)
-        return FolderWriter(self.root / path)
+        return FolderWriter(_inside(self.root, path))
 
 
 class FolderWriter(SequenceWriter):
@@ -86,7 +86,7 @@ class FolderWriter(SequenceWriter):
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Write one file."""
         entry = layout.field_named(field)
-        path = self.folder / entry.file(frame)
+        path = _inside(self.folder, entry.file(frame))
         write_atomic(path, entry.encode(array, str(path)))
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
@@ -105,9 +105,16 @@ class FolderWriter(SequenceWriter):
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
-        write_atomic(self.folder / name, data)
+        write_atomic(_inside(self.folder, name), data)
 
     def read_document(self, name: str) -> bytes | None:
         """Return a text file's bytes, None if it is not there."""
         path = self.folder / name
         return path.read_bytes() if path.is_file() else None
+
+
+def _inside(folder: Path, path: str) -> Path:
+    """Return a path below a folder; names come from stores too, which anyone may have made."""
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise FormatError(f"{path}: expected a path inside {folder}, found one that leads elsewhere")
+    return folder / path

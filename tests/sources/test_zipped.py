@@ -139,7 +139,7 @@ def test_names_that_lead_out_of_the_folder_are_refused(files: dict[str, bytes], 
         carlasc.open(archive).sequences()
 
 
-@pytest.mark.parametrize("name", ["a..b.txt", "Train/10:30.txt"])
+@pytest.mark.parametrize("name", ["a..b.txt", "Train/10:30.txt", "Übersicht.txt"])
 def test_harmless_names_with_odd_signs_are_taken(files: dict[str, bytes], tmp_path: Path, name: str) -> None:
     archive = write_zip(files | {name: b"1"}, tmp_path / "data.zip")
     assert len(carlasc.open(archive).sequences()) == 3
