@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import resource
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +28,8 @@ class Latency:
         median_ms: of the repetitions.
         fastest_ms: of the repetitions; on a machine that does other work, too, the better figure for ratios.
         memory_mb: peak of the GPU's memory, or of the whole process on a CPU.
-        speedup: against eager float32 of the same run, fastest against fastest.
-        same_labels: share of voxels with the labels of eager float32.
+        speedup: against the first mode of the same run (eager float32), fastest against fastest.
+        same_labels: share of voxels with the labels of the first mode.
     """
 
     network: str
@@ -42,9 +43,16 @@ class Latency:
 
 
 def measure_network(
-    name: str, history: int, device: torch.device, *, spec: GridSpec, num_classes: int = 11, repetitions: int = 100
+    name: str,
+    history: int,
+    device: torch.device,
+    *,
+    spec: GridSpec,
+    num_classes: int = 11,
+    repetitions: int = 100,
+    modes: Sequence[Mode] = ("eager", "compile"),
 ) -> list[Latency]:
-    """Measure a network eagerly in float32, then as `prepare` makes it fast.
+    """Measure a network in one mode after the other; speed and labels are compared with the first.
 
     Weights are random: they do not change the time. Occupancy is as dense as a scan's: 1 voxel in 20.
     """
@@ -52,7 +60,7 @@ def measure_network(
     occupancy = torch.from_numpy((rng.random((1, history, *spec.size)) < 0.05).astype(np.uint8)).to(device)
     results: list[Latency] = []
     reference = None
-    for mode in ("eager", "compile"):
+    for mode in modes:
         torch.manual_seed(0)
         run = prepare(randomise(build_network(name, num_classes, spec, history)), device, mode)
         if device.type == "cuda":

@@ -9,7 +9,8 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 sys.path.insert(0, str(EXAMPLES))
-pytest.importorskip("torch", reason="the examples need carlasc[torch]")
+torch = pytest.importorskip("torch", reason="the examples need carlasc[torch]")
+torch.set_num_threads(1)  # the networks are tiny here: threads that wait for each other cost more than they bring
 
 
 @pytest.fixture(scope="session")
