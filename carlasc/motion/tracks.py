@@ -19,6 +19,7 @@ _STOPPING_M_S = 1.5  # slower actors may stand still in the next scan, or have s
 _MAX_GAP = 15  # frames that an actor may be hidden and still be the same
 _EXTRAPOLATE = 5  # frames that a track goes on before its first and after its last sighting
 _HEADING_SPEED_M_S = 1.0  # faster actors look where they go
+_STANDING_M = 0.5  # what is seen of a standing actor may wander as much
 _TRIM = 0.01  # share of points that may stick out of an actor's box: flying pixels, a neighbour's
 _MARGIN_M = 0.1
 
@@ -64,8 +65,9 @@ class Track:
 
     @property
     def moves(self) -> bool:
-        """Whether the actor ever moves faster than standing actors seem to."""
-        return bool((np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any())
+        """Whether the actor ever moves faster, and farther, than standing actors seem to."""
+        fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
+        return bool(fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M)
 
 
 def link_segments(
@@ -175,8 +177,8 @@ def _make_track(chain: list[Segment], times: Mapping[int, float]) -> Track:
     """Turn linked segments into a path, then into poses with the box around everything that was seen."""
     seconds = np.array([times[segment.frame] for segment in chain])
     if any(segment.velocity is None for segment in chain):
-        positions, headings = register([segment.points for segment in chain], seconds)
-        velocities = _derivative(positions, seconds)
+        origins = np.stack([segment.origin for segment in chain])
+        positions, velocities, headings = register([segment.points for segment in chain], origins, seconds)
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
         positions = _integrate(velocities, seconds, chain)
@@ -259,10 +261,3 @@ def _resample(
     speed = np.stack([np.interp(at, seconds, velocities[:, a]) for a in range(3)], axis=1)
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
     return path + speed * beyond[:, None], speed, np.interp(at, seconds, headings)
-
-
-def _derivative(positions: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return velocities by central differences; zero for a single sighting."""
-    if len(seconds) < 2:
-        return np.zeros_like(positions)
-    return np.gradient(positions, seconds, axis=0)
