@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 import typer
 from completion.command import run
@@ -43,7 +44,8 @@ class Size:
         frames: of each drive.
         sensors: LiDARs a frame.
         points: rays a scan.
-        cells: of the grid over the published volume.
+        half_width_m: the grid reaches so far from the sensor; height is the published -2..1 m.
+        cells: of the grid.
         epochs: of every network.
         batch_size: samples a step.
         seeds: runs of each setting of the study of history.
@@ -54,6 +56,7 @@ class Size:
     frames: int
     sensors: int
     points: int
+    half_width_m: float
     cells: tuple[int, int, int]
     epochs: int
     batch_size: int
@@ -62,9 +65,9 @@ class Size:
 
 
 SIZES = {
-    "tiny": Size((2, 1, 1), 6, 4, 20_000, (32, 32, 8), 2, 4, seeds=1),
-    "small": Size((6, 2, 3), 12, 12, 65_000, (64, 64, 8), 8, 4),
-    "full": Size((24, 3, 6), 100, 20, 130_000, (128, 128, 8), 10, 8, workers=8),
+    "tiny": Size((2, 1, 1), 6, 3, 10_000, 25.6, (16, 16, 8), 1, 4, seeds=1),
+    "small": Size((6, 2, 3), 12, 12, 65_000, 12.8, (32, 32, 8), 12, 4),
+    "full": Size((24, 3, 6), 100, 20, 130_000, 25.6, (128, 128, 8), 10, 8, workers=8),
 }
 
 
@@ -110,13 +113,14 @@ def build_data(out: Path, size: Size, workers: int | None) -> None:
         for (split, seed), count in zip(SPLITS, size.towns, strict=True)
         for index in range(count)
     ]
+    half = float(np.float32(size.half_width_m))  # the format's bounds are float32
     build_towns(
         out,
         towns,
         frames=size.frames,
         sensors=size.sensors,
         points=size.points,
-        spec=GridSpec.published().with_size(size.cells),
+        spec=GridSpec("cartesian", size.cells, (-half, -half, -2.0), (half, half, 1.0)),
         workers=workers,
         progress=lambda done, total: print(f"towns: {done}/{total}", file=sys.stderr),
     )

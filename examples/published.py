@@ -15,13 +15,20 @@ from completion.command import run
 from completion.predicting import Model, predict_dataset
 from completion.towns import Town, build_towns
 
-from carlasc.metrics import evaluate
+from carlasc.metrics import Evaluation, evaluate
 
 TOWNS = tuple(
     Town(f"Town{seed}_{traffic.title()}", "Test", seed, traffic, first_frame)
     for seed, traffic in ((10, "light"), (11, "medium"), (12, "heavy"))
     for first_frame in range(50, 550, 50)
 )
+
+
+def score_towns(weights: Path, out: Path, *, every: int = 1, workers: int | None = None) -> Evaluation:
+    """Simulate the towns, complete their ego scans, score them; what is in `out` already is not made again."""
+    build_towns(out, TOWNS[::every], frames=1, sensors=20, workers=workers)
+    predict_dataset(Model.read(weights), str(out), None, torch.device("cpu"), "eager")
+    return evaluate(out, out, pred_grid="completion", name=weights.name)
 
 
 def main(
@@ -31,11 +38,7 @@ def main(
     workers: Annotated[int | None, typer.Option(help="Processes side by side; all cores if not given.")] = None,
 ) -> None:
     """Score published weights on the simulated towns."""
-    build_towns(out, TOWNS[::every], frames=1, sensors=20, workers=workers)
-    model = Model.read(weights)
-    predict_dataset(model, str(out), None, torch.device("cpu"), "eager")
-    result = evaluate(out, out, pred_grid="completion", name=weights.name)
-    for table in result.tables():
+    for table in score_towns(weights, out, every=every, workers=workers).tables():
         print(table.title, table.to_csv(), sep="\n")
 
 
