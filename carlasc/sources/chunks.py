@@ -172,4 +172,4 @@ _scratch = _Scratch()
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
     """Threads of this process: a fork inherits the object, but not its threads."""
-    return ThreadPoolExecutor(min(4, len(os.sched_getaffinity(0))), thread_name_prefix="carlasc-decode")
+    return ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0))), thread_name_prefix="carlasc-decode")

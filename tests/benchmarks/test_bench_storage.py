@@ -84,14 +84,17 @@ def places(order: str) -> list[int]:
 
 
 def _milliseconds(loads, repeats):
-    """Return each load's mean over frames of the best of several passes; the loads take turns, so that all meet the same machine."""
+    """Return each load's mean over frames of the best of several passes; the loads take turns, so that all meet the same machine.
+
+    Processor time of all threads: on an idle machine a stack takes that by the number of cores.
+    """
     best = {}
     for _ in range(repeats):
         for name, (load, items) in loads.items():
             for place, item in enumerate(items):
-                start = time.perf_counter()
+                start = time.process_time()
                 load(item)
-                took = time.perf_counter() - start
+                took = time.process_time() - start
                 best[name, place] = min(best.get((name, place), np.inf), took)
     return {name: 1e3 * np.mean([best[name, k] for k in range(len(items))]) for name, (_, items) in loads.items()}
 
