@@ -1,0 +1,150 @@
+"""Poses of a recording: from its files or from its scans, and whether scans agree with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import layout
+from carlasc.converting.protocol import Converter, Recording
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.inspection.alignment import diagnose_poses
+from carlasc.inspection.structure import static_structure
+from carlasc.sources.base import Metadata, Sequence
+
+PoseSource = Literal["file", "kiss-icp", "auto"]
+FILE, KISS_ICP = "file", "kiss-icp"
+
+
+def read_poses(recording: Recording, wanted: PoseSource, *, force: bool) -> NDArray[np.float64] | None:
+    """Return (F, 4, 4) first_T_sensor by frame number from the recording's files, None where they are to be estimated.
+
+    Raises:
+        MissingDataError: there are none, and none are to be estimated.
+        FormatError: a frame has no line.
+    """
+    poses = None if wanted == KISS_ICP else recording.poses(force=force)
+    if poses is None:
+        if wanted == FILE:
+            raise MissingDataError(
+                f"{recording.location}: expected poses.txt, found nothing: copy it, or estimate poses from the scans (`--poses kiss-icp`)"
+            )
+        return None
+    last = recording.frames[-1].number
+    if len(poses) <= last:
+        raise FormatError(
+            f"{recording.location}: expected a pose for each frame up to {last}, found {len(poses)} lines in the file of poses: copy it again, or"
+            " estimate poses from the scans (`--poses kiss-icp`)"
+        )
+    relative: NDArray[np.float64] = np.linalg.inv(poses[0]) @ poses[: last + 1]
+    return relative
+
+
+def estimate_poses(
+    recording: Recording, converter: type[Converter], step: Callable[[], object]
+) -> NDArray[np.float64]:
+    """Let KISS-ICP find the pose of each scan; lines of frames without a scan stay where the last one was.
+
+    Scans that cannot be read are passed over: whoever converts them reports them.
+    """
+    from carlasc import odometry
+
+    found: list[int] = []
+
+    def scans() -> Any:
+        for handle in recording.frames:
+            step()
+            try:
+                points = handle.read().points
+            except (FormatError, MissingDataError):
+                continue
+            found.append(handle.number)
+            yield points[np.isfinite(points).all(axis=1), :3]
+
+    limits = {"min_range_m": converter.min_range_m or 0.0, "max_range_m": converter.max_range_m or 100.0}
+    poses = odometry.estimate_poses(scans(), **limits)
+    if not len(poses):
+        raise MissingDataError(f"{recording.location}: expected scans to estimate poses from, found none that can be read")
+    lines = np.searchsorted(found, np.arange(recording.frames[-1].number + 1), side="right") - 1
+    return poses[np.clip(lines, 0, None)]
+
+
+def check_poses(recording: Recording, converter: type[Converter], poses: NDArray[np.float64]) -> None:
+    """Align scans under their poses.
+
+    Raises:
+        FormatError: they do not lie on each other; says what the poses look like, and what to do.
+    """
+    scans = _Scans(recording, converter)
+    frames = [handle.number for handle in recording.frames]
+
+    def structure(index: int) -> NDArray[np.float64]:
+        try:
+            return static_structure(scans, frames[index])
+        except (FormatError, MissingDataError):
+            return np.empty((0, 3))
+
+    diagnosis = diagnose_poses(structure, poses[frames])
+    expected = f"{recording.location}: expected poses that put scans on each other"
+    if diagnosis.correction is not None:
+        raise FormatError(
+            f"{expected}, found {diagnosis.share_there:.0%} of a scan's structure on an earlier scan's; they look like {diagnosis.correction.name}"
+            f" (with that undone, {diagnosis.corrected_share:.0%}): {diagnosis.correction.advice}; or go on with --force"
+        )
+    if diagnosis.offset_m is not None:
+        x, y, z = diagnosis.offset_m
+        raise FormatError(
+            f"{expected}, found that they put scans about ({x:.1f}, {y:.1f}, {z:.1f}) m beside their place: are poses.txt and calib.txt of this"
+            " sequence? Estimate poses from the scans (`--poses kiss-icp`), or go on with --force"
+        )
+
+
+class _Scans(Sequence):
+    """A recording's scans, as they are, for those who read sequences."""
+
+    def __init__(self, recording: Recording, converter: type[Converter]) -> None:
+        self.recording, self.path, self.location = recording, "", recording.location
+        self.split, self.name, self.coordinates = recording.split, recording.name, "cartesian"
+        self.metadata = Metadata("kitti", converter.classes)
+        self._handles = {handle.number: handle for handle in recording.frames}
+
+    def fields(self) -> frozenset[str]:
+        return frozenset(("points", "labels") if self.recording.has_labels else ("points",))
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        return np.array(list(self._handles), np.int64) if field in self.fields() else np.empty(0, np.int64)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        if field == "points":
+            return self._handles[frame].read().points
+        labels, _ = self._handles[frame].read_labels()
+        if labels is None:
+            raise MissingDataError(f"{self.location}: expected labels, found none")
+        return labels
+
+    def documents(self) -> tuple[str, ...]:
+        return ()
+
+    def read_document(self, name: str) -> bytes:
+        raise MissingDataError(f"{self.location}/{name}: expected a file, found a recording of another data set")
+
+
+def first_line_times(recording: Recording) -> NDArray[np.float64]:
+    """Return (F,) seconds since the first frame by frame number; 10 Hz where the recording says nothing.
+
+    Raises:
+        FormatError: a frame has no line.
+    """
+    frames = recording.frames[-1].number + 1
+    times = recording.times()
+    if times is None:
+        return np.arange(frames) * layout.FRAME_PERIOD_S
+    if len(times) < frames:
+        raise FormatError(
+            f"{recording.location}: expected a time for each frame up to {frames - 1}, found {len(times)} lines in times.txt: copy it again"
+        )
+    since: NDArray[np.float64] = times[:frames] - times[0]
+    return since

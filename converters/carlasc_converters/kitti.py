@@ -1,0 +1,239 @@
+"""SemanticKITTI, and KITTI odometry roots without labels (FORMAT section 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import layout
+from carlasc.converting import Converter, Exporter, FrameContent, FrameHandle, Recording, Split, VoxelContent
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.geometry import Transform, check_rigid
+from carlasc.labels import REMAPS, SEMANTICKITTI
+from carlasc_converters.kitti_voxels import GRID, read_voxel_files
+
+_MOVING_TO_BASE = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
+_TEST_FIRST, _VALIDATION = 11, 8
+
+
+class SemanticKitti(Converter):
+    """A SemanticKITTI root, one of its sequences, or a KITTI odometry root."""
+
+    title: ClassVar[str] = "SemanticKITTI, or a KITTI odometry root without labels"
+    classes = SEMANTICKITTI
+    to_carla = REMAPS["semantickitti_to_carla"]
+    sensor = "Velodyne HDL-64E"
+    min_range_m = 2.5
+    max_range_m = 70.0
+    voxels = GRID
+
+    def sequences(self) -> list[Recording]:
+        """Return the sequences, by number.
+
+        Raises:
+            MissingDataError: there is none.
+        """
+        folders = find_sequences(self.root)
+        return [KittiRecording(folder, f"KITTI_{folder.name}", _split_of(folder.name)) for folder in folders]
+
+    @classmethod
+    def exporter(cls, **options: Any) -> Exporter:
+        """Return what writes SemanticKITTI's files."""
+        from carlasc_converters.kitti_export import KittiExporter
+
+        return KittiExporter(**options)
+
+
+class KittiRecording(Recording):
+    """One sequence's folder: velodyne/, labels/, voxels/, poses.txt, calib.txt, times.txt.
+
+    Attributes:
+        folder: where it is.
+    """
+
+    def __init__(self, folder: Path, name: str, split: Split) -> None:
+        self.folder, self.name, self.split = folder, name, split
+        self.location = str(folder)
+        self.has_labels = bool(frames_of(folder / "labels", ".label"))
+
+    @cached_property
+    def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
+        """The frames that have a scan."""
+        return [self._handle(number) for number in frames_of(self.folder / "velodyne", ".bin")]
+
+    def _handle(self, number: int) -> FrameHandle:
+        return KittiFrame(str(self.folder), number, self.has_labels)
+
+    def poses(self, *, force: bool = False) -> NDArray[np.float64] | None:
+        """Return inv(Tr) @ P @ Tr of each line of poses.txt: it holds poses of the left camera."""
+        path = next((path for path in self._pose_files() if path.is_file()), None)
+        if path is None:
+            return None
+        camera_poses = layout.decode_poses(path.read_bytes(), str(path))
+        camera_T_lidar = self._calibration(path, force=force)
+        return np.linalg.inv(camera_T_lidar) @ check_rigid(camera_poses, str(path)) @ camera_T_lidar
+
+    def _pose_files(self) -> tuple[Path, ...]:
+        """Where poses may be: in the sequence, or, in odometry roots, in poses/ beside sequences/."""
+        return self.folder / "poses.txt", self.folder.parent.parent / "poses" / f"{self.folder.name}.txt"
+
+    def _calibration(self, poses: Path, *, force: bool) -> Transform:
+        path = self.folder / "calib.txt"
+        found = read_calibration(path) if path.is_file() else None
+        if found is not None and "Tr" in found:
+            return check_rigid(found["Tr"], f"{path}: Tr")
+        if force:
+            return np.eye(4)
+        what = "no such file" if found is None else f"only {', '.join(found) or 'no key'}"
+        error = MissingDataError if found is None else FormatError
+        raise error(
+            f"{path}: expected Tr, which takes LiDAR points to the camera whose poses {poses.name} holds, found {what}: copy calib.txt of the KITTI"
+            " odometry data, estimate poses from the scans (`--poses kiss-icp`), or take them for the LiDAR's own (`--force`)"
+        )
+
+    def times(self) -> NDArray[np.float64] | None:
+        """Return the lines of times.txt."""
+        path = self.folder / "times.txt"
+        return layout.decode_times(path.read_bytes(), str(path)) if path.is_file() else None
+
+    def problems(self) -> list[tuple[int, str]]:
+        """Name the frames that have labels or voxels, but no scan."""
+        there = {frame.number for frame in self.frames}
+        others = {*frames_of(self.folder / "labels", ".label"), *frames_of(self.folder / "voxels", ".label")}
+        scan = self.folder / "velodyne"
+        return [
+            (number, f"{scan / f'{number:06d}.bin'}: expected a scan beside its labels, found no such file")
+            for number in sorted(others - there)
+        ]
+
+
+@dataclass(frozen=True)
+class KittiFrame(FrameHandle):
+    """One frame's files."""
+
+    folder: str
+    number: int
+    labelled: bool
+
+    @property
+    def location(self) -> str:  # type: ignore[override]
+        """The file of the points."""
+        return f"{self.folder}/velodyne/{self.number:06d}.bin"
+
+    @property
+    def _label_file(self) -> str:
+        return f"{self.folder}/labels/{self.number:06d}.label"
+
+    def read(self) -> FrameContent:
+        """Read points, classes and instances."""
+        points = _read_array(self.location, np.dtype("<f4"), 4)
+        if not len(points):
+            raise FormatError(f"{self.location}: expected points, found an empty file: copy it again")
+        labels, instances = self.read_labels()
+        if labels is not None and len(labels) != len(points):
+            raise FormatError(
+                f"{self._label_file}: expected a label for each of {len(points)} points, found {len(labels)}: of another scan, or cut short"
+            )
+        return FrameContent(points, labels, instances)
+
+    def read_labels(self) -> tuple[NDArray[np.uint16] | None, NDArray[np.uint32] | None]:
+        """Read classes (the low 16 bits) and instances (the high ones)."""
+        if not self.labelled:
+            return None, None
+        both = _read_array(self._label_file, np.dtype("<u4"), 1)[:, 0]
+        labels = both.astype(np.uint16)  # the low half
+        return labels, self._number_actors(labels, both)
+
+    def _number_actors(self, labels: NDArray[np.uint16], both: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Number actors over all classes: instances are counted anew in each, and a car is the same whether it moves or not."""
+        instances = np.zeros(len(both), np.uint32)
+        numbered = np.flatnonzero(both >> 16)
+        base = _BASE[np.minimum(labels[numbered], len(_BASE) - 1)]
+        instances[numbered] = (base << 16) | (both[numbered] >> 16)
+        return instances
+
+    def read_voxels(self) -> VoxelContent | None:
+        """Read the frame's voxels; SemanticKITTI has them for every fifth scan."""
+        return read_voxel_files(Path(self.folder) / "voxels", self.number)
+
+
+def find_sequences(root: Path) -> list[Path]:
+    """Find the sequences' folders: below `sequences/`, below `dataset/sequences/`, or the folder itself.
+
+    Raises:
+        MissingDataError: there is none.
+    """
+    if not root.is_dir():
+        raise MissingDataError(
+            f"{root}: expected a folder, found {'a file' if root.exists() else 'nothing'}: check the path"
+        )
+    if (root / "velodyne").is_dir():
+        return [root.resolve()]
+    for folder in (root / "sequences", root / "dataset" / "sequences", root):
+        if folder.is_dir() and (found := sorted(path for path in folder.iterdir() if (path / "velodyne").is_dir())):
+            return found
+    raise MissingDataError(
+        f"{root}: expected sequences/00/velodyne/ and so on, or a folder with velodyne/ in it, found none: give the folder that holds sequences/"
+    )
+
+
+def frames_of(folder: Path, suffix: str) -> list[int]:
+    """Return the sorted frame numbers of a folder's files; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    numbers = (layout.frame_of(path.name, suffix) for path in folder.iterdir())
+    return sorted(number for number in numbers if number is not None)
+
+
+def read_calibration(path: Path) -> dict[str, Transform]:
+    """Read calib.txt: "NAME:" and 12 numbers a line; other keys with other numbers are passed over.
+
+    Returns:
+        (4, 4) by name.
+
+    Raises:
+        FormatError: it is no text, or Tr has not 12 numbers.
+    """
+    try:
+        lines = path.read_text().splitlines()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: expected NAME: and 12 numbers a line, found something else: {error}") from error
+    found = {}
+    for line in lines:
+        name, colon, values = line.partition(":")
+        try:
+            numbers = [float(value) for value in values.split()]
+        except ValueError:
+            numbers = []
+        if colon and len(numbers) == 12:
+            found[name.strip()] = np.vstack([np.reshape(numbers, (3, 4)), (0.0, 0.0, 0.0, 1.0)])
+        elif name.strip() == "Tr":
+            raise FormatError(f"{path}: expected 12 numbers after Tr:, found {values.strip()!r}")
+    return found
+
+
+def _split_of(name: str) -> Split:
+    """Return the split of a sequence by its number; folders of other names are for training."""
+    number = int(name) if name.isascii() and name.isdigit() else 0
+    return "Val" if number == _VALIDATION else "Test" if _TEST_FIRST <= number <= 21 else "Train"
+
+
+def _read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
+    try:
+        data = np.fromfile(path, np.uint8)
+    except FileNotFoundError:
+        raise MissingDataError(f"{path}: expected a file, found nothing: copy it again") from None
+    row = dtype.itemsize * columns
+    if len(data) % row:
+        raise FormatError(f"{path}: expected a multiple of {row} bytes, found {len(data)}: cut short?")
+    return data.view(dtype).reshape(-1, columns)
+
+
+_BASE = np.arange(260, dtype=np.uint32)
+_BASE[list(_MOVING_TO_BASE)] = list(_MOVING_TO_BASE.values())
