@@ -150,7 +150,7 @@ def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[An
         ConflictError: they differ.
     """
     there = writer.read(field, frame)
-    if there is not None and not np.array_equal(there, array):
+    if there is not None and not np.array_equal(there, array, equal_nan=array.dtype.kind == "f"):
         raise _other_data(f"{writer.location}/{layout.field_named(field).file(frame)}", frame)
 
 

@@ -155,7 +155,10 @@ def scan_inputs(
     sequences = [s for s in open_source(source).sequences().values() if "points" in s.fields()]
     if not sequences:
         raise MissingDataError(f"{source}: expected sequences with scans (velodyne/), found none")
-    return [ScanInputs(sequence, frames, merging, estimate_poses=estimate_poses, force=force) for sequence in sequences]
+    return [
+        ScanInputs(sequence, frames, merging, estimate_poses=estimate_poses, force=force)
+        for sequence in sequences.values()
+    ]
 
 
 def choose_frames(sequence: Sequence, there: NDArray[np.int64], frames: FrameRange | None) -> list[int]:
