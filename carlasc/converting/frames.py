@@ -154,13 +154,12 @@ def make_fields(content: FrameContent, job: FrameJob, target: Target) -> tuple[d
         fields["instances"] = content.instances
         if job.velocities is not None:
             flow = _flow(content.instances, job.velocities)
-            fields["flow"] = flow * _MIRROR_ROW if target.mirrored else flow
+            fields["flow"] = flow * _MIRROR_VECTOR if target.mirrored else flow
             moving = np.isin(content.labels, sorted(target.source.moving))
             without = int(np.count_nonzero(moving & ~np.isin(content.instances, sorted(job.velocities))))
     points = content.points
     if target.mirrored:
-        points = points.copy()
-        np.negative(points[:, 1], out=points[:, 1])
+        points = points * _MIRROR_POINT
     fields["points"] = points
     return fields, without
 
@@ -202,6 +201,7 @@ def _describe(labels: NDArray[np.unsignedinteger]) -> str:
     return f"found {', '.join(named[:8])}{more}: take them for unlabelled with --allow-unknown"
 
 
-_MIRROR_ROW = np.array([1, -1, 1], np.float32)
+_MIRROR_VECTOR = np.array([1, -1, 1], np.float32)
+_MIRROR_POINT = np.array([1, -1, 1, 1], np.float32)
 _UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
 _LOOKUPS: dict[tuple[tuple[int, int], ...], NDArray[np.uint32]] = {}
