@@ -16,6 +16,8 @@ from carlasc import GridSpec
 from completion.inference import Mode, prepare
 from completion.networks import build_network
 
+_STACKS = 8  # a million voxels of the published grid
+
 
 @dataclass(frozen=True)
 class Latency:
@@ -29,7 +31,7 @@ class Latency:
         fastest_ms: of the repetitions; on a machine that does other work, too, the better figure for ratios.
         memory_mb: peak of the GPU's memory, or of the whole process on a CPU.
         speedup: against the first mode of the same run (eager float32), fastest against fastest.
-        same_labels: share of voxels with the labels of the first mode.
+        differing: voxels in a million whose label is not the first mode's.
     """
 
     network: str
@@ -39,7 +41,7 @@ class Latency:
     fastest_ms: float
     memory_mb: float
     speedup: float
-    same_labels: float
+    differing: float
 
 
 def measure_network(
@@ -54,20 +56,20 @@ def measure_network(
 ) -> list[Latency]:
     """Measure a network in one mode after the other; speed and labels are compared with the first.
 
-    Weights are random: they do not change the time. Occupancy is as dense as a scan's: 1 voxel in 20.
+    Weights are random: they do not change the time. Occupancy is as dense as a scan's: 1 voxel in 20. Labels are compared on `_STACKS` stacks.
     """
     rng = np.random.default_rng(0)
-    occupancy = torch.from_numpy((rng.random((1, history, *spec.size)) < 0.05).astype(np.uint8)).to(device)
+    stacks = torch.from_numpy((rng.random((_STACKS, 1, history, *spec.size)) < 0.05).astype(np.uint8)).to(device)
     results: list[Latency] = []
-    reference = None
+    reference: torch.Tensor | None = None
     for mode in modes:
         torch.manual_seed(0)
         run = prepare(randomise(build_network(name, num_classes, spec, history)), device, mode)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
-        labels = run(occupancy).clone()
+        labels = torch.cat([run(stack).clone() for stack in stacks])
         reference = labels if reference is None else reference
-        times_ms = np.array([_time_ms(run, occupancy, device) for _ in range(repetitions)])
+        times_ms = np.array([_time_ms(run, stacks[0], device) for _ in range(repetitions)])
         baseline = results[0].fastest_ms if results else times_ms.min()
         results.append(
             Latency(
@@ -78,7 +80,7 @@ def measure_network(
                 float(times_ms.min()),
                 _peak_mb(device),
                 float(baseline / times_ms.min()),
-                float((labels == reference).double().mean()),
+                float(1e6 * (labels != reference).double().mean()),
             )
         )
         del run
