@@ -106,11 +106,11 @@ def print_table() -> None:
         rows = {}
         for order in ("random", "in order"):
             loads = {name: (Dataset(path, history=HISTORY).__getitem__, places(order)) for name, path in stores.items()}
-            rows[f"a sample of 16 scans, {order}"] = _milliseconds(loads, 12)
+            rows[f"a sample of 16 scans, {order}"] = _milliseconds(loads, 5)
         for field in ("points", "evaluation/labels", "evaluation/counts"):
             sequences = {name: carlasc.open(path).sequences()[PATH] for name, path in stores.items()}
             loads = {name: (lambda f, s=s, n=field: s.read(n, f).sum(), range(FRAMES)) for name, s in sequences.items()}
-            rows[f"`{field}` of a frame, summed"] = _milliseconds(loads, 12)
+            rows[f"`{field}` of a frame, summed"] = _milliseconds(loads, 5)
         print(f"| | {' | '.join(STORES)} |\n|---|{'---:|' * len(STORES)}")
         for what, times in rows.items():
             cells = [f"{times[name]:.2f} ms ({times[name] / times['files']:.2f}x)" for name in STORES]
