@@ -181,7 +181,7 @@ def regrid(
             name=name,
             keep_votes=keep_votes,
             overwrite=overwrite,
-            merging=_merging(window, window_m, stride, dynamic, min_range, max_range),
+            merging=merging_of(window, window_m, stride, dynamic, min_range, max_range),
             from_grid=from_grid,
             estimate_poses=poses is Poses.kiss_icp,
             force=force,
@@ -201,7 +201,7 @@ def regrid(
     report_failures(failures, result.made + result.skipped + len(failures))
 
 
-def _merging(
+def merging_of(
     window: str | None,
     window_m: float | None,
     stride: int | None,
