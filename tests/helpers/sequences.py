@@ -18,7 +18,9 @@ SIZE, SECOND = (4, 6, 2), (8, 4, 3)
 
 def params(size: tuple[int, int, int], coordinates: str = "cartesian") -> bytes:
     bounds = {"min_bound": [0.0 if coordinates == "cylindrical" else -25.6, -3.0, -2.0], "max_bound": [25.6, 3.0, 1.0]}
-    return json.dumps({"grid_size": [float(n) for n in size], **bounds, "num_channels": 25, "coordinates": coordinates}).encode()
+    return json.dumps(
+        {"grid_size": [float(n) for n in size], **bounds, "num_channels": 25, "coordinates": coordinates}
+    ).encode()
 
 
 def scan(rng: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
