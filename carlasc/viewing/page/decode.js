@@ -1,0 +1,93 @@
+// From the page's text to typed arrays: the inverse of carlasc/viewing/coding.py.
+
+async function inflate(base64) {
+  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));
+  return new Response(stream).arrayBuffer();
+}
+
+const ARRAY_TYPES = { uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array, float32: Float32Array };
+
+/** Returns the arrays of a block by name; each was stored as byte planes. */
+function unpackArrays(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  const arrays = {};
+  let start = 4 + length;
+  for (const [name, type, size] of header) {
+    const ArrayType = ARRAY_TYPES[type];
+    const width = ArrayType.BYTES_PER_ELEMENT;
+    const planes = new Uint8Array(buffer, start, size * width);
+    const bytes = new Uint8Array(size * width);
+    for (let plane = 0; plane < width; plane++) {
+      for (let i = 0; i < size; i++) bytes[i * width + plane] = planes[plane * size + i];
+    }
+    arrays[name] = new ArrayType(bytes.buffer);
+    start += size * width;
+  }
+  return arrays;
+}
+
+/** Sums gaps up to the rising values they came from. */
+function sumUp(gaps) {
+  const values = new Uint32Array(gaps.length);
+  let value = 0;
+  for (let i = 0; i < gaps.length; i++) values[i] = value += gaps[i];
+  return values;
+}
+
+/** Makes a panel's voxels of its arrays: C-order index, label and votes of each occupied cell, all labels, all unknown cells. */
+function decodeGrid(arrays, prefix, panel) {
+  const index = sumUp(arrays[`${prefix}/index`]);
+  const label = arrays[`${prefix}/label`];
+  const [nx, ny, nz] = panel.size;
+  const volume = new Uint16Array(nx * ny * nz);
+  for (let i = 0; i < index.length; i++) volume[index[i]] = label[i];
+  let unknown = null;
+  if (arrays[`${prefix}/unknown`]) {
+    const turns = sumUp(arrays[`${prefix}/unknown`]);
+    unknown = new Uint8Array(volume.length);
+    for (let i = 0; i < turns.length; i += 2) unknown.fill(1, turns[i], i + 1 < turns.length ? turns[i + 1] : volume.length);
+  }
+  return { index, label, votes: arrays[`${prefix}/votes`] ?? null, volume, unknown };
+}
+
+/** Makes points (x, y, z of each, metres) of a scan's cells and offsets. */
+function decodeScan(arrays, scene) {
+  if (!arrays['scan/index']) return null;
+  const index = sumUp(arrays['scan/index']);
+  const [x0, y0, z0, , ny, nz] = arrays['scan/box'];
+  const offset = arrays['scan/offset'];
+  const count = index.length;
+  const points = new Float32Array(3 * count);
+  for (let i = 0; i < count; i++) {
+    const z = index[i] % nz;
+    const y = Math.floor(index[i] / nz) % ny;
+    const x = Math.floor(index[i] / (nz * ny));
+    const cell = [x0 + x, y0 + y, z0 + z];
+    for (let a = 0; a < 3; a++) points[3 * i + a] = (cell[a] + (offset[a * count + i] + 0.5) / scene.offsetSteps) * scene.pointCell;
+  }
+  return { points, label: arrays['scan/label'] ?? new Uint8Array(count), arrows: arrays['scan/arrows'] ?? new Float32Array(0) };
+}
+
+/** Decodes frames on demand and keeps the last few. */
+class FrameStore {
+  constructor(scene) {
+    this.scene = scene;
+    this.kept = new Map();
+  }
+
+  get(position) {
+    if (!this.kept.has(position)) {
+      if (this.kept.size >= 8) this.kept.delete(this.kept.keys().next().value);
+      this.kept.set(position, this.decode(position));
+    }
+    return this.kept.get(position);
+  }
+
+  async decode(position) {
+    const arrays = unpackArrays(await inflate(document.getElementById(`frame${position}`).textContent));
+    const grids = this.scene.panels.map((panel, number) => decodeGrid(arrays, `panel${number}`, panel));
+    return { grids, scan: decodeScan(arrays, this.scene) };
+  }
+}

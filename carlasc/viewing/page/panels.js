@@ -1,0 +1,189 @@
+// Panels side by side on one canvas, seen by one camera: so they are linked.
+
+class Panels {
+  constructor(canvas, scene, visibility) {
+    this.canvas = canvas;
+    this.description = scene;
+    this.side = scene.leftHanded ? 1 : -1;
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, powerPreference: 'high-performance' });
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.renderer.autoClear = false;
+    this.palettes = Object.fromEntries(
+      Object.entries(scene.tables).map(([name, classes]) => [name, colorTexture(classes.map(([, color]) => color), THREE.NearestFilter)]),
+    );
+    const first = scene.panels[0];
+    const heights = first ? [first.lower[2], first.upper[2]] : [-2, 3];
+    this.scan = new ScanLayer(this.side, this.palettes[scene.pointTable], heights, first ? 1.2 * Math.max(first.voxel[0], first.voxel[2]) : 0);
+    this.panels = (scene.panels.length ? scene.panels : [null]).map((panel) => this.makePanel(panel));
+    this.round = first?.coordinates === 'cylindrical';
+    this.radius = this.round ? first.upper[0] : 30;
+    this.target = new THREE.Vector3(0, -1.5, 0);
+    if (first && !this.round) {
+      this.target.set((this.side * (first.lower[1] + first.upper[1])) / 2, -1.5, -(first.lower[0] + first.upper[0]) / 2);
+      this.radius = Math.max(first.upper[0] - first.lower[0], first.upper[1] - first.lower[1]) / 2;
+    }
+    this.camera = new THREE.PerspectiveCamera(42, 1, 0.3, 2000);
+    this.controls = new THREE.OrbitControls(this.camera, canvas);
+    this.controls.maxPolarAngle = Math.PI * 0.495;
+    this.controls.addEventListener('change', () => this.invalidate());
+    this.pickTarget = new THREE.WebGLRenderTarget(1, 1);
+    this.changed = true;
+  }
+
+  makePanel(panel) {
+    const scene = new THREE.Scene();
+    const layer = panel && new VoxelLayer(panel, this.side, this.palettes[panel.table]);
+    const vehicle = egoVehicle();
+    if (layer) scene.add(layer.mesh, outline(panel, this.side));
+    scene.add(vehicle, ...this.scan.objects());
+    return { panel, scene, layer, vehicle, shown: true };
+  }
+
+  get shown() {
+    return this.panels.filter((panel) => panel.shown);
+  }
+
+  setFrame({ grids, scan }) {
+    this.panels.forEach(({ layer }, number) => layer && layer.set(grids[number]));
+    this.scan.set(scan);
+    this.invalidate();
+  }
+
+  setVisible(what, visible) {
+    for (const { layer, vehicle } of this.panels) {
+      if (what === 'grid' && layer) layer.mesh.visible = visible;
+      if (what === 'vehicle') vehicle.visible = visible;
+    }
+    const objects = { points: this.scan.points, flow: this.scan.arrows }[what] ?? [];
+    for (const object of objects) object.visible = visible;
+    this.invalidate();
+  }
+
+  setClass(table, id, visible) {
+    const palette = this.palettes[table];
+    palette.image.data[4 * id + 3] = visible ? 255 : 0;
+    palette.needsUpdate = true;
+    for (const { panel, layer } of this.panels) if (layer?.grid && panel.table === table) layer.shade();
+    this.invalidate();
+  }
+
+  colorBy(mode) {
+    for (const { layer } of this.panels) if (layer) layer.colorAs(mode);
+    this.scan.uniforms.byHeight.value = mode === 'height';
+    this.invalidate();
+  }
+
+  setBackground(color, ink) {
+    this.renderer.setClearColor(new THREE.Color(color), 1);
+    this.scan.arrowMaterial.color.set(ink);
+    this.invalidate();
+  }
+
+  /** Looks from behind and above, or from straight above, so that the grid just fits in a panel. */
+  look(view) {
+    const box = this.boxes()[0];
+    this.camera.aspect = box.width / box.height;
+    this.camera.updateProjectionMatrix();
+    const elevation = view === 'top' ? Math.PI / 2 - 1e-4 : 0.66;
+    const back = new THREE.Vector3(0, Math.sin(elevation), Math.cos(elevation));
+    const target = this.target.clone();
+    let distance = 2 * this.radius;
+    for (let i = 0; i < 30; i++) { // nearer or farther, forth or back, until the corners touch the margins
+      this.camera.position.copy(target).addScaledVector(back, distance);
+      this.camera.lookAt(target);
+      this.camera.updateMatrixWorld();
+      const seen = this.corners().map((corner) => corner.project(this.camera));
+      const [low, high] = [Math.min(...seen.map((p) => p.y)), Math.max(...seen.map((p) => p.y))];
+      const wide = Math.max(...seen.map((p) => Math.abs(p.x)));
+      target.z -= 0.25 * (high + low) * distance * Math.tan((this.camera.fov * Math.PI) / 360);
+      distance *= 0.5 + 0.5 * Math.max(wide / 0.94, (high - low) / 2 / 0.86);
+    }
+    this.controls.target.copy(target);
+    this.controls.update();
+    this.invalidate();
+  }
+
+  /** Corners of what should be in the picture: of the grid's floor and ceiling. */
+  corners() {
+    const { x, z } = this.target;
+    const around = this.round ? Array.from({ length: 24 }, (_, i) => (i * Math.PI) / 12) : [1, 3, 5, 7].map((i) => (i * Math.PI) / 4);
+    const reach = this.round ? this.radius : this.radius * Math.SQRT2;
+    return around.flatMap((angle) => [-2, 1].map((y) => new THREE.Vector3(x + reach * Math.sin(angle), y, z - reach * Math.cos(angle))));
+  }
+
+  resize() {
+    const { clientWidth, clientHeight } = this.canvas.parentElement;
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.invalidate();
+  }
+
+  /** The rectangles of the panels that are shown, CSS pixels from the top left. */
+  boxes() {
+    const { clientWidth, clientHeight } = this.canvas.parentElement;
+    const shown = this.shown;
+    const upright = clientHeight > clientWidth * 1.15; // a telephone: one above the other
+    return shown.map((panel, i) => {
+      const [from, to] = [i / shown.length, (i + 1) / shown.length];
+      return upright
+        ? { panel, x: 0, y: Math.round(from * clientHeight), width: clientWidth, height: Math.round(to * clientHeight) - Math.round(from * clientHeight) }
+        : { panel, x: Math.round(from * clientWidth), y: 0, width: Math.round(to * clientWidth) - Math.round(from * clientWidth), height: clientHeight };
+    });
+  }
+
+  invalidate() {
+    this.changed = true;
+  }
+
+  draw() {
+    if (!this.changed) return;
+    this.changed = false;
+    const total = this.canvas.parentElement.clientHeight;
+    this.renderer.setScissorTest(true);
+    for (const { panel, x, y, width, height } of this.boxes()) {
+      this.renderer.setViewport(x, total - y - height, width, height);
+      this.renderer.setScissor(x, total - y - height, width, height);
+      this.renderer.clear();
+      this.camera.aspect = width / height;
+      this.camera.updateProjectionMatrix();
+      this.scan.uniforms.scale.value = (0.1 * height * this.renderer.getPixelRatio()) / Math.tan((this.camera.fov * Math.PI) / 360);
+      this.renderer.render(panel.scene, this.camera);
+    }
+  }
+
+  /** Finds the voxel at a place on the canvas: draws that one pixel with the voxels' numbers for colours. */
+  pick(x, y) {
+    const box = this.boxes().find((b) => x >= b.x && x < b.x + b.width && y >= b.y && y < b.y + b.height);
+    const layer = box?.panel.layer;
+    if (!layer?.grid || !layer.mesh.visible) return null;
+    this.camera.aspect = box.width / box.height;
+    this.camera.setViewOffset(box.width, box.height, x - box.x, y - box.y, 1, 1);
+    const others = box.panel.scene.children.filter((child) => child !== layer.mesh && child.visible);
+    for (const child of others) child.visible = false;
+    layer.mesh.material = layer.pickMaterial;
+    const background = this.renderer.getClearColor(new THREE.Color());
+    this.renderer.setClearColor(0, 0);
+    this.renderer.setScissorTest(false);
+    this.renderer.setRenderTarget(this.pickTarget);
+    this.renderer.clear();
+    this.renderer.render(box.panel.scene, this.camera);
+    const pixel = new Uint8Array(4);
+    this.renderer.readRenderTargetPixels(this.pickTarget, 0, 0, 1, 1, pixel);
+    this.renderer.setRenderTarget(null);
+    this.renderer.setClearColor(background, 1);
+    layer.mesh.material = layer.material;
+    for (const child of others) child.visible = true;
+    this.camera.clearViewOffset();
+    const instance = pixel[0] + 256 * pixel[1] + 65536 * pixel[2] - 1;
+    return instance < 0 || instance >= layer.drawn.length ? null : { panel: box.panel, instance, index: layer.grid.index[layer.drawn[instance]] };
+  }
+
+  /** Marks a picked cell in every panel that draws it; null marks none. */
+  mark(index) {
+    for (const { layer } of this.panels) {
+      if (!layer?.grid) continue;
+      const at = index === null ? -1 : layer.drawn.findIndex((i) => layer.grid.index[i] === index);
+      layer.material.uniforms.picked.value = at;
+    }
+    this.invalidate();
+  }
+}

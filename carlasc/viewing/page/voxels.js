@@ -1,0 +1,250 @@
+// A grid's voxels as instances of one cell. The vertex shader bends it into a wedge in cylindrical grids.
+//
+// The scene's axes are right-handed: x to the right, y up, z backwards. CarlaSC's are left-handed (x forward, y right, z up), so this is a
+// plain change of names (`side` is +1); in right-handed data (y left) it also mirrors y (`side` is -1).
+
+const RAMP = ['#440154', '#3b528b', '#21918c', '#5ec962', '#fde725']; // viridis: lightness rises throughout
+const WIDEST_ARC = (4 * Math.PI) / 180; // wider cells are drawn as several flat pieces
+
+const GRID_GLSL = /* glsl */ `
+  uniform vec3 lower;    // lower bounds on the grid's axes
+  uniform vec3 voxel;    // size of a cell
+  uniform vec3 dims;     // cells an axis
+  uniform bool cylindrical;
+  uniform float side;
+  vec3 toScene(vec3 axes) {
+    vec3 p = cylindrical ? vec3(axes.x * cos(axes.y), axes.x * sin(axes.y), axes.z) : axes;
+    return vec3(side * p.y, p.z, -p.x);
+  }
+  vec3 toCells(vec3 p) {
+    vec3 axes = vec3(-p.z, side * p.x, p.y);
+    if (cylindrical) axes = vec3(length(axes.xy), atan(axes.y, axes.x), axes.z);
+    if (cylindrical && axes.y < lower.y) axes.y += 6.2831853;
+    return (axes - lower) / voxel;
+  }`;
+
+const VOXEL_VERTEX = /* glsl */ `
+  precision highp sampler2D;
+  attribute vec3 cell;
+  attribute float label;
+  attribute float value;   // 0..1 on the ramp
+  uniform sampler2D palette; // colour and visibility of each class
+  uniform sampler2D ramp;
+  uniform bool byRamp;
+  uniform float picked;
+  varying vec3 vColor;
+  varying vec3 vWithin;
+  varying vec3 vFace;
+  varying vec3 vNormal;
+  varying vec3 vScene;
+  flat varying float vPicked;
+  flat varying int vInstance;
+  ${GRID_GLSL}
+  void main() {
+    vec4 entry = texelFetch(palette, ivec2(int(label + 0.5), 0), 0);
+    vec3 axes = lower + (cell + position) * voxel;
+    vec3 flatNormal = normal;
+    if (cylindrical) {
+      float middle = axes.y;
+      flatNormal = vec3(normal.x * cos(middle) - normal.y * sin(middle), normal.x * sin(middle) + normal.y * cos(middle), normal.z);
+    }
+    vNormal = vec3(side * flatNormal.y, flatNormal.z, -flatNormal.x);
+    vScene = toScene(axes);
+    vColor = byRamp ? texture(ramp, vec2(value, 0.5)).rgb : entry.rgb;
+    vWithin = position;
+    vFace = normal;
+    vInstance = gl_InstanceID;
+    vPicked = abs(picked - float(gl_InstanceID)) < 0.5 ? 1.0 : 0.0;
+    gl_Position = entry.a < 0.5 ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * viewMatrix * vec4(vScene, 1.0);
+  }`;
+
+const VOXEL_FRAGMENT = /* glsl */ `
+  precision highp sampler3D;
+  uniform sampler3D occupancy; // z, y, x
+  uniform vec3 sun;
+  uniform bool closed;         // azimuth goes all the way round
+  varying vec3 vColor;
+  varying vec3 vWithin;
+  varying vec3 vFace;
+  varying vec3 vNormal;
+  varying vec3 vScene;
+  flat varying float vPicked;
+  flat varying int vInstance;
+  ${GRID_GLSL}
+  float solid(vec3 cells) {
+    if (closed) cells.y = mod(cells.y, dims.y);
+    if (any(lessThan(cells, vec3(0.0))) || any(greaterThan(cells, dims))) return 0.0;
+    return texture(occupancy, (cells / dims).zyx).r;
+  }
+  void main() {
+    vec3 normal = normalize(vNormal);
+    float reach = min(min(voxel.x, cylindrical ? voxel.x : voxel.y), voxel.z);
+    vec3 foot = vScene + normal * reach * 0.5;
+    float near = solid(toCells(vScene + normal * reach * 0.55));
+    float far = solid(toCells(vScene + normal * reach * 1.3));
+    float open = 1.0 - 0.42 * near - 0.22 * far;
+
+    float lit = max(dot(normal, sun), 0.0);
+    float shadow = 0.0;
+    if (lit > 0.0) {
+      for (int i = 1; i <= 14; i++) shadow = max(shadow, solid(toCells(foot + sun * (reach * 0.75 * float(i)))));
+    }
+    lit *= 1.0 - smoothstep(0.35, 0.8, shadow);
+    float level = sun.y; // an open, level face in the sun has exactly the legend's colour
+    vec3 color = vColor * open * (0.58 + 0.42 * min(lit / level, 1.25));
+
+    vec3 away = min(vWithin, 1.0 - vWithin) / max(fwidth(vWithin), 1e-5);
+    away += abs(vFace) * 1e6;
+    float edge = min(away.x, min(away.y, away.z));
+    float fine = clamp(0.25 / max(max(fwidth(vWithin).x, fwidth(vWithin).y), fwidth(vWithin).z) - 0.75, 0.0, 1.0);
+    color *= 1.0 - 0.22 * fine * (1.0 - smoothstep(0.3, 1.3, edge));
+    if (vPicked > 0.5) color = mix(color, vec3(1.0, 0.62, 0.1), 0.35 + 0.65 * (1.0 - smoothstep(1.0, 2.5, edge)));
+    gl_FragColor = vec4(color, 1.0);
+  }`;
+
+const PICK_FRAGMENT = /* glsl */ `
+  flat varying int vInstance;
+  void main() {
+    int id = vInstance + 1;
+    gl_FragColor = vec4(float(id & 255), float((id >> 8) & 255), float((id >> 16) & 255), 255.0) / 255.0;
+  }`;
+
+/** A texture of colours ("#rrggbb" or [.., "#rrggbb"]), one texel each, visible all. */
+function colorTexture(colors, filter) {
+  const texels = new Uint8Array(4 * colors.length);
+  colors.forEach((color, i) => texels.set([1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16)).concat(255), 4 * i));
+  const texture = new THREE.DataTexture(texels, colors.length, 1, THREE.RGBAFormat, THREE.UnsignedByteType);
+  texture.minFilter = texture.magFilter = filter;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+/** Draws the voxels of one panel, whose classes may be hidden and picked. */
+class VoxelLayer {
+  constructor(panel, side, palette) {
+    this.panel = panel;
+    const [nx, ny, nz] = panel.size;
+    const cylindrical = panel.coordinates === 'cylindrical';
+    this.closed = cylindrical && panel.upper[1] - panel.lower[1] > 2 * Math.PI - 1e-3;
+    const pieces = cylindrical ? Math.ceil(panel.voxel[1] / WIDEST_ARC) : 1;
+    this.box = new THREE.BoxGeometry(1, 1, 1, 1, pieces, 1).translate(0.5, 0.5, 0.5);
+    this.texels = new Uint8Array(nx * ny * nz);
+    this.occupancy = new THREE.Data3DTexture(this.texels, nz, ny, nx);
+    this.occupancy.format = THREE.RedFormat;
+    this.occupancy.unpackAlignment = 1;
+    this.occupancy.minFilter = this.occupancy.magFilter = THREE.LinearFilter;
+    if (this.closed) this.occupancy.wrapT = THREE.RepeatWrapping;
+    const uniforms = {
+      lower: { value: new THREE.Vector3(...panel.lower) },
+      voxel: { value: new THREE.Vector3(...panel.voxel) },
+      dims: { value: new THREE.Vector3(...panel.size) },
+      cylindrical: { value: cylindrical },
+      closed: { value: this.closed },
+      side: { value: side },
+      palette: { value: palette },
+      ramp: { value: colorTexture(RAMP, THREE.LinearFilter) },
+      byRamp: { value: false },
+      occupancy: { value: this.occupancy },
+      sun: { value: new THREE.Vector3(-0.5, 0.78, 0.38).normalize() },
+      picked: { value: -1 },
+    };
+    // the change of axes mirrors where the data is left-handed: there the box's faces turn inside out
+    const face = side > 0 ? THREE.BackSide : THREE.FrontSide;
+    this.material = new THREE.ShaderMaterial({ uniforms, vertexShader: VOXEL_VERTEX, fragmentShader: VOXEL_FRAGMENT, side: face });
+    this.pickMaterial = new THREE.ShaderMaterial({ uniforms, vertexShader: VOXEL_VERTEX, fragmentShader: PICK_FRAGMENT, side: face });
+    this.mesh = new THREE.Mesh(new THREE.InstancedBufferGeometry(), this.material);
+    this.mesh.frustumCulled = false;
+    this.grid = null;
+    this.drawn = new Uint32Array(0);
+  }
+
+  /** Takes a frame's voxels. */
+  set(grid) {
+    if (this.grid !== grid) {
+      this.grid = grid;
+      this.drawn = this.visible(grid);
+    }
+    this.build();
+  }
+
+  /** The voxels that can be seen: one whose six neighbours are of its own class is hidden whichever classes are shown. */
+  visible({ index, label, volume }) {
+    const [nx, ny, nz] = this.panel.size;
+    const rim = 0xffff; // outside the grid: seen from there
+    const kept = [];
+    for (let i = 0; i < index.length; i++) {
+      const at = index[i];
+      const z = at % nz;
+      const y = Math.floor(at / nz) % ny;
+      const x = Math.floor(at / (nz * ny));
+      const own = label[i];
+      const left = y > 0 ? volume[at - nz] : this.closed ? volume[at + nz * (ny - 1)] : rim;
+      const right = y < ny - 1 ? volume[at + nz] : this.closed ? volume[at - nz * (ny - 1)] : rim;
+      const buried =
+        z > 0 && volume[at - 1] === own && z < nz - 1 && volume[at + 1] === own && left === own && right === own &&
+        x > 0 && volume[at - nz * ny] === own && x < nx - 1 && volume[at + nz * ny] === own;
+      if (!buried) kept.push(i);
+    }
+    return Uint32Array.from(kept);
+  }
+
+  build() {
+    const { index, label } = this.grid;
+    const [, ny, nz] = this.panel.size;
+    const count = this.drawn.length;
+    const cells = new Uint16Array(3 * count);
+    const labels = new Uint16Array(count);
+    for (let k = 0; k < count; k++) {
+      const at = index[this.drawn[k]];
+      cells[3 * k] = Math.floor(at / (nz * ny));
+      cells[3 * k + 1] = Math.floor(at / nz) % ny;
+      cells[3 * k + 2] = at % nz;
+      labels[k] = label[this.drawn[k]];
+    }
+    const geometry = new THREE.InstancedBufferGeometry();
+    geometry.index = this.box.index;
+    geometry.setAttribute('position', this.box.getAttribute('position'));
+    geometry.setAttribute('normal', this.box.getAttribute('normal'));
+    geometry.setAttribute('cell', new THREE.InstancedBufferAttribute(cells, 3));
+    geometry.setAttribute('label', new THREE.InstancedBufferAttribute(labels, 1));
+    geometry.setAttribute('value', new THREE.InstancedBufferAttribute(this.rampValues(cells), 1, true));
+    geometry.instanceCount = count;
+    this.mesh.geometry.dispose();
+    this.mesh.geometry = geometry;
+    this.material.uniforms.picked.value = -1;
+    this.shade();
+  }
+
+  /** Where each drawn voxel stands on the ramp, 0..255: its height, or the logarithm of its votes. */
+  rampValues(cells) {
+    const values = new Uint8Array(this.drawn.length);
+    const { votes } = this.grid;
+    const most = Math.log1p(this.mostVotes());
+    for (let k = 0; k < values.length; k++) {
+      if (this.colorBy === 'height') values[k] = (255 * cells[3 * k + 2]) / Math.max(this.panel.size[2] - 1, 1);
+      else if (this.colorBy === 'votes' && votes) values[k] = (255 * Math.log1p(votes[this.drawn[k]])) / Math.max(most, 1e-6);
+    }
+    return values;
+  }
+
+  mostVotes() {
+    let most = 0;
+    for (const vote of this.grid?.votes ?? []) if (vote > most) most = vote;
+    return most;
+  }
+
+  colorAs(mode) {
+    this.colorBy = mode;
+    this.material.uniforms.byRamp.value = mode === 'height' || (mode === 'votes' && Boolean(this.grid?.votes));
+    if (this.grid) this.build();
+  }
+
+  /** Tells the shader what casts shadows: the voxels of the classes that are shown. */
+  shade() {
+    const shown = this.material.uniforms.palette.value.image.data;
+    const { index, label } = this.grid;
+    this.texels.fill(0);
+    for (let i = 0; i < index.length; i++) if (shown[4 * label[i] + 3]) this.texels[index[i]] = 255;
+    this.occupancy.needsUpdate = true;
+  }
+}

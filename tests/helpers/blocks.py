@@ -1,0 +1,53 @@
+"""A road with two blocks on it, in grids and points: what a viewer should draw, and where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlasc import layout
+from carlasc.files import to_json
+from carlasc.grids import GridSpec
+from carlasc.sources.folder import FolderSink
+from helpers.pixels import BLUE, RED, grid_with
+
+ROAD = 7
+
+
+def write_blocks(
+    folder: Path,
+    frames: int = 3,
+    spec: GridSpec | None = None,
+    metadata: dict[str, Any] | None = None,
+    shift: float = 0.0,
+    points: bool = True,
+) -> Path:
+    """A road with a red block ahead on the side of +y, which goes on by a metre a frame, and a blue one that stands."""
+    spec = spec or GridSpec.published("cartesian")
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    writer.write_document(layout.params_file(layout.EVALUATION), to_json(spec.to_params()))
+    if metadata:
+        writer.write_document(layout.METADATA, to_json(metadata))
+    rng = np.random.default_rng(0)
+    for frame in range(frames):
+        grid = grid_with({(10 + frame + shift, 5, 0): RED, (-8, -6, 0): BLUE}, spec, size_m=2.0)
+        labels, counts = grid.labels.copy(), np.asarray(grid.counts).copy()
+        labels[:, :, 0] = ROAD
+        counts[labels > 0] = 7
+        counts[0] = 0
+        labels[0] = 0
+        writer.write("evaluation/labels", frame, labels)
+        writer.write("evaluation/counts", frame, counts)
+        if points:
+            ground = np.column_stack([rng.uniform(-30, 30, (3000, 2)), np.full(3000, -1.8)])
+            block = np.array([10 + frame, 5, 0]) + rng.uniform(-1, 1, (400, 3))
+            cloud = np.concatenate([ground, block, [[10 + frame, 5, 0]]]).astype(np.float32)
+            moving = np.arange(len(cloud)) >= len(ground)
+            writer.write("points", frame, np.column_stack([cloud, np.zeros(len(cloud), np.float32)]))
+            writer.write("labels", frame, np.where(moving, RED, ROAD).astype(np.uint32))
+            writer.write("flow", frame, (moving[:, None] * np.array([10.0, 0, 0])).astype(np.float32))
+    if points:
+        writer.write_document(layout.TIMES, layout.encode_times(np.arange(frames) * 0.1))
+    return folder

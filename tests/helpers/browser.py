@@ -1,0 +1,89 @@
+"""A headless Chromium that opens pages from files."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+OUTPUT = Path(__file__).parents[2] / "test-output"
+_FLAGS = (
+    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run"
+    " --disable-background-networking --disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars"
+).split()
+
+
+def start_chromium(profile: Path) -> Any:
+    """Start a browser with a fresh profile, or skip the test saying what is missing."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: pip install selenium")
+    binary = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+    driver = shutil.which("chromedriver")
+    if binary is None or driver is None:
+        pytest.skip("chromium or chromedriver is not there: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    for flag in (*_FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    browser.set_script_timeout(60)
+    return browser
+
+
+class Page:
+    """A page that `carlasc view --html` wrote, opened."""
+
+    def __init__(self, browser: Any, path: Path, size: tuple[int, int] = (1280, 800)) -> None:
+        self.browser = browser
+        browser.get_log("browser")  # of the page before
+        browser.set_window_size(*size)
+        browser.get(path.absolute().as_uri())
+        self.run(
+            "while (!document.documentElement.dataset.ready && !window.failed) {"
+            " await new Promise((done) => setTimeout(done, 20));"
+            " window.failed = document.getElementById('message').textContent.startsWith('This page');"
+            "} document.documentElement.dataset.theme = 'light'; window.carlasc?.setTheme('light');"
+        )
+
+    def run(self, script: str, *arguments: object) -> Any:
+        """Run an async function's body in the page, wait until what it changed is drawn, and return what it returned."""
+        return self.browser.execute_async_script(
+            "const [args, done] = [[...arguments].slice(0, -1), arguments[arguments.length - 1]];"
+            f"(async () => {{ {script} }})().then("
+            " (value) => requestAnimationFrame(() => requestAnimationFrame(() => done(value))), (error) => done(`failed: ${error.stack}`));",
+            *arguments,
+        )
+
+    def click(self, selector: str) -> None:
+        """Click what a CSS selector finds, as a user would, and wait until it is drawn."""
+        self.browser.find_element("css selector", selector).click()
+        self.run("")
+
+    def text(self, selector: str) -> str:
+        """Return the text that is seen of an element."""
+        return str(self.browser.find_element("css selector", selector).text)
+
+    def picture(self, name: str | None = None) -> NDArray[np.uint8]:
+        """Return what is seen, (H, W, 3) uint8; kept as test-output/<name>.png."""
+        from PIL import Image
+
+        png = self.browser.get_screenshot_as_png()
+        if name is not None:
+            OUTPUT.mkdir(exist_ok=True)
+            (OUTPUT / f"{name}.png").write_bytes(png)
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+    def canvas(self, name: str | None = None) -> NDArray[np.uint8]:
+        """Return the part of the picture that is drawn by three.js."""
+        box = self.run("const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, r.y, r.right, r.bottom]")
+        x0, y0, x1, y1 = (round(value) for value in box)
+        return self.picture(name)[y0:y1, x0:x1]
+
+    def complaints(self) -> list[str]:
+        """Return what the console was told since the page was opened: warnings and errors."""
+        return [entry["message"] for entry in self.browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
