@@ -5,10 +5,12 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from completion.config import Config
 from completion.inference import check_compiler, prepare
 from completion.latency import measure_network
 from completion.networks import build_network
-from helpers.completion import SPEC
+from completion.throughput import measure_throughput
+from helpers.completion import SPEC, write_split
 
 from carlasc.errors import ArgumentError, DependencyError
 
@@ -55,3 +57,10 @@ def test_a_missing_compiler_is_one_line_that_says_what_to_install(monkeypatch):
         check_compiler(CPU)
     with pytest.raises(ArgumentError, match="mode"):
         prepare(build_network("sscnet", 11, SPEC), CPU, "fast")
+
+
+def test_loader_and_network_are_timed_apart(tmp_path):
+    write_split(tmp_path, "Train", ["Town01_Light"], frames=4)
+    rates = measure_throughput(tmp_path, Config("sscnet", batch_size=2, workers=0), CPU, batches=2)
+    assert rates.loader > 0
+    assert rates.network > 0

@@ -1,0 +1,63 @@
+"""How many training samples a second the loader gives, and how many the network takes: which one waits for the other."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from completion.config import Config
+from completion.data import TrainLoader, open_split, to_device
+from completion.losses import completion_loss
+from completion.networks import build_network
+
+
+@dataclass(frozen=True)
+class Throughput:
+    """Samples a second.
+
+    Attributes:
+        loader: of the loader alone, nothing done with the batches.
+        network: of forward, loss, backward and step on one batch that is there already.
+    """
+
+    loader: float
+    network: float
+
+
+def measure_throughput(root: str | Path, config: Config, device: torch.device, batches: int = 20) -> Throughput:
+    """Measure loader and network apart, with the settings of a run; first batches, which start workers and warm up, are not counted."""
+    data = open_split(root, config.train, config, training=True)
+    loader = TrainLoader(data, config)
+    endless = itertools.chain.from_iterable(loader.epoch(number) for number in itertools.count())
+    warm = max(2, 2 * config.workers)  # what workers have ready when the clock starts
+    batch = next(itertools.islice(endless, warm, None))
+    start = time.perf_counter()
+    loaded = sum(len(loaded["frame"]) for loaded in itertools.islice(endless, batches))
+    loader_rate = loaded / (time.perf_counter() - start)
+
+    num_classes = max(data.classes.names) + 1
+    network = build_network(config.network, num_classes, data.spec, config.history).to(device).train()
+    optimizer = torch.optim.Adam(network.parameters())
+    occupancy, target = to_device(batch, device)
+    weights = torch.ones(num_classes, device=device)
+    for step in range(batches + 2):
+        if step == 2:
+            _wait(device)
+            start = time.perf_counter()
+        with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
+            outputs = network(occupancy)
+        sums, totals = completion_loss(outputs, target, weights)
+        optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward((sums / totals).mean())
+        optimizer.step()
+    _wait(device)
+    return Throughput(loader_rate, batches * len(occupancy) / (time.perf_counter() - start))
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
