@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError, import_extra
 
 MIN_POINTS = 100  # fewer say nothing about the motion
+_GROUND_M, _NEAR_M = 1.5, 8.0  # far points so deep below the sensor are ground
 
 
 def estimate_poses(
@@ -24,8 +25,9 @@ def estimate_poses(
 ) -> NDArray[np.float64]:
     """Estimate the pose of every scan of a drive, in order.
 
-    Scans are taken as instantaneous (no deskewing): so CarlaSC's are, and SemanticKITTI's are deskewed. On a plain straight street
-    nothing tells how far one has driven, and the estimate slips.
+    Scans are taken as instantaneous (no deskewing): so CarlaSC's are, and SemanticKITTI's are deskewed. Far ground is left out: its
+    rings move along with the sensor and hide the first metres of a drive. On a plain straight street nothing tells how far one has
+    driven, and the estimate slips.
 
     Args:
         scans: (N, 3) points each, metres, sensor frame; right-handed or left-handed, the poses are in the same frame.
@@ -54,7 +56,8 @@ def estimate_poses(
             raise ArgumentError(
                 f"odometry: expected at least {MIN_POINTS} points in every scan, found {len(points)} in scan {number}: leave it out"
             )
-        odometry.register_frame(np.ascontiguousarray(points[:, :3], np.float64), np.zeros(0))
+        standing = (points[:, 2] > -_GROUND_M) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
+        odometry.register_frame(np.ascontiguousarray(points[standing, :3], np.float64), np.zeros(0))
         poses.append(np.array(odometry.last_pose))
         if progress:
             progress(number + 1, total or number + 1)

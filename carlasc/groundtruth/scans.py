@@ -152,7 +152,13 @@ def scan_inputs(
         MissingDataError: there is none, or it has no poses.
         FormatError: poses are not rigid, or jump.
     """
-    sequences = [s for s in open_source(source).sequences().values() if "points" in s.fields()]
+    sequences: dict[str, Sequence] = {}
+    for sequence in open_source(source).sequences().values():
+        parent = _parent_of(sequence.path, sequence.coordinates)
+        rival = sequences.get(parent)  # scans may stand beside the grids of both coordinates: the fuller ones are taken
+        if rival is None or len(sequence.frames("points")) > len(rival.frames("points")):
+            sequences[parent] = sequence
+    sequences = {parent: sequence for parent, sequence in sequences.items() if "points" in sequence.fields()}
     if not sequences:
         raise MissingDataError(f"{source}: expected sequences with scans (velodyne/), found none")
     return [
