@@ -125,7 +125,7 @@ def scan_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
         unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
         point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids)
     note = None if len(points) else "the scan has no point"
-    return Scene(extent, _ego_vehicle() if ego else None, points.points, point_colors, legend, note)
+    return Scene(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
 
 
 def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Scene:
@@ -146,7 +146,7 @@ def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
         point_colors[moving] = colors.by_id[points.labels[moving]]
         legend += colors.entries(np.unique(points.labels[moving]).tolist())
     tails, vectors = motion_arrows(points.select(moving))
-    meshes = [_ego_vehicle()] if ego else []
+    meshes = [ego_vehicle()] if ego else []
     if len(tails):
         meshes.append(arrows(tails, vectors, palette.ARROW, 0.24))
         legend.append(Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES))
@@ -198,12 +198,12 @@ def _voxel_scene(
     ego: bool,
 ) -> Scene:
     floor = quads(footprint(spec, spec.lower[2] - 2e-3), _FLOOR, open_sky=True)
-    meshes = [grid_mesh(spec, voxel_colors, occupied), floor, *([_ego_vehicle()] if ego else [])]
+    meshes = [grid_mesh(spec, voxel_colors, occupied), floor, *([ego_vehicle()] if ego else [])]
     return Scene(grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty)
 
 
-def _ego_vehicle() -> QuadMesh:
-    """A plain car under the sensor: this stands 0.5 m behind its middle, 1.8 m above the ground (FORMAT section 1)."""
+def ego_vehicle() -> QuadMesh:
+    """Return a plain car under the sensor: this stands 0.5 m behind its middle, 1.8 m above the ground (FORMAT section 1)."""
     body = box((-1.75, -0.95, -1.62), (2.75, 0.95, -0.98), palette.EGO)
     windows = box((-1.55, -0.88, -0.98), (1.55, 0.88, -0.5), palette.GLASS, taper=0.28)
     roof = box((-1.27, -0.6, -0.5), (1.27, 0.6, -0.42), palette.EGO)
