@@ -1,0 +1,210 @@
+"""What the documentation takes from the code as it is built: options, the layout, classes, and the pages of the navigation.
+
+A page says `<!-- generated: layout -->` where a table goes. Every page of a command ends with the command's options.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import logging
+import re
+from collections.abc import Callable, Iterator
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from typer.models import ArgumentInfo, ParameterInfo
+
+from carlasc import cli, layout
+from carlasc.grids import GridSpec
+from carlasc.labels import CARLA, REMAPS, ClassTable
+
+LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
+_MARKER = re.compile(r"<!-- generated: ([a-z-]+) -->")
+
+
+def on_config(config: Any) -> Any:
+    """Put the pages that a `folder/*` in the navigation stands for in its place."""
+    config.nav = _expand(config.nav, Path(config.docs_dir), set(_pages(config.nav)))
+    return config
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Leave scripts out of the site."""
+    for file in [file for file in files if file.src_uri.endswith(".py")]:
+        files.remove(file)
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Fill in generated tables."""
+    folder, _, name = page.file.src_uri.removesuffix(".md").rpartition("/")
+    text = _MARKER.sub(lambda match: _generate(match[1], page.file.src_uri), markdown)
+    return f"{text}\n\n{options_of(name)}" if folder == "commands" and name in command_names() else text
+
+
+def command_names() -> list[str]:
+    """Return the names of the commands that there are, in the order of `carlasc --help`."""
+    return [name for name in cli._COMMANDS if importlib.util.find_spec(f"carlasc.cli.{name}")]
+
+
+def options_of(command: str) -> str:
+    """Return the section of a command's page that lists its arguments and options, by the panels of its `--help`."""
+    function = getattr(importlib.import_module(f"carlasc.cli.{command}"), command)
+    panels: dict[str, list[str]] = {}
+    for row, panel in _parameters(function):
+        panels.setdefault(panel, []).append(row)
+    parts = ["## Options", "", f"As `carlasc {command} --help` lists them.", ""]
+    for panel, rows in panels.items():
+        parts += [f"**{panel}**", ""] if panel else []
+        parts += ["| option | default | |", "|---|---|---|", *rows, ""]
+    return "\n".join(parts)
+
+
+def _parameters(function: Callable[..., None]) -> Iterator[tuple[str, str]]:
+    """Yield a row of the table and its panel for each parameter of a command."""
+    hints = get_type_hints(function, include_extras=True)
+    for name, parameter in inspect.signature(function).parameters.items():
+        annotation, *marks = get_args(hints[name])
+        (info,) = (mark for mark in marks if isinstance(mark, ParameterInfo))
+        option = f"`{'`, `'.join(_names(name, annotation, info))}`"
+        if values := _values(annotation):
+            option += f" {values}"
+        row = f"| {option} | {_default(parameter.default, info)} | {_escape(info.help or '')} |"
+        yield row, info.rich_help_panel or ""
+
+
+def _names(name: str, annotation: Any, info: ParameterInfo) -> list[str]:
+    if isinstance(info, ArgumentInfo):
+        return [info.metavar or name.upper()]
+    given = (info.default, *(info.param_decls or ()))  # typer keeps the first name where a default would stand
+    declared = [part for part in given if isinstance(part, str) and part.startswith("-")]
+    if annotation is bool and len(declared) == 1:
+        return declared[0].split("/")
+    dashed = name.replace("_", "-")
+    return declared or ([f"--{dashed}", f"--no-{dashed}"] if annotation is bool else [f"--{dashed}"])
+
+
+def _values(annotation: Any) -> str:
+    """Return the values that an option may take, or what kind of value; nothing for a switch."""
+    kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+    if get_origin(annotation) is Literal:
+        return _escape(" \\| ".join(f"`{value}`" for value in kinds))
+    if get_origin(annotation) is list:
+        return _values(kinds[0])
+    if kinds:
+        return _values(kinds[0]) if len(kinds) == 1 else ""
+    if inspect.isclass(annotation) and issubclass(annotation, Enum):
+        return " \\| ".join(f"`{value.value}`" for value in annotation)
+    return {int: "integer", float: "number", Path: "path", str: "text"}.get(annotation, "")
+
+
+def _default(default: Any, info: ParameterInfo) -> str:
+    if default is inspect.Parameter.empty:
+        return "required"
+    if isinstance(info.show_default, str):
+        return info.show_default
+    if default is None or default is False:
+        return ""
+    return f"`{default.value if isinstance(default, Enum) else default}`"
+
+
+def _layout() -> str:
+    rows = ["| file | field | type | shape | unit | | |", "|---|---|---|---|---|---|---|"]
+    grid = [layout.field_named(f"{layout.EVALUATION}/{part}") for part in layout.GRID_FIELDS]
+    for field in (*layout.SCAN_FIELDS.values(), *grid):
+        shape = "(X, Y, Z)" if field.name.endswith(("/labels", "/counts")) else "(N,)"
+        shape = shape if field.columns is None else f"(N, {field.columns})"
+        kind = {"<f4": "float32", "<u4": "uint32", "u1": "bytes", "": "npz"}[field.dtype]
+        cells = [f"`{field.file(0)}`", f"`{field.name}`", kind, "" if kind in ("bytes", "npz") else shape]
+        cells += [field.unit, _escape(field.meaning), "" if field.published else "ours"]
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def _grids() -> str:
+    rows = ["| grid | `--preset` | cells | lower bounds | upper bounds | cell |", "|---|---|---|---|---|---|"]
+    for preset, name in (("coarse", "cartesian"), ("fine", "cartesian_fine"), ("cylindrical", "cylindrical")):
+        spec = GridSpec.published(name)
+        bounds = [", ".join(f"{value:.7g}" for value in side) for side in (spec.lower, spec.upper)]
+        cell = " x ".join(f"{edge:.4g}" for edge in spec.voxel_size)
+        rows.append(f"| {spec} | `{preset}` | {spec.num_voxels:,} | {bounds[0]} | {bounds[1]} | {cell} |")
+    return "\n".join(rows)
+
+
+def _classes() -> str:
+    remap = REMAPS["carlasc11"]
+    rows = ["| id | class | | of the eleven | |", "|---|---|---|---|---|"]
+    for index, name in CARLA.names.items():
+        target = remap.mapping[index]
+        cells = (
+            index,
+            name,
+            _swatch(CARLA, index),
+            f"{target} {remap.target.names[target]}",
+            _swatch(remap.target, target),
+        )
+        rows.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(rows)
+
+
+def _remaps() -> str:
+    rows = ["| name | from | to |", "|---|---|---|"]
+    rows += [f"| `{name}` | `{remap.source.name}` | `{remap.target.name}` |" for name, remap in REMAPS.items()]
+    return "\n".join(rows)
+
+
+def _swatch(table: ClassTable, index: int) -> str:
+    color = "#{:02x}{:02x}{:02x}".format(*table.colors[index])
+    return f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span>'
+
+
+_TABLES: dict[str, Callable[[], str]] = {
+    "layout": _layout,
+    "grids": _grids,
+    "classes": _classes,
+    "remaps": _remaps,
+}
+
+
+def _generate(name: str, page: str) -> str:
+    if name in _TABLES:
+        return _TABLES[name]()
+    LOG.warning("%s: expected one of %s to generate, found %s", page, ", ".join(_TABLES), name)
+    return ""
+
+
+def _escape(text: str) -> str:
+    """Keep a text in its cell."""
+    return re.sub(r"(?<!\\)\|", r"\\|", text).replace("<", "&lt;")
+
+
+def _pages(nav: Any) -> Iterator[str]:
+    for item in nav if isinstance(nav, list) else [nav]:
+        if isinstance(item, dict):
+            for value in item.values():
+                yield from _pages(value)
+        elif isinstance(item, str):
+            yield item
+
+
+def _expand(nav: list[Any], docs: Path, named: set[str]) -> list[Any]:
+    """Replace each `folder/*` by the folder's pages that have no place of their own; commands in the order of `--help`."""
+    expanded: list[Any] = []
+    order = {f"{name}.md": place for place, name in enumerate(cli._COMMANDS)}
+    for item in nav:
+        if isinstance(item, dict):
+            expanded.append(
+                {
+                    title: _expand(value, docs, named) if isinstance(value, list) else value
+                    for title, value in item.items()
+                }
+            )
+        elif item.endswith("*"):
+            pages = sorted(docs.glob(f"{item}.md"), key=lambda path: (order.get(path.name, len(order)), path.name))
+            expanded += [uri for page in pages if (uri := page.relative_to(docs).as_posix()) not in named]
+        else:
+            expanded.append(item)
+    return expanded
