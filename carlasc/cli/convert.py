@@ -104,9 +104,7 @@ def convert(
     coordinates: Annotated[
         Coordinates | None, typer.Option(help="Axes of the grid; cartesian if not given.", rich_help_panel=_GRIDS)
     ] = None,
-    bounds: Annotated[
-        str | None, typer.Option(help="x0,x1,y0,y1,z0,z1 as in regrid.", rich_help_panel=_GRIDS)
-    ] = None,
+    bounds: Annotated[str | None, typer.Option(help="x0,x1,y0,y1,z0,z1 as in regrid.", rich_help_panel=_GRIDS)] = None,
     vote: Annotated[Vote | None, typer.Option(help="How votes are counted.", rich_help_panel=_GRIDS)] = None,
     window: Annotated[
         str | None, typer.Option(help="Scans A:B around each frame; -30:30 if not given.", rich_help_panel=_GRIDS)
@@ -136,7 +134,11 @@ def convert(
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, vote, merging))
     if asked and grids is not Grids.scans:
         raise ArgumentError(f"grid options are for --grids scans: expected none of them, found some with {grids.value}")
-    whole = None if res or size else preset or (Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse)
+    whole = (
+        None
+        if res or size
+        else preset or (Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse)
+    )
     spec = parse_grid(res, size, whole, coordinates, bounds) if grids is Grids.scans else None
     with progress_bar(f"convert {name}") as progress:
         result = convert_recordings(
@@ -167,4 +169,6 @@ def convert(
             typer.echo(place)
         there = f" ({result.skipped} were there)" if result.skipped else ""
         typer.echo(f"{result.made} frames converted{there} in {result.elapsed_s:.1f} s")
-    report_failures([(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures))
+    report_failures(
+        [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
+    )

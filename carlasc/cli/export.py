@@ -18,7 +18,8 @@ def export(
         str | None, typer.Option(help="Names of sequences, with commas between; all if not given.")
     ] = None,
     grid: Annotated[
-        str | None, typer.Option(help="Which grid goes to voxels/; the original files, or the finest grid, if not given.")
+        str | None,
+        typer.Option(help="Which grid goes to voxels/; the original files, or the finest grid, if not given."),
     ] = None,
     predictions: Annotated[
         bool, typer.Option("--predictions", help="SRC holds a network's output: write predictions/ for the evaluator.")
@@ -52,4 +53,6 @@ def export(
             typer.echo(f"{path or '.'} -> {result.out / folder}")
         there = f" ({result.skipped} were there)" if result.skipped else ""
         typer.echo(f"{result.made} frames written{there} in {result.elapsed_s:.1f} s")
-    report_failures([(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures))
+    report_failures(
+        [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
+    )

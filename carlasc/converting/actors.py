@@ -156,4 +156,3 @@ def _runs(frames: list[int]) -> list[list[int]]:
         pieces = -(-len(part) // _LONGEST)
         parts += [piece.tolist() for piece in np.array_split(part, pieces)]
     return parts
-

@@ -146,7 +146,8 @@ def make_fields(content: FrameContent, job: FrameJob, target: Target) -> tuple[d
 
     Points are never dropped or put in another order.
     """
-    where, fields = job.handle.location, {}
+    where = job.handle.location
+    fields: dict[str, NDArray[Any]] = {}
     without = 0
     if content.labels is not None:
         fields["labels"] = target.labels(content.labels, f"labels of {where}")
@@ -155,7 +156,7 @@ def make_fields(content: FrameContent, job: FrameJob, target: Target) -> tuple[d
         if job.velocities is not None:
             flow = _flow(content.instances, job.velocities)
             fields["flow"] = flow * _MIRROR_VECTOR if target.mirrored else flow
-            moving = np.isin(content.labels, sorted(target.source.moving))
+            moving = np.isin(np.asarray(content.labels), sorted(target.source.moving))
             without = int(np.count_nonzero(moving & ~np.isin(content.instances, sorted(job.velocities))))
     points = content.points
     if target.mirrored:

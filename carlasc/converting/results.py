@@ -57,6 +57,7 @@ class Steps:
         self._total += more
 
     def __call__(self, steps: int = 1) -> None:
+        """Say that so many steps are done."""
         self._done += steps
         if self._progress:
             self._progress(self._done, self._total)

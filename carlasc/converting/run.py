@@ -187,7 +187,9 @@ def _check(name: str, converter: type[Converter], **given: str) -> None:
 def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
     if not isinstance(sink, FolderSink):
         if grids != "none":
-            raise ArgumentError(f"grids: expected none with {sink.location}, found {grids}: convert to a folder, then pack it")
+            raise ArgumentError(
+                f"grids: expected none with {sink.location}, found {grids}: convert to a folder, then pack it"
+            )
         return
     place, origin = sink.root.resolve(), source.resolve()
     if place == origin or place.is_relative_to(origin):
@@ -252,9 +254,7 @@ def _voxel_params(target: Target, converter: type[Converter]) -> dict[str, objec
     return spec.to_params(target.classes.num_channels) | {RECORD: record}
 
 
-def _write_documents(
-    plan: _Plan, target: Target, converter: type[Converter], metadata: Metadata, steps: Steps
-) -> None:
+def _write_documents(plan: _Plan, target: Target, converter: type[Converter], metadata: Metadata, steps: Steps) -> None:
     """Write poses, times, carlasc.json and the voxel grid's params.json; estimate poses where there are none.
 
     Estimated poses that are there already are taken as they are: a second estimate might differ in its last digits.
@@ -324,7 +324,9 @@ def _notes(plan: _Plan, without_flow: int, flow: Flow) -> list[str]:
     if not plan.recording.has_labels:
         notes.append(f"{where}: scans have no labels: neither labels, instances nor flow were written")
     if without_flow:
-        notes.append(f"{where}: {without_flow} moving points belong to no numbered actor: their flow is unknown and was left 0")
+        notes.append(
+            f"{where}: {without_flow} moving points belong to no numbered actor: their flow is unknown and was left 0"
+        )
     gaps = plan.recording.frames[-1].number + 1 - len(plan.recording.frames)
     if gaps:
         notes.append(f"{where}: {gaps} of {gaps + len(plan.recording.frames)} frames have no scan")

@@ -43,9 +43,7 @@ def read_poses(recording: Recording, wanted: PoseSource, *, force: bool) -> NDAr
     return relative
 
 
-def estimate_poses(
-    recording: Recording, converter: type[Converter], step: Callable[[], object]
-) -> NDArray[np.float64]:
+def estimate_poses(recording: Recording, converter: type[Converter], step: Callable[[], object]) -> NDArray[np.float64]:
     """Let KISS-ICP find the pose of each scan; lines of frames without a scan stay where the last one was.
 
     Scans that cannot be read are passed over: whoever converts them reports them.
@@ -64,10 +62,12 @@ def estimate_poses(
             found.append(handle.number)
             yield points[np.isfinite(points).all(axis=1), :3]
 
-    limits = {"min_range_m": converter.min_range_m or 0.0, "max_range_m": converter.max_range_m or 100.0}
-    poses = odometry.estimate_poses(scans(), **limits)
+    nearest, farthest = converter.min_range_m or 0.0, converter.max_range_m or 100.0
+    poses = odometry.estimate_poses(scans(), min_range_m=nearest, max_range_m=farthest)
     if not len(poses):
-        raise MissingDataError(f"{recording.location}: expected scans to estimate poses from, found none that can be read")
+        raise MissingDataError(
+            f"{recording.location}: expected scans to estimate poses from, found none that can be read"
+        )
     lines = np.searchsorted(found, np.arange(recording.frames[-1].number + 1), side="right") - 1
     return poses[np.clip(lines, 0, None)]
 
@@ -141,7 +141,7 @@ def first_line_times(recording: Recording) -> NDArray[np.float64]:
     frames = recording.frames[-1].number + 1
     times = recording.times()
     if times is None:
-        return np.arange(frames) * layout.FRAME_PERIOD_S
+        return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
     if len(times) < frames:
         raise FormatError(
             f"{recording.location}: expected a time for each frame up to {frames - 1}, found {len(times)} lines in times.txt: copy it again"

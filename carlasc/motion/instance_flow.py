@@ -39,7 +39,7 @@ def estimate_velocities(
     enough = np.flatnonzero(counts >= min(MIN_POINTS, counts.max(initial=0)))
     if len(enough) < 2:
         return np.zeros((len(sightings), 3))
-    chosen = [sightings[index] for index in enough]
+    chosen = [sightings[index] for index in enough.tolist()]
     if rigid:
         velocities = register(chosen, origins[enough], seconds[enough])[1]
     else:

@@ -148,15 +148,9 @@ class KittiFrame(FrameHandle):
             return None, None
         both = _read_array(self._label_file, np.dtype("<u4"), 1)[:, 0]
         labels = both.astype(np.uint16)  # the low half
-        return labels, self._number_actors(labels, both)
-
-    def _number_actors(self, labels: NDArray[np.uint16], both: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Number actors over all classes: instances are counted anew in each, and a car is the same whether it moves or not."""
-        instances = np.zeros(len(both), np.uint32)
-        numbered = np.flatnonzero(both >> 16)
-        base = _BASE[np.minimum(labels[numbered], len(_BASE) - 1)]
-        instances[numbered] = (base << 16) | (both[numbered] >> 16)
-        return instances
+        actors = both >> 16
+        # Instances are counted anew in each class, and a car is the same whether it moves or not.
+        return labels, np.where(actors > 0, _CLASS_PART[labels] | actors, np.uint32(0))
 
     def read_voxels(self) -> VoxelContent | None:
         """Read the frame's voxels; SemanticKITTI has them for every fifth scan."""
@@ -235,5 +229,5 @@ def _read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
     return data.view(dtype).reshape(-1, columns)
 
 
-_BASE = np.arange(260, dtype=np.uint32)
-_BASE[list(_MOVING_TO_BASE)] = list(_MOVING_TO_BASE.values())
+_CLASS_PART = np.arange(1 << 16, dtype=np.uint32) << 16
+_CLASS_PART[list(_MOVING_TO_BASE)] = _CLASS_PART[list(_MOVING_TO_BASE.values())]

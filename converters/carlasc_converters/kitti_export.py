@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ _PREDICTED = {  # classes that networks are trained on -> raw ids
     "semantickitti19": (0, 10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81),
 }
 _CALIBRATION = "".join(
-    f"{name}: {' '.join(f'{value:.12e}' for value in np.eye(4)[:3].ravel())}\n" for name in ("P0", "P1", "P2", "P3", "Tr")
+    f"{name}: {' '.join(f'{value:.12e}' for value in np.eye(4)[:3].ravel())}\n"
+    for name in ("P0", "P1", "P2", "P3", "Tr")
 )
 
 
@@ -191,5 +193,5 @@ def _mirror_row(sequence: sources.Sequence) -> NDArray[np.float32]:
     return np.array([1, 1 if sequence.metadata.frame == "kitti" else -1, 1, 1], np.float32)
 
 
-def _flipped(sequence: sources.Sequence, grid: NDArray[np.generic]) -> NDArray[np.generic]:
+def _flipped(sequence: sources.Sequence, grid: NDArray[Any]) -> NDArray[Any]:
     return grid if sequence.metadata.frame == "kitti" else grid[:, ::-1]

@@ -60,4 +60,3 @@ def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
     if invalid is not None:
         known = ~unpack_bits(invalid, GRID.size, str(folder / f"{frame:06d}.invalid"))
     return VoxelContent(labels, known, files)
-

@@ -21,9 +21,11 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SMALL_LIDAR = Lidar(channels=32, points=16_000)
 MOVING_CLASS = {10: 252, 30: 254}
 
-CAMERA_T_LIDAR = translation((0.06, -0.08, -0.27)) @ np.array(
-    [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
-) @ rotation_z(0.01)  # made up, but like the real one: x right, y down, z forward
+CAMERA_T_LIDAR = (
+    translation((0.06, -0.08, -0.27))
+    @ np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    @ rotation_z(0.01)
+)  # made up, but like the real one: x right, y down, z forward
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ def write_kitti(
         np.column_stack([points, remission]).tofile(folder / "velodyne" / f"{number:06d}.bin")
         actors = recording.scan.instances
         moves = np.isin(actors, sorted(moving))
-        flow[number] = np.where(moves[:, None], recording.flow(), 0).astype(np.float32) * np.array([1, -1, 1], np.float32)
+        flow[number] = np.where(moves[:, None], recording.flow(), 0).astype(np.float32) * np.array(
+            [1, -1, 1], np.float32
+        )
         if labels:
             classes = kitti_classes(recording.scan.labels, moves)
             (folder / "labels").mkdir(exist_ok=True)
@@ -123,7 +127,11 @@ def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes:
     labels = np.zeros((256, 256, 32), "<u2")
     labels[tuple(cells[inside].T)] = classes[inside]
     rng = np.random.default_rng(frame)
-    masks = {"bin": labels > 0, "invalid": (labels == 0) & (rng.random(labels.shape) < 0.3), "occluded": rng.random(labels.shape) < 0.5}
+    masks = {
+        "bin": labels > 0,
+        "invalid": (labels == 0) & (rng.random(labels.shape) < 0.3),
+        "occluded": rng.random(labels.shape) < 0.5,
+    }
     labels.tofile(folder / "voxels" / f"{frame:06d}.label")
     for name, mask in masks.items():
         np.packbits(mask).tofile(folder / "voxels" / f"{frame:06d}.{name}")
@@ -132,8 +140,5 @@ def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes:
 def _movers(drive: Drive, frames: range) -> set[int]:
     """Actors that move at some time of the drive: SemanticKITTI calls these moving all the time."""
     return {
-        actor.id
-        for frame in frames
-        for actor in drive.actors(frame)
-        if float(np.square(actor.velocity).sum()) > 0.1**2
+        actor.id for frame in frames for actor in drive.actors(frame) if float(np.square(actor.velocity).sum()) > 0.1**2
     }
