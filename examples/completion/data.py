@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler, Subset
 
-from carlasc import Dataset
+from carlasc import Dataset, Flip
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.labels import REMAPS, TRAIN_VOXEL_COUNTS
+from carlasc.labels import REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
 from carlasc.labels import class_weights as weights_of
-from carlasc.transforms import Flip
+from carlasc.metrics import semantickitti
 from completion.config import Config
 from completion.losses import IGNORE
 
@@ -34,6 +35,18 @@ class ShuffleHistory:
         stack = sample["occupancy"]
         order = np.random.default_rng([self.seed, sample["frame"]]).permutation(len(stack) - 1)
         return sample | {"occupancy": stack[[*order, len(stack) - 1]]}
+
+
+class SemanticKittiRule:
+    """Takes raw SemanticKITTI ids to the benchmark's classes, and voxels of classes that it ignores out of what is known."""
+
+    def __call__(self, sample: Sample) -> Sample:
+        """Return the sample in the benchmark's classes."""
+        raw = sample["labels"]
+        return sample | {
+            "labels": REMAPS["semantickitti19"](raw),
+            "known": sample["known"] & semantickitti(raw),
+        }
 
 
 class Compose:
@@ -62,8 +75,10 @@ def open_split(root: str | Path, split: str | list[str], config: Config, *, trai
         MissingDataError: there is no such split, or no frame in it.
         ArgumentError: the history is longer than every sequence.
     """
+    kitti = config.remap == "semantickitti19"
+    remap = None if kitti else config.remap
     try:
-        data = Dataset(root, split, history=config.history, grid=config.grid, remap=config.remap, align=config.align)
+        data = Dataset(root, split, history=config.history, grid=config.grid, remap=remap, align=config.align)
     except MissingDataError as error:
         raise MissingDataError(f"split {split!r}: {error}") from error
     frames = {sequence.location: len(sequence.scan_frames()) for sequence in data.sequences}
@@ -73,6 +88,13 @@ def open_split(root: str | Path, split: str | list[str], config: Config, *, trai
             f"history: expected at most the {frames[longest]} frames of {longest} (the longest sequence), found {config.history}"
         )
     transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history else []
+    if kitti:
+        if data.classes is not SEMANTICKITTI:
+            raise ArgumentError(
+                f"remap semantickitti19: expected SemanticKITTI's ids, found {data.classes.name}: take carlasc11"
+            )
+        data.classes = SEMANTICKITTI19
+        transforms.append(SemanticKittiRule())
     if training and config.flips:
         transforms.append(Flip(data.spec, tuple(config.flips), seed=config.seed))
     data.transform = Compose(*transforms)
@@ -161,7 +183,7 @@ def class_weights(root: str | Path, data: Dataset, config: Config) -> NDArray[np
 
 def _count_voxels(root: str | Path, config: Config, num_classes: int) -> NDArray[np.int64]:
     """Count the known voxels of each class over the training split."""
-    data = Dataset(root, config.train, grid=config.grid, remap=config.remap, fields=("labels", "known"))
+    data = open_split(root, config.train, replace(config, history=1, shuffle_history=False))
     counts = np.zeros(num_classes, np.int64)
     for index in range(len(data)):
         sample = data[index]

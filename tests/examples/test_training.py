@@ -124,6 +124,23 @@ def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(
     np.testing.assert_allclose(found, np.arange(11) / 10)
 
 
+def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_path):
+    from completion.data import open_split
+
+    raw = (10, 40, 52, 99)  # car, road, and two that the benchmark ignores
+    for split in ("Train", "Val"):
+        write_split(tmp_path, split, [f"KITTI_{split}"], frames=2, classes=raw, table="semantickitti")
+    config = replace(QUICK, remap="semantickitti19", epochs=1)
+    sample = open_split(tmp_path, "train", config)[0]
+    assert set(np.unique(sample["labels"])) == {0, 1, 9}
+    assert not sample["known"][8:][sample["occupancy"][-1][8:] > 0].any()
+    assert np.isfinite(train(tmp_path, config, tmp_path / "run", ALONE).losses[0])
+    assert read_weights(tmp_path / "run" / BEST)["seg_head_1_1.conv_classes.bias"].shape == (20,)
+    write_split(tmp_path / "carla", "Train", ["Town01_Light"], frames=2)
+    with pytest.raises(ArgumentError, match="expected SemanticKITTI's ids, found carla"):
+        open_split(tmp_path / "carla", "train", config)
+
+
 def test_settings_files_of_every_network_are_read(examples):
     files = sorted(examples.glob("*/*.yaml"))
     assert len(files) == 6

@@ -14,13 +14,16 @@ SPEC = GridSpec("cartesian", (16, 16, 8), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 CLASSES = (1, 7, 8, 10)  # CARLA: building, road, sidewalk, vehicle
 
 
-def write_split(root: Path, split: str, sequences: list[str], frames: int, seed: int = 0) -> None:
+def write_split(
+    root: Path, split: str, sequences: list[str], frames: int, seed: int = 0, classes=CLASSES, table="carla"
+) -> None:
     """Write sequences whose voxels take their class from the quarter they lie in, where there is a point, else free."""
     rng = np.random.default_rng(seed)
-    quarter = np.array(CLASSES)[2 * (np.arange(16) >= 8)[:, None] + (np.arange(16) >= 8)[None, :]]
+    quarter = np.array(classes)[2 * (np.arange(16) >= 8)[:, None] + (np.arange(16) >= 8)[None, :]]
     for name in sequences:
         writer = FolderSink(root).sequence(f"{split}/{name}/cartesian")
         writer.write_document(layout.params_file("evaluation"), json.dumps(SPEC.to_params()).encode())
+        writer.write_document(layout.METADATA, json.dumps({"classes": table}).encode())
         writer.write_document(layout.POSES, layout.encode_poses(np.tile(np.eye(4), (frames, 1, 1))))
         for frame in range(frames):
             points = rng.uniform(SPEC.lower, SPEC.upper, (400, 3)).astype(np.float32)
