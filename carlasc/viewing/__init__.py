@@ -2,5 +2,6 @@
 
 from carlasc.viewing.clip import Clip, FrameContent, PanelSpec, open_clip
 from carlasc.viewing.page import PageResult, make_page
+from carlasc.viewing.window import Window, show
 
-__all__ = ["Clip", "FrameContent", "PageResult", "PanelSpec", "make_page", "open_clip"]
+__all__ = ["Clip", "FrameContent", "PageResult", "PanelSpec", "Window", "make_page", "open_clip", "show"]

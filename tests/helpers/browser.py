@@ -38,7 +38,7 @@ def start_chromium(profile: Path) -> Any:
 class Page:
     """A page that `carlasc view --html` wrote, opened."""
 
-    def __init__(self, browser: Any, path: Path, size: tuple[int, int] = (1280, 800)) -> None:
+    def __init__(self, browser: Any, path: Path, size: tuple[int, int] = (1000, 640)) -> None:
         self.browser = browser
         browser.get_log("browser")  # of the page before
         browser.set_window_size(*size)

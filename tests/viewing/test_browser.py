@@ -123,7 +123,7 @@ def test_picking_a_voxel_tells_its_class_votes_and_place(page):
     x, y, z = page.run("return carlasc.picked.center")
     assert abs(x - 10) < 1.3 and abs(y - 5) < 1.3 and abs(z) < 1.3
     cell = page.run("return carlasc.picked.cell")
-    assert np.allclose(GridSpec.published().centers()[tuple(cell)], (x, y, z), atol=1e-4)
+    assert np.allclose(GridSpec.published().with_size((64, 64, 4)).centers()[tuple(cell)], (x, y, z), atol=1e-4)
     assert page.run("return carlasc.pick(3, 3)") is None
     assert page.text("#card") == ""
 
@@ -141,7 +141,7 @@ def test_prediction_truth_and_errors_stand_side_by_side_and_turn_together(browse
     prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
     result = make_page(prediction, tmp_path / "scene.html", truth=blocks)
     assert result.panels == ("prediction", "truth", "errors")
-    page = Page(browser, result.out, (1500, 800))
+    page = Page(browser, result.out, (1200, 640))
     canvas = page.canvas("page_compared")
     third = canvas.shape[1] // 3
     predicted, true = (red_pixels(canvas[:, i * third : (i + 1) * third]) for i in (0, 1))
@@ -164,13 +164,13 @@ def test_prediction_truth_and_errors_stand_side_by_side_and_turn_together(browse
 
 
 def test_wedges_of_a_cylindrical_grid_lie_where_they_should(browser, tmp_path):
-    spec = GridSpec.published("cylindrical")
+    spec = GridSpec.published("cylindrical").with_size((64, 64, 4))
     folder = write_blocks(tmp_path / "Town01_Light" / "cylindrical", frames=1, spec=spec)
     page = Page(browser, make_page(folder, tmp_path / "scene.html").out)
     page.click("#view-top")
     canvas = page.canvas("page_cylindrical")
     column, row = middle_of(red_pixels(canvas))
-    assert column > canvas.shape[1] / 2 + 30 and row < canvas.shape[0] / 2 - 30
+    assert column > canvas.shape[1] / 2 + 15 and row < canvas.shape[0] / 2 - 30
     page.run("carlasc.pick(...args)", float(column), float(row))
     x, y, _ = page.run("return carlasc.picked.center")
     assert abs(x - 10) < 1.5 and abs(y - 5) < 1.5
@@ -189,11 +189,13 @@ def test_points_alone_are_drawn(browser, tmp_path):
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (500, 900)])
-def test_nothing_overlaps_and_nothing_is_cut_off(browser, page_file, size):
-    page = Page(browser, page_file, size)
-    page.picture(f"page_{size[0]}x{size[1]}")
+@pytest.mark.parametrize("compared", [False, True])
+def test_nothing_overlaps_and_nothing_is_cut_off(browser, blocks, tmp_path, size, compared):
+    result = make_page(blocks, tmp_path / "scene.html", truth=blocks if compared else None, frames=(0, 1))
+    page = Page(browser, result.out, size)
+    page.picture(f"page_{size[0]}x{size[1]}{'_compared' if compared else ''}")
     found = page.run(
-        "const boxes = [...document.querySelectorAll('header button, h1, #subtitle, footer button, #slider, #frame-label, .chips button, tbody .name, tbody .count')]"
+        "const boxes = [...document.querySelectorAll('header button, h1, #subtitle, footer button, #slider, #frame-label, .chips button, th, tbody .name, tbody .count, #titles span')]"
         "  .filter((e) => e.offsetParent).map((e) => [e, e.getBoundingClientRect()]);"
         "const wrong = [];"
         "for (const [e, b] of boxes) if (b.left < -0.5 || b.right > window.innerWidth + 0.5) wrong.push(`${e.id || e.textContent} is cut off`);"

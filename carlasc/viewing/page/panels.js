@@ -26,6 +26,7 @@ class Panels {
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.maxPolarAngle = Math.PI * 0.495;
     this.controls.addEventListener('change', () => this.invalidate());
+    this.setShadows(!this.isSoftware());
     this.pickTarget = new THREE.WebGLRenderTarget(1, 1);
     this.changed = true;
   }
@@ -148,6 +149,18 @@ class Panels {
       this.scan.uniforms.scale.value = (0.1 * height * this.renderer.getPixelRatio()) / Math.tan((this.camera.fov * Math.PI) / 360);
       this.renderer.render(panel.scene, this.camera);
     }
+  }
+
+  /** Whether pictures are computed without a GPU: then shadows would make every move take seconds. */
+  isSoftware() {
+    const gl = this.renderer.getContext();
+    const names = gl.getExtension('WEBGL_debug_renderer_info');
+    return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  }
+
+  setShadows(on) {
+    for (const { layer } of this.panels) if (layer) layer.material.uniforms.shadows.value = on;
+    this.invalidate();
   }
 
   /** Finds the voxel at a place on the canvas: draws that one pixel with the voxels' numbers for colours. */

@@ -71,11 +71,12 @@ class Viewer {
     this.legends = Object.entries(this.scene.tables).map(([name, classes]) => {
       const panels = this.scene.panels.map((panel, number) => ({ panel, number })).filter(({ panel }) => panel.table === name);
       const columns = panels.map(({ panel }) => (panels.length > 1 ? panel.title : 'voxels'));
-      if (name === this.scene.pointTable) columns.push('points');
+      const counted = name === this.scene.pointTable && panels.length < 2; // beside two grids there is no room for a third column
+      if (counted) columns.push('points');
       const change = (table, id, on) => { this.panels.setClass(table, id, on); this.unpick(); };
       const legend = new Legend(name === 'errors' ? 'Errors' : 'Classes', name, classes, columns, change);
       byId('legends').append(legend.element);
-      return { legend, panels: panels.map(({ number }) => number) };
+      return { legend, counted, panels: panels.map(({ number }) => number) };
     });
   }
 
@@ -129,9 +130,9 @@ class Viewer {
     this.position = position;
     this.contents = contents;
     this.panels.setFrame(contents);
-    for (const { legend, panels } of this.legends) {
+    for (const { legend, counted, panels } of this.legends) {
       const columns = panels.map((number) => countBy(contents.grids[number].label, legend.classes.length));
-      if (legend.table === this.scene.pointTable) columns.push(contents.scan ? countBy(contents.scan.label, legend.classes.length) : []);
+      if (counted) columns.push(contents.scan ? countBy(contents.scan.label, legend.classes.length) : []);
       legend.update(columns);
     }
     const time = this.scene.times[position];

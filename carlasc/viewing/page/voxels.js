@@ -25,6 +25,9 @@ const GRID_GLSL = /* glsl */ `
 
 const VOXEL_VERTEX = /* glsl */ `
   precision highp sampler2D;
+  precision highp sampler3D;
+  uniform sampler3D occupancy; // of the shown voxels; its axes are z, y, x
+  uniform bool closed;         // azimuth goes all the way round
   attribute vec3 cell;
   attribute float label;
   attribute float value;   // 0..1 on the ramp
@@ -40,6 +43,12 @@ const VOXEL_VERTEX = /* glsl */ `
   flat varying float vPicked;
   flat varying int vInstance;
   ${GRID_GLSL}
+  bool covered() { // by a neighbour that is shown: such faces would shine through at the edges
+    vec3 beside = cell + normal;
+    if (closed) beside.y = mod(beside.y, dims.y);
+    if (any(lessThan(beside, vec3(0.0))) || any(greaterThanEqual(beside, dims))) return false;
+    return texelFetch(occupancy, ivec3(beside.zyx), 0).r > 0.5;
+  }
   void main() {
     vec4 entry = texelFetch(palette, ivec2(int(label + 0.5), 0), 0);
     vec3 axes = lower + (cell + position) * voxel;
@@ -55,14 +64,15 @@ const VOXEL_VERTEX = /* glsl */ `
     vFace = normal;
     vInstance = gl_InstanceID;
     vPicked = abs(picked - float(gl_InstanceID)) < 0.5 ? 1.0 : 0.0;
-    gl_Position = entry.a < 0.5 ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * viewMatrix * vec4(vScene, 1.0);
+    gl_Position = entry.a < 0.5 || covered() ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * viewMatrix * vec4(vScene, 1.0);
   }`;
 
 const VOXEL_FRAGMENT = /* glsl */ `
   precision highp sampler3D;
-  uniform sampler3D occupancy; // z, y, x
+  uniform sampler3D occupancy;
+  uniform bool closed;
   uniform vec3 sun;
-  uniform bool closed;         // azimuth goes all the way round
+  uniform bool shadows;
   varying vec3 vColor;
   varying vec3 vWithin;
   varying vec3 vFace;
@@ -86,18 +96,19 @@ const VOXEL_FRAGMENT = /* glsl */ `
 
     float lit = max(dot(normal, sun), 0.0);
     float shadow = 0.0;
-    if (lit > 0.0) {
+    if (shadows && lit > 0.0) {
       for (int i = 1; i <= 14; i++) shadow = max(shadow, solid(toCells(foot + sun * (reach * 0.75 * float(i)))));
     }
     lit *= 1.0 - smoothstep(0.35, 0.8, shadow);
     float level = sun.y; // an open, level face in the sun has exactly the legend's colour
     vec3 color = vColor * open * (0.58 + 0.42 * min(lit / level, 1.25));
 
-    vec3 away = min(vWithin, 1.0 - vWithin) / max(fwidth(vWithin), 1e-5);
-    away += abs(vFace) * 1e6;
+    vec3 step = max(fwidth(vWithin), 1e-5);
+    vec3 away = min(vWithin, 1.0 - vWithin) / step + abs(vFace) * 1e6; // pixels to the edges, of which a face has four
     float edge = min(away.x, min(away.y, away.z));
-    float fine = clamp(0.25 / max(max(fwidth(vWithin).x, fwidth(vWithin).y), fwidth(vWithin).z) - 0.75, 0.0, 1.0);
-    color *= 1.0 - 0.22 * fine * (1.0 - smoothstep(0.3, 1.3, edge));
+    vec3 fine = clamp((1.0 / step - 5.0) / 8.0, 0.0, 1.0); // lines a few pixels apart would shimmer
+    vec3 lines = fine * (1.0 - smoothstep(0.3, 1.3, away));
+    color *= 1.0 - 0.22 * max(lines.x, max(lines.y, lines.z));
     if (vPicked > 0.5) color = mix(color, vec3(1.0, 0.62, 0.1), 0.35 + 0.65 * (1.0 - smoothstep(1.0, 2.5, edge)));
     gl_FragColor = vec4(color, 1.0);
   }`;
@@ -146,6 +157,7 @@ class VoxelLayer {
       byRamp: { value: false },
       occupancy: { value: this.occupancy },
       sun: { value: new THREE.Vector3(-0.5, 0.78, 0.38).normalize() },
+      shadows: { value: true },
       picked: { value: -1 },
     };
     // the change of axes mirrors where the data is left-handed: there the box's faces turn inside out

@@ -1,0 +1,70 @@
+import json
+import sys
+
+import pytest
+from helpers.blocks import write_blocks
+from typer.testing import CliRunner
+
+from carlasc.cli import app
+
+
+def call(*options):
+    return CliRunner().invoke(app, ["view", *map(str, options)])
+
+
+def test_a_page_is_written_and_named(golden_capture, tmp_path):
+    result = call(golden_capture / "cartesian", "--html", tmp_path / "scene.html")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith(f"{tmp_path}/scene.html: ") and "3 frames" in result.stdout
+    assert (tmp_path / "scene.html").read_text().startswith("<!doctype html>")
+
+
+def test_figures_are_json(golden_capture, tmp_path):
+    result = call(golden_capture / "cylindrical", "--html", tmp_path / "a.html", "--frames", "1:3", "--every", 2, "--json")
+    figures = json.loads(result.stdout)
+    assert figures["frames"] == [1] and figures["size_bytes"] == (tmp_path / "a.html").stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "word"),
+    [
+        (["--html", "a.txt"], 2, ".html"),
+        (["--html", "a.html", "--frames", "9:12"], 1, "expected frames 9:12"),
+        (["--html", "a.html", "--grid", "fine"], 1, "fine"),
+        (["--html", "a.html", "--thin", "0"], 2, "thin"),
+        (["--html", "a.html", "--classes", "mine"], 2, "mine"),
+        (["--json"], 2, "--html"),
+    ],
+)
+def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
+    monkeypatch.chdir(tmp_path)
+    result = call(golden_capture / "cartesian", *options)
+    assert result.exit_code == code, result.stderr
+    assert word in result.stderr and result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_that_is_there_is_only_replaced_when_asked(tmp_path):
+    data = write_blocks(tmp_path / "data" / "cartesian", frames=1)
+    (tmp_path / "a.html").write_text("mine")
+    assert call(data, "--html", tmp_path / "a.html").exit_code == 1
+    assert (tmp_path / "a.html").read_text() == "mine"
+    assert call(data, "--html", tmp_path / "a.html", "--overwrite").exit_code == 0
+    assert (tmp_path / "a.html").read_text() != "mine"
+
+
+def test_without_a_screen_the_window_says_what_to_do(tmp_path, monkeypatch):
+    pytest.importorskip("open3d", exc_type=ImportError)
+    if sys.platform != "linux":
+        pytest.skip("screens are named by DISPLAY on Linux only")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    result = call(write_blocks(tmp_path / "data" / "cartesian", frames=1))
+    assert result.exit_code == 1
+    assert "DISPLAY" in result.stderr and "--html" in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_without_open3d_the_window_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    result = call(write_blocks(tmp_path / "data" / "cartesian", frames=1))
+    assert result.exit_code == 1 and "carlasc[view]" in result.stderr

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from carlasc.grids import Grid, GridSpec
+from carlasc.scans import Scan
+from carlasc.viewing.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays, unpack_arrays
+
+arrays = st.dictionaries(
+    st.text(min_size=1, max_size=8),
+    st.one_of(
+        *(
+            st.lists(st.integers(0, np.iinfo(kind).max), max_size=20).map(lambda v, k=kind: np.array(v, k))
+            for kind in (np.uint8, np.uint16, np.uint32)
+        ),
+        st.lists(st.floats(width=32, allow_nan=False), max_size=20).map(lambda v: np.array(v, np.float32)),
+        st.lists(st.integers(-(2**31), 2**31 - 1), max_size=20).map(lambda v: np.array(v, np.int32)),
+    ),
+    max_size=4,
+)
+
+
+@given(arrays)
+def test_packed_arrays_come_back(given_arrays):
+    found = unpack_arrays(pack_arrays(given_arrays))
+    assert list(found) == list(given_arrays)
+    for name, array in given_arrays.items():
+        assert found[name].dtype == array.dtype
+        assert np.array_equal(found[name], array)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.booleans(), st.sampled_from([1, 200, 3000]), st.sampled_from([np.uint8, np.uint16]))
+def test_a_grid_comes_back(seed, whole, most, kind):
+    rng = np.random.default_rng(seed)
+    spec = GridSpec("cartesian", (5, 4, 3), (0, 0, 0), (5, 4, 3))
+    labels = (rng.integers(0, 260 if kind == np.uint16 else 20, spec.size) * (rng.random(spec.size) < 0.4)).astype(kind)
+    counts = (rng.integers(0, most, spec.size) * (rng.random(spec.size) < 0.7)).astype(np.float32) / (1 if whole else 3)
+    found = encode_grid(Grid(spec, labels, counts))
+    index = np.cumsum(found["index"].astype(np.int64))
+    again = np.zeros(spec.num_voxels, kind)
+    again[index] = found["label"]
+    assert np.array_equal(again.reshape(spec.size), labels)
+    assert np.array_equal(found["votes"].astype(np.float32), counts.reshape(-1)[index])
+    turns = np.cumsum(found["unknown"].astype(np.int64))
+    unknown = np.searchsorted(turns, np.arange(spec.num_voxels), side="right") % 2 == 1
+    assert np.array_equal(unknown.reshape(spec.size), counts == 0)
+
+
+def test_a_grid_without_counts_has_no_votes():
+    spec = GridSpec("cartesian", (2, 2, 2), (0, 0, 0), (1, 1, 1))
+    assert set(encode_grid(Grid(spec, np.zeros(spec.size, np.uint8)))) == {"index", "label"}
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.integers(0, 400), st.sampled_from([0.1, 0.2, 1.0]))
+def test_a_scan_comes_back_thinned_to_one_point_a_cell(seed, count, cell):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0, 1.5, (count, 3)).astype(np.float32)
+    labels = rng.integers(0, 23, count).astype(np.uint32)
+    found = encode_scan(Scan(points, labels), cell)
+    lower, size = found["box"][:3], found["box"][3:]
+    cells = np.stack(np.unravel_index(np.cumsum(found["index"].astype(np.int64)), size), axis=1) + lower
+    assert len(np.unique(cells, axis=0)) == len(cells)
+    expected = np.floor(points.astype(np.float64) / cell).astype(int)
+    assert set(map(tuple, cells)) == set(map(tuple, expected))
+    again = (cells + (found["offset"].reshape(3, -1).T + 0.5) / OFFSET_STEPS) * cell
+    for point, label in zip(again, found["label"], strict=True):  # each is one of the scan's own points
+        near = np.abs(points - point).max(axis=1) <= cell / OFFSET_STEPS / 2 + 1e-4
+        assert label in labels[near]
+
+
+def test_what_moves_becomes_an_arrow_a_thing():
+    points = np.array([[1, 0, 0], [1.2, 0, 0], [20, 0, 0], [30, 0, 0]], np.float32)
+    flow = np.array([[5, 0, 0], [5, 0, 0], [0, -2, 0], [0, 0, 0]], np.float32)
+    arrows = encode_scan(Scan(points, flow=flow), 0.2)["arrows"].reshape(-1, 6)
+    assert np.allclose(sorted(arrows[:, 3:].tolist()), [[0, -2, 0], [5, 0, 0]])
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_empty_arrays_come_back(kind):
+    assert unpack_arrays(pack_arrays({"a": np.empty(0, kind)}))["a"].dtype == kind

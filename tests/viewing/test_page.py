@@ -1,0 +1,122 @@
+import base64
+import json
+import re
+
+import numpy as np
+import pytest
+from helpers.blocks import write_blocks
+
+from carlasc.errors import ArgumentError, ConflictError, MissingDataError
+from carlasc.grids import Grid, GridSpec
+from carlasc.sources import open as open_source
+from carlasc.viewing import make_page, open_clip
+from carlasc.viewing.clip import INVENTED, MISSED, RIGHT, WRONG, compare
+from carlasc.viewing.coding import unpack_arrays
+
+
+def read_page(path):
+    """Return the page's text, the scene it describes, and the arrays of its frames."""
+    text = path.read_text()
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', text)[1])
+    frames = re.findall(r'id="frame\d+">(.*?)</script>', text)
+    return text, scene, [unpack_arrays(base64.b64decode(frame)) for frame in frames]
+
+
+def test_a_page_holds_the_grids_as_they_are(golden_capture, tmp_path):
+    result = make_page(golden_capture / "cartesian", tmp_path / "scene.html")
+    _, scene, frames = read_page(result.out)
+    (sequence,) = open_source(golden_capture / "cartesian").sequences().values()
+    assert scene["frames"] == [0, 1, 2] == list(result.frames)
+    assert scene["times"] == pytest.approx([0, 0.1, 0.2])
+    assert scene["panels"][0]["lower"] == list(sequence.grids["evaluation"].lower)
+    for frame, arrays in zip(scene["frames"], frames, strict=True):
+        grid = sequence.grid("evaluation", frame)
+        index = np.cumsum(arrays["panel0/index"].astype(np.int64))
+        assert np.array_equal(index, np.flatnonzero(grid.labels))
+        assert np.array_equal(arrays["panel0/label"], grid.labels.reshape(-1)[index])
+        assert np.array_equal(arrays["panel0/votes"], grid.counts.reshape(-1)[index])
+
+
+def test_a_page_asks_the_network_for_nothing(golden_capture, tmp_path):
+    text, _, _ = read_page(make_page(golden_capture / "cartesian", tmp_path / "scene.html", frames=(0, 1)).out)
+    assert not re.search(r"<(script|link|img)[^>]+(src|href)=[\"'](?!data:)", text)
+    assert "default-src 'none'" in text
+    assert "Permission is hereby granted" in text  # three.js's licence goes with it
+    assert "{{" not in text.split("<script>")[0]
+
+
+def test_a_name_cannot_break_the_page(tmp_path):
+    folder = write_blocks(tmp_path / "a<script>alert(1)<b" / "cartesian", frames=1, points=False)
+    text, scene, _ = read_page(make_page(folder, tmp_path / "scene.html").out)
+    assert scene["name"] == "a<script>alert(1)<b"
+    assert "<script>alert" not in text
+
+
+def test_the_first_sixty_frames_are_taken_where_no_range_is_given(tmp_path):
+    folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, points=False)
+    for frame in range(1, 65):
+        for kind in ("label", "bin"):
+            (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(folder / "evaluation" / f"000000.{kind}")
+    clip = open_clip(folder, at_most=60)
+    assert clip.frames == tuple(range(60)) and "65 frames there: took the first 60" in clip.notes[0]
+    assert open_clip(folder, frames=(3, 64), every=20, at_most=2).frames == (3, 23, 43, 63)
+    assert len(open_clip(folder).frames) == 65
+
+
+def test_errors_are_told_where_the_truth_is_known():
+    spec = GridSpec("cartesian", (6, 1, 1), (0, 0, 0), (6, 1, 1))
+
+    def grid(labels, counts=None):
+        return Grid(spec, np.array(labels, np.uint8).reshape(spec.size), None if counts is None else np.array(counts).reshape(spec.size))
+
+    found = compare(grid([7, 7, 0, 7, 0, 7]), grid([7, 10, 7, 0, 0, 7], [1, 1, 1, 1, 1, 0]))
+    assert found.labels.reshape(-1).tolist() == [RIGHT, WRONG, MISSED, INVENTED, 0, 0]
+    with pytest.raises(ArgumentError, match="prediction's grid"):
+        compare(grid([0] * 6), Grid(spec.with_size((3, 1, 1)), np.zeros((3, 1, 1), np.uint8)))
+
+
+def test_a_prediction_in_eleven_classes_is_shown_beside_its_truth_in_the_same(blocks, tmp_path):
+    prediction = write_blocks(tmp_path / "Town01_Light" / "cartesian", metadata={"classes": "carlasc11"}, points=False)
+    clip = open_clip(prediction, truth=blocks)
+    assert {panel.colors.table.name for panel in clip.panels} == {"carlasc11", "errors"}
+    assert clip.read(0).grids[1].labels.max() <= 10
+
+
+def test_what_is_not_there_is_named(blocks, tmp_path):
+    with pytest.raises(MissingDataError, match="expected frames 7:9, found 0 to 2"):
+        make_page(blocks, tmp_path / "a.html", frames=(7, 9))
+    with pytest.raises(ArgumentError, match=r"\.html"):
+        make_page(blocks, tmp_path / "a.pdf")
+    with pytest.raises(ArgumentError, match="every"):
+        make_page(blocks, tmp_path / "a.html", every=0)
+    (tmp_path / "a.html").write_text("mine")
+    with pytest.raises(ConflictError, match="--overwrite"):
+        make_page(blocks, tmp_path / "a.html")
+
+
+def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
+    """A frame as full as a real one: 130,000 points, a coarse grid of 20,000 voxels; its bytes times 60."""
+    from helpers.scenes import Street
+
+    from carlasc.geometry import translation
+    from carlasc.sources.folder import FolderSink
+
+    rng = np.random.default_rng(0)
+    points, labels = Street.random().scan(translation((0, 0, 1.8)), rng, channels=64, columns=2031)
+    writer = FolderSink(tmp_path).sequence("cartesian")
+    spec = GridSpec.published()
+    grid = np.zeros(spec.size, np.uint32)
+    flat = spec.flat_index(points)
+    grid.reshape(-1)[flat[flat >= 0]] = labels[flat >= 0]
+    grid[:, :, 0] = np.where(rng.random((128, 128)) < 0.95, 7, grid[:, :, 0])
+    writer.write_document("evaluation/params.json", json.dumps(spec.to_params()).encode())
+    writer.write("evaluation/labels", 0, grid)
+    writer.write("evaluation/counts", 0, np.where(rng.random(spec.size) < 0.7, rng.integers(1, 21, spec.size), 0).astype(np.float32))
+    writer.write("points", 0, np.column_stack([points, np.zeros(len(points), np.float32)]))
+    writer.write("labels", 0, labels.astype(np.uint32))
+    assert len(points) > 90_000 and (grid > 0).sum() > 15_000
+    result = make_page(tmp_path / "cartesian", tmp_path / "scene.html")
+    text, _, _ = read_page(result.out)
+    frame = len(re.search(r'id="frame0">(.*?)</script>', text)[1])
+    assert result.size_bytes + 59 * frame < 15e6
+    assert result.size_bytes < 1.2e6
