@@ -1,0 +1,224 @@
+"""What the documentation shows is so: commands and scripts run, figures are drawn anew, pages and options are all there."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlasc import cli
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = {str(path.relative_to(DOCS)): path for path in sorted(DOCS.rglob("*.md"))}
+START = "index.md"
+FENCE = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+END = "\x1e"  # between the outputs of two commands
+
+
+def blocks(page, language):
+    """Return (options, text) of the fenced blocks of a page in a language."""
+    return [(match[2], match[3]) for match in FENCE.finditer(PAGES[page].read_text()) if match[1] == language]
+
+
+def scripts(page):
+    """Return the scripts that a page tells its reader to save, by name."""
+    named = [(re.search(r'title="([^"]+)"', options), text) for options, text in blocks(page, "python")]
+    return {name[1]: text for name, text in named if name}
+
+
+def session(page):
+    """Return the (command, expected output) of a page's console blocks, in order."""
+    steps = []
+    for _, text in blocks(page, "console"):
+        for line in text.splitlines():
+            if line.startswith("$ "):
+                steps.append((line[2:], []))
+            else:
+                steps[-1][1].append(line)
+    return [(command, "\n".join(lines)) for command, lines in steps]
+
+
+def play(page, folder):
+    """Run a page's commands in one shell; return (command, expected, found, exit code) of each."""
+    for name, text in scripts(page).items():
+        (folder / name).write_text(text)
+    steps = session(page)
+    script = "".join(f"{command}\n__code=$?; printf '%d{END}' $__code; (exit $__code)\n" for command, _ in steps)
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "COLUMNS": "160"}
+    ran = subprocess.run(
+        ["bash"],
+        check=False,
+        input=script,
+        cwd=folder,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    outputs = [re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups() for output in ran.stdout.split(END)[:-1]]
+    assert len(outputs) == len(steps), ran.stdout
+    return [(*step, found, int(code)) for step, (found, code) in zip(steps, outputs, strict=True)]
+
+
+def check(results):
+    """Compare what commands printed; those whose output is an error must have failed, the others not."""
+    checker = OutputChecker()
+    for command, expected, found, code in results:
+        assert checker.check_output(
+            f"{expected}\n", found if found.endswith("\n") else f"{found}\n", ELLIPSIS | NORMALIZE_WHITESPACE
+        ), f"$ {command}\nexpected:\n{expected}\nfound:\n{found}"
+        assert (code != 0) == expected.startswith("carlasc: "), f"$ {command}\nexit code {code}:\n{found}"
+
+
+@pytest.fixture(scope="session")
+def started(tmp_path_factory):
+    """The folder of a reader who followed "start here", and what each command printed."""
+    folder = tmp_path_factory.mktemp("start")
+    return folder, play(START, folder)
+
+
+@pytest.mark.slow
+def test_start_here_works_from_the_demo_to_the_training_step(started):
+    folder, results = started
+    check(results)
+    assert any(command.startswith("python") for command, *_ in results)
+    assert (folder / "town" / "fine.png").stat().st_size > 10_000
+    assert (folder / "town" / "Train" / "Demo_Heavy" / "mine.png").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if page != START and session(page)])
+def test_commands_of_a_page_print_what_it_shows(page, started, tmp_path):
+    shutil.copytree(started[0] / "town", tmp_path / "town", copy_function=os.link)
+    check(play(page, tmp_path))
+
+
+def command_lines():
+    """Return (page, line) of every line in the documentation that runs carlasc."""
+    for page, path in PAGES.items():
+        texts = [text for language in ("bash", "sh", "console") for _, text in blocks(page, language)]
+        texts += re.findall(r"(?:^    .*\n)+", path.read_text(), re.MULTILINE)
+        for line in "\n".join(texts).splitlines():
+            found = re.match(r"\s*(?:\$ )?(carlasc [a-z]+(?: .*)?)$", line)
+            if found and "[" not in found[1].split("#")[0]:  # a synopsis is no command
+                yield page, found[1]
+
+
+@pytest.mark.parametrize(("page", "line"), sorted(set(command_lines())))
+def test_commands_in_the_docs_have_the_options_that_they_are_given(page, line):
+    name, *arguments = shlex.split(line, comments=True)[1:]
+    command = group().commands[name]
+    arguments = arguments[: next((i for i, part in enumerate(arguments) if part in (">", "|", "&&")), None)]
+    command.make_context(name, arguments)  # reads the arguments and runs nothing
+
+
+def group():
+    from typer.main import get_command
+
+    return get_command(cli.app)
+
+
+def test_every_command_has_a_page_and_every_page_a_command():
+    pages = {page.removeprefix("commands/").removesuffix(".md") for page in PAGES if page.startswith("commands/")}
+    assert pages == set(group().commands)
+
+
+def test_option_tables_name_every_option():
+    sys.path.insert(0, str(DOCS))
+    try:
+        from hooks import command_names, options_of
+    finally:
+        sys.path.remove(str(DOCS))
+    assert command_names() == list(group().commands)
+    for name, command in group().commands.items():
+        table = options_of(name)
+        for parameter in command.params:
+            names = parameter.opts if parameter.opts[0].startswith("-") else [parameter.name.upper()]
+            for option in names:
+                if option != "--help":
+                    assert f"`{option}`" in table, f"{name}: {option}"
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    arguments = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
+    ran = subprocess.run(arguments, check=False, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    html = (tmp_path / "site" / "format" / "index.html").read_text()
+    assert "velodyne/000000.bin" in html and "generated:" not in html
+    assert "--free-step" in (tmp_path / "site" / "commands" / "regrid" / "index.html").read_text()
+    assert not list((tmp_path / "site").rglob("*.py"))
+
+
+def test_no_page_is_only_api():
+    for page, path in PAGES.items():
+        prose = re.sub(r"^:::.*\n(?: {4}.*\n)*|^#.*\n", "", path.read_text(), flags=re.MULTILINE)
+        assert len(prose.split()) >= 12, page
+
+
+@pytest.fixture(scope="session")
+def figures():
+    sys.path.insert(0, str(DOCS))
+    try:
+        import figures
+    finally:
+        sys.path.remove(str(DOCS))
+    return figures
+
+
+@pytest.mark.parametrize("name", ["frames.svg", "votes.svg"])
+def test_drawings_are_those_that_the_script_draws(name, figures):
+    assert figures.draw(name).decode() == (figures.IMAGES / name).read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["town.png", "grids.png"])
+def test_pictures_are_those_that_the_script_draws(name, figures, tmp_path):
+    from PIL import Image
+
+    (tmp_path / name).write_bytes(figures.draw(name))
+    ours, theirs = (np.asarray(Image.open(folder / name).convert("RGB"), int) for folder in (tmp_path, figures.IMAGES))
+    assert ours.shape == theirs.shape
+    assert np.abs(ours - theirs).mean() < 2  # of 255; quantising may choose other colours elsewhere
+
+
+def test_pictures_are_small_and_shown_on_a_page(figures):
+    shown = "".join(path.read_text() for path in (*PAGES.values(), ROOT / "README.md"))
+    for image in figures.IMAGES.iterdir():
+        assert image.stat().st_size < 300_000, image.name
+        assert f"images/{image.name}" in shown, image.name
+
+
+def test_help_loads_nothing_heavy():
+    heavy = "{'numba', 'scipy', 'trimesh', 'torch', 'zarr', 'h5py', 'pyarrow', 'matplotlib', 'PIL', 'fsspec'}"
+    for name in group().commands:
+        code = (
+            "import sys; from carlasc.cli import main; sys.argv = ['carlasc', sys.argv[1], '--help']\n"
+            f"try: main()\nfinally: print('loaded:', sorted({heavy} & set(sys.modules)))"
+        )
+        ran = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True, check=True)
+        assert "Usage: carlasc" in ran.stdout and ran.stdout.rstrip().endswith("loaded: []"), name
+
+
+@pytest.mark.parametrize(("typed", "offered"), [("carlasc reg", "regrid"), ("carlasc regrid --pre", "--preset")])
+def test_shells_complete_commands_and_options(typed, offered):
+    carlasc = [sys.executable, "-c", "import sys; sys.argv = ['carlasc']; from carlasc.cli import main; main()"]
+    asked = {"_CARLASC_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
+    ran = subprocess.run(carlasc, check=False, env=os.environ | asked, capture_output=True, text=True)
+    assert offered in ran.stdout.split()
+
+
+def test_links_of_the_readme_lead_somewhere():
+    targets = re.findall(r"\]\(([^)#]+)(?:#([^)]+))?\)", (ROOT / "README.md").read_text())
+    assert targets
+    for target, anchor in targets:
+        assert (ROOT / target).is_file(), target
+        headings = re.findall(r"^#+ (.*)$", (ROOT / target).read_text(), re.MULTILINE) if anchor else []
+        assert not anchor or anchor in [heading.lower().replace(" ", "-") for heading in headings]
