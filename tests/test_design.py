@@ -1,0 +1,49 @@
+"""The rooms are in the order that the design says: each imports those above it, never those below."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "carlasc"
+
+
+def rooms():
+    """Return the rooms in the order of the design's table."""
+    table = (ROOT / "docs" / "design.md").read_text().partition("## The rooms")[2].partition("\n## ")[0]
+    return re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
+
+
+def imported(path):
+    """Yield the rooms that a file imports, wherever in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        modules = []
+        if isinstance(node, ast.ImportFrom) and node.module == "carlasc":
+            modules = [f"carlasc.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            modules = [node.module or ""]
+        elif isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        for module in modules:
+            if (parts := module.split("."))[0] == "carlasc" and len(parts) > 1:
+                yield parts[1]
+
+
+def test_every_room_stands_in_the_table():
+    there = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    assert set(rooms()) == there - {"__init__", "__main__"}
+
+
+def test_no_room_imports_one_below_it():
+    order = {room: place for place, room in enumerate(rooms())}
+    for room, place in order.items():
+        files = [PACKAGE / f"{room}.py"] if (PACKAGE / f"{room}.py").is_file() else (PACKAGE / room).rglob("*.py")
+        for path in files:
+            below = {name for name in imported(path) if order.get(name, -1) > place}
+            assert not below, f"{path.relative_to(ROOT)} imports {', '.join(below)}"
+
+
+def test_converters_and_examples_use_no_private_name():
+    for path in [*(ROOT / "converters").rglob("*.py"), *(ROOT / "examples").rglob("*.py")]:
+        private = re.findall(r"from carlasc[\w.]* import .*\b_\w+", path.read_text())
+        assert not private, f"{path.relative_to(ROOT)}: {private}"
