@@ -124,7 +124,7 @@ class Clip:
         """
         scan = self.data.read_scan(frame) if self._has_points(frame) else None
         if scan is not None:
-            finite = np.isfinite(scan.points).all(axis=1)
+            finite = np.asarray(np.isfinite(scan.points).all(axis=1))
             scan = scan if finite.all() else scan.select(finite)
             if scan.labels is not None:
                 self.data.table.check(scan.labels, f"{self.data.sequence.location}: labels, frame {frame}")

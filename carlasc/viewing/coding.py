@@ -94,7 +94,8 @@ def unpack_arrays(block: bytes) -> Arrays:
 
 def _gaps(rising: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
     """Return the first value and the differences of rising ones, in the narrowest type."""
-    return _narrow(np.diff(rising.astype(np.int64), prepend=0))
+    values = rising.astype(np.int64)
+    return _narrow(np.concatenate([values[:1], values[1:] - values[:-1]]))
 
 
 def _narrow(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:

@@ -187,7 +187,7 @@ class Window:
         control.set_lookat([-3.0, 0.0, -1.0])
         control.set_front([-0.79, 0.0, 0.61])
         control.set_up([0.0, 0.0, 1.0])
-        control.set_zoom(0.6)
+        control.set_zoom(0.52)
 
     def _bind_keys(self) -> None:
         simple: dict[int, Callable[[], None]] = {
@@ -244,7 +244,9 @@ class Window:
             self._vectors(ends.reshape(-1, 3)),
             self.o3d.utility.Vector2iVector(np.arange(2 * len(face), dtype=np.int32).reshape(-1, 2)),
         )
-        lines.colors = self.o3d.utility.Vector3dVector(mesh.colors[face] * (_EDGE / 255.0) * self._light(mesh)[face, None])
+        lines.colors = self.o3d.utility.Vector3dVector(
+            mesh.colors[face] * (_EDGE / 255.0) * self._light(mesh)[face, None]
+        )
         return lines
 
     def _points(self) -> Any:
@@ -265,6 +267,10 @@ class Window:
         if scan is None or scan.flow is None:
             return None
         tails, vectors = motion_arrows(scan.select(np.linalg.norm(scan.flow, axis=1) > 0))
+        if self.clip.panels and "points" not in self.look.layers:  # elsewhere they would stand above nothing
+            spec = self.clip.panels[0].spec
+            _, inside = spec.index(spec.to_axes(tails * [1, 1, 0] + [0, 0, (spec.lower[2] + spec.upper[2]) / 2]))
+            tails, vectors = tails[inside], vectors[inside]
         return self._mesh(arrows(tails, vectors, palette.ARROW, 0.24)) if len(tails) else None
 
     def _mesh(self, mesh: QuadMesh) -> Any:

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from helpers.pixels import BLUE, RED, grid_with
 
 from carlasc import layout
 from carlasc.files import to_json
 from carlasc.grids import GridSpec
 from carlasc.sources.folder import FolderSink
-from helpers.pixels import BLUE, RED, grid_with
 
 ROAD = 7
 

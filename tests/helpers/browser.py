@@ -80,10 +80,14 @@ class Page:
 
     def canvas(self, name: str | None = None) -> NDArray[np.uint8]:
         """Return the part of the picture that is drawn by three.js."""
-        box = self.run("const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, r.y, r.right, r.bottom]")
+        box = self.run(
+            "const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, r.y, r.right, r.bottom]"
+        )
         x0, y0, x1, y1 = (round(value) for value in box)
         return self.picture(name)[y0:y1, x0:x1]
 
     def complaints(self) -> list[str]:
         """Return what the console was told since the page was opened: warnings and errors."""
-        return [entry["message"] for entry in self.browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+        return [
+            entry["message"] for entry in self.browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")
+        ]

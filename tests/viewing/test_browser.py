@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from helpers.blocks import write_blocks
 from helpers.browser import Page
 from helpers.pixels import blue_pixels, middle_of, red_pixels
-from helpers.blocks import write_blocks
 
 from carlasc.grids import GridSpec
 from carlasc.viewing import make_page
@@ -79,7 +79,10 @@ def test_play_goes_through_the_frames_until_it_is_stopped(page):
     assert seen == [0, 1, 2]
     assert page.text("#play") == "Stop"
     page.click("#play")
-    assert page.run("while (carlasc.runs) await new Promise((done) => setTimeout(done, 10)); return carlasc.playing") is False
+    assert (
+        page.run("while (carlasc.runs) await new Promise((done) => setTimeout(done, 10)); return carlasc.playing")
+        is False
+    )
 
 
 def test_a_class_is_toggled_and_counted(page):
@@ -131,7 +134,9 @@ def test_picking_a_voxel_tells_its_class_votes_and_place(page):
 @pytest.mark.parametrize("mode", ["height", "votes"])
 def test_colours_may_tell_height_or_votes(page, mode):
     before = page.canvas()
-    page.run("const s = document.getElementById('color-by'); s.value = args[0]; s.dispatchEvent(new Event('change'))", mode)
+    page.run(
+        "const s = document.getElementById('color-by'); s.value = args[0]; s.dispatchEvent(new Event('change'))", mode
+    )
     after = page.canvas(f"page_{mode}")
     assert (before != after).any(-1).mean() > 0.1
     assert page.text("#ramp h2").lower().startswith(mode)

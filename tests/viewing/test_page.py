@@ -67,7 +67,11 @@ def test_errors_are_told_where_the_truth_is_known():
     spec = GridSpec("cartesian", (6, 1, 1), (0, 0, 0), (6, 1, 1))
 
     def grid(labels, counts=None):
-        return Grid(spec, np.array(labels, np.uint8).reshape(spec.size), None if counts is None else np.array(counts).reshape(spec.size))
+        return Grid(
+            spec,
+            np.array(labels, np.uint8).reshape(spec.size),
+            None if counts is None else np.array(counts).reshape(spec.size),
+        )
 
     found = compare(grid([7, 7, 0, 7, 0, 7]), grid([7, 10, 7, 0, 0, 7], [1, 1, 1, 1, 1, 0]))
     assert found.labels.reshape(-1).tolist() == [RIGHT, WRONG, MISSED, INVENTED, 0, 0]
@@ -111,7 +115,11 @@ def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     grid[:, :, 0] = np.where(rng.random((128, 128)) < 0.95, 7, grid[:, :, 0])
     writer.write_document("evaluation/params.json", json.dumps(spec.to_params()).encode())
     writer.write("evaluation/labels", 0, grid)
-    writer.write("evaluation/counts", 0, np.where(rng.random(spec.size) < 0.7, rng.integers(1, 21, spec.size), 0).astype(np.float32))
+    writer.write(
+        "evaluation/counts",
+        0,
+        np.where(rng.random(spec.size) < 0.7, rng.integers(1, 21, spec.size), 0).astype(np.float32),
+    )
     writer.write("points", 0, np.column_stack([points, np.zeros(len(points), np.float32)]))
     writer.write("labels", 0, labels.astype(np.uint32))
     assert len(points) > 90_000 and (grid > 0).sum() > 15_000

@@ -13,7 +13,7 @@ class Panels {
     );
     const first = scene.panels[0];
     const heights = first ? [first.lower[2], first.upper[2]] : [-2, 3];
-    this.scan = new ScanLayer(this.side, this.palettes[scene.pointTable], heights, first ? 1.2 * Math.max(first.voxel[0], first.voxel[2]) : 0);
+    this.scan = new ScanLayer(this.side, this.palettes[scene.pointTable], heights, first);
     this.panels = (scene.panels.length ? scene.panels : [null]).map((panel) => this.makePanel(panel));
     this.round = first?.coordinates === 'cylindrical';
     this.radius = this.round ? first.upper[0] : 30;
@@ -57,6 +57,7 @@ class Panels {
     }
     const objects = { points: this.scan.points, flow: this.scan.arrows }[what] ?? [];
     for (const object of objects) object.visible = visible;
+    this.scan.thinArrows();
     this.invalidate();
   }
 

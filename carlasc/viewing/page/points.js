@@ -30,8 +30,10 @@ const POINT_FRAGMENT = /* glsl */ `
 
 /** A scan's points and its arrows; one is shared by all panels. */
 class ScanLayer {
-  constructor(side, palette, heights, voxel) {
+  constructor(side, palette, heights, panel) {
     this.side = side;
+    this.panel = panel;
+    const voxel = panel ? 1.2 * Math.max(panel.voxel[0], panel.voxel[2]) : 0;
     this.uniforms = {
       palette: { value: palette },
       ramp: { value: colorTexture(RAMP, THREE.LinearFilter) },
@@ -76,6 +78,19 @@ class ScanLayer {
       group.clear();
       for (let i = 0; i + 5 < (scan?.arrows.length ?? 0); i += 6) group.add(this.arrow(scan.arrows.subarray(i, i + 6)));
     }
+    this.thinArrows();
+  }
+
+  /** Hides arrows above nothing: those outside the grid, while no points are shown. */
+  thinArrows() {
+    const shown = this.points.some((points) => points.visible);
+    for (const group of this.arrows) for (const arrow of group.children) arrow.visible = shown || arrow.userData.inside;
+  }
+
+  isInside(x, y) {
+    if (!this.panel) return true;
+    const axes = this.panel.coordinates === 'cylindrical' ? [Math.hypot(x, y), Math.atan2(y, x)] : [x, y];
+    return axes.every((value, a) => value >= this.panel.lower[a] && value < this.panel.upper[a]);
   }
 
   arrow([x, y, z, vx, vy, vz]) {
@@ -90,6 +105,7 @@ class ScanLayer {
     tip.position.y = length;
     const group = new THREE.Group();
     group.add(shaft, tip);
+    group.userData.inside = this.isInside(x, y);
     group.position.set(this.side * y, z, -x);
     group.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), along.divideScalar(length));
     return group;
