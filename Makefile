@@ -6,7 +6,7 @@ SYSTEM_LIBRARIES := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libg
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types unit benchmark docs clean
+.PHONY: help demo test lint types unit benchmark benchmark-ssc docs page clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -22,12 +22,19 @@ lint: $(VENV)/ready ## ruff
 
 types: $(VENV)/ready ## mypy
 	$(RUN)/mypy
+	cd examples && MYPYPATH=. ../$(RUN)/mypy --config-file ../pyproject.toml -p completion -p motionsc -p lmscnet -p sscnet
 
 unit: $(VENV)/ready ## the tests
 	$(RUN)/pytest -n auto --dist worksteal -q
 
 benchmark: $(VENV)/ready ## time the hot paths (docs/performance.md)
 	$(RUN)/pytest tests/benchmarks --benchmark-enable --benchmark-only -p no:xdist
+
+benchmark-ssc: $(VENV)/ready ## train the networks on a small simulated data set and print the tables (SIZE=full on a GPU)
+	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small) --history
+
+page: ## build the bundle of the shareable page again from npm
+	carlasc/viewing/page/build.sh
 
 docs: $(VENV)/ready ## the documentation, built strictly into site/
 	NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet
