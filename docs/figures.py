@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -133,17 +134,22 @@ FIGURES: dict[str, Callable[[], bytes]] = {
 }
 
 
-def _ground_truth(spec: GridSpec) -> Grid:
-    """Return the grid of one simulated frame, seen by twenty LiDARs, in the eleven classes."""
+@cache
+def _observations() -> list[Observation]:
+    """Return what twenty LiDARs see of one simulated frame."""
     drive = Drive(seed=2, traffic="heavy")
     recordings = [drive.record(FRAME, sensor) for sensor in range(SENSORS)]
     ego = recordings[0].world_T_sensor
-    observations = [
+    return [
         Observation(r.scan.points, r.scan.labels, relative_to(ego, r.world_T_sensor))
         for r in recordings
         if r.scan.labels is not None
     ]
-    grid = count_votes(observations, spec, CARLA).to_grid()
+
+
+def _ground_truth(spec: GridSpec) -> Grid:
+    """Return their grid, in the eleven classes."""
+    grid = count_votes(_observations(), spec, CARLA).to_grid()
     return Grid(spec, REMAPS["carlasc11"](grid.labels), grid.counts)
 
 

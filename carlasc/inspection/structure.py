@@ -44,7 +44,9 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     keep &= (distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)
     labels = _per_point(sequence, "labels", frame, len(points))
     if labels is not None and bool(labels.any()):
-        keep &= _static_classes(sequence.metadata.classes)[np.minimum(labels, np.iinfo(np.uint16).max)]
+        keep &= _static_classes(sequence.metadata.classes)[
+            np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)  # packed stores keep them in uint8
+        ]
     else:
         keep[keep] = _upright(points[keep])
     flow = _per_point(sequence, "flow", frame, len(points))
