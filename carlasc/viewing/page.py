@@ -135,6 +135,8 @@ def describe(clip: Clip, thin_m: float) -> dict[str, Any]:
         "panels": [_describe_panel(panel) for panel in clip.panels],
         "frames": list(clip.frames),
         "times": [clip.read_time(frame) for frame in clip.frames],
+        "hasPoints": "points" in clip.data.sequence.fields(),
+        "hasFlow": "flow" in clip.data.sequence.fields(),
         "pointCell": thin_m,
         "offsetSteps": OFFSET_STEPS,
     }

@@ -20,7 +20,9 @@ def test_a_page_is_written_and_named(golden_capture, tmp_path):
 
 
 def test_figures_are_json(golden_capture, tmp_path):
-    result = call(golden_capture / "cylindrical", "--html", tmp_path / "a.html", "--frames", "1:3", "--every", 2, "--json")
+    result = call(
+        golden_capture / "cylindrical", "--html", tmp_path / "a.html", "--frames", "1:3", "--every", 2, "--json"
+    )
     figures = json.loads(result.stdout)
     assert figures["frames"] == [1] and figures["size_bytes"] == (tmp_path / "a.html").stat().st_size
 

@@ -24,7 +24,7 @@ def start_chromium(profile: Path) -> Any:
     binary = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
     driver = shutil.which("chromedriver")
     if binary is None or driver is None:
-        pytest.skip("chromium or chromedriver is not there: apt-get install chromium chromium-driver")
+        pytest.skip("chromium or chromedriver is not there: apt-get install chromium-driver")
     options = webdriver.ChromeOptions()
     options.binary_location = binary
     for flag in (*_FLAGS, f"--user-data-dir={profile}"):

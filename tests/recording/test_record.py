@@ -102,10 +102,10 @@ def test_the_ego_vehicle_is_not_seen_and_others_are_where_they_are(tmp_path):
         assert np.linalg.norm(places - (at.x, at.y, at.z), axis=1).min() > 1.0
         everybody = np.array(
             [
-                [l.x, l.y, l.z]
+                [place.x, place.y, place.z]
                 for a in server.worlds[-1].actors
                 if a.type_id[:7] in ("vehicle", "walker.")
-                for l in [a._transform.location]
+                for place in [a._transform.location]
             ]
         )
         nearest = np.abs(places[:, None] - everybody[None]).max(-1).min(1)

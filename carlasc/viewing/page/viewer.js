@@ -56,7 +56,8 @@ class Viewer {
     const names = { grid: 'Grid', points: 'Points', flow: 'Flow', vehicle: 'Vehicle' };
     this.layerButtons = {};
     for (const [layer, label] of Object.entries(names)) {
-      if (layer === 'grid' && !this.scene.panels.length) continue;
+      const there = { grid: this.scene.panels.length > 0, points: this.scene.hasPoints, flow: this.scene.hasFlow, vehicle: true };
+      if (!there[layer]) continue;
       const button = toggleButton(label, this.layers[layer], (on) => this.setLayer(layer, on), { 'data-layer': layer });
       this.layerButtons[layer] = button;
       byId('layer-buttons').append(button);
@@ -71,7 +72,7 @@ class Viewer {
     this.legends = Object.entries(this.scene.tables).map(([name, classes]) => {
       const panels = this.scene.panels.map((panel, number) => ({ panel, number })).filter(({ panel }) => panel.table === name);
       const columns = panels.map(({ panel }) => (panels.length > 1 ? panel.title : 'voxels'));
-      const counted = name === this.scene.pointTable && panels.length < 2; // beside two grids there is no room for a third column
+      const counted = this.scene.hasPoints && name === this.scene.pointTable && panels.length < 2; // beside two grids there is no room for a third column
       if (counted) columns.push('points');
       const change = (table, id, on) => { this.panels.setClass(table, id, on); this.unpick(); };
       const legend = new Legend(name === 'errors' ? 'Errors' : 'Classes', name, classes, columns, change);
@@ -96,8 +97,8 @@ class Viewer {
       ArrowLeft: () => this.step(-1),
       ArrowRight: () => this.step(1),
       g: () => this.layerButtons.grid?.click(),
-      p: () => this.layerButtons.points.click(),
-      f: () => this.layerButtons.flow.click(),
+      p: () => this.layerButtons.points?.click(),
+      f: () => this.layerButtons.flow?.click(),
       1: () => this.look('behind'),
       2: () => this.look('top'),
       d: () => byId('theme').click(),

@@ -1,0 +1,61 @@
+"""The pictures of the documentation: a simulated street in the page and in the window. They stay in test-output/."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from helpers.browser import OUTPUT, Page
+from helpers.pixels import color_is_there
+from helpers.screens import virtual_screen
+
+from carlasc import regrid, simulate
+from carlasc.errors import CarlascError
+from carlasc.grids import GridSpec
+from carlasc.labels import CARLA
+from carlasc.viewing import make_page
+from carlasc.viewing.libraries import import_open3d
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("town") / "Train" / "Demo_Heavy"
+    simulate(folder, frames=2, sensors=6, traffic="heavy", points=60_000, bev=False, workers=1)
+    regrid(folder, None, GridSpec.published(), workers=1)
+    return folder / "cartesian"
+
+
+def test_the_page_of_a_street(browser, street, tmp_path):
+    page = Page(browser, make_page(street, tmp_path / "scene.html").out, (1280, 860))
+    page.run("carlasc.panels.setShadows(true)")
+    canvas = page.canvas("docs_page")
+    for name in ("Road", "Sidewalk", "Vehicle"):  # open, level faces in the sun have the legend's colours
+        assert color_is_there(canvas, CARLA.colors[CARLA.id_of(name)])
+    page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.look('top')")
+    above = page.canvas("docs_page_dark")
+    assert np.median(above.reshape(-1, 3)[:, 0]) < 140
+    assert page.complaints() == []
+
+
+def test_the_window_of_a_street(street):
+    try:
+        import_open3d()
+    except CarlascError as error:
+        pytest.skip(str(error))
+    OUTPUT.mkdir(exist_ok=True)
+    script = (
+        "import sys; from PIL import Image; from carlasc.viewing import Window, open_clip;"
+        "window = Window(open_clip(sys.argv[1]), size=(1280, 720)); Image.fromarray(window.picture()).save(sys.argv[2]); window.close()"
+    )
+    target = OUTPUT / "docs_window.png"
+    target.unlink(missing_ok=True)
+    with virtual_screen() as environment:
+        subprocess.run([sys.executable, "-c", script, street, target], env=environment, check=True, timeout=120)
+    from PIL import Image
+
+    picture = np.asarray(Image.open(target).convert("RGB"))
+    assert picture.shape == (720, 1280, 3)
+    for name in ("Road", "Sidewalk", "Vehicle"):
+        assert color_is_there(picture, CARLA.colors[CARLA.id_of(name)])
