@@ -134,12 +134,9 @@ def convert(
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, vote, merging))
     if asked and grids is not Grids.scans:
         raise ArgumentError(f"grid options are for --grids scans: expected none of them, found some with {grids.value}")
-    whole = (
-        None
-        if res or size
-        else preset or (Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse)
-    )
-    spec = parse_grid(res, size, whole, coordinates, bounds) if grids is Grids.scans else None
+    if preset is None and res is None and size is None:
+        preset = Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse
+    spec = parse_grid(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
     with progress_bar(f"convert {name}") as progress:
         result = convert_recordings(
             name,

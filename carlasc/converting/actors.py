@@ -128,7 +128,7 @@ def _follow(chase: _Chase) -> list[tuple[float, ...]]:
     """Return the actor's velocity in each of its frames, sensor frame; nothing where it goes nowhere."""
     sightings = [_points(chase, index) for index in range(len(chase.handles))]
     rigid = chase.label not in chase.classes.deformable
-    velocities = estimate_velocities(sightings, chase.poses[:, :3, 3], chase.seconds, rigid=rigid)
+    velocities = estimate_velocities(sightings, chase.seconds, rigid=rigid)
     if not chase.classes.moving:
         way = np.trapezoid(velocities, chase.seconds, axis=0)
         if np.linalg.norm(way) < _STANDING_M:

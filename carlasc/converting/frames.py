@@ -52,7 +52,7 @@ class Target:
             FormatError: an id is unknown; names it, and how often it stands.
         """
         lookup = self._lookup()
-        mapped = lookup[np.minimum(labels, _IDS - 1)]
+        mapped = lookup[labels if labels.dtype.itemsize <= 2 else np.minimum(labels, _IDS - 1)]
         if mapped.size and int(mapped.max()) == _UNKNOWN:
             unknown = mapped == _UNKNOWN
             if not self.allow_unknown:

@@ -1,25 +1,40 @@
-"""Scene flow from instances: how fast an actor is, from its points alone, in scans that number actors and have no flow."""
+"""Scene flow from instances: how fast an actor is, from its points alone, in scans that number actors and have no flow.
+
+Of a car that drives by one sees a flank for long, and points laid on points slide along it. So a rigid actor is followed from scan to scan: where it
+will be is predicted from its motion so far, and its points, laid on the planes of all that was seen of it before, correct the prediction
+only as far as those planes tell: across a flank, and along the way where its front or back is in sight.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.motion.registration import register, smooth
+from carlasc.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.motion.registration import smooth
 
 MIN_POINTS = 10  # fewer say too little; such a sighting inherits from its track
 _FASTEST_CHANGE_M_S2 = 6.0  # of velocity: hard braking, a sharp bend
 _WALK_S = 0.6  # half width of the window in which a person walks evenly
+_DRIVE_S = 0.5  # and a vehicle
+_POINTS = 300  # of a sighting are laid on the model
+_MODEL_CELL_M, _MODEL_POINTS = 0.15, 1200
+_PLANE_M = 0.5  # points so near each other tell a plane
+_ITERATIONS = 8
+_FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
+_POINT_M, _INDEPENDENT = 0.05, 60  # error of a point, and how many of a sighting count as errors of their own
+_PREDICTED = np.array(
+    [0.08, 0.08, 0.03, 0.01]
+)  # error of a prediction over one scan: x, y, z in metres, yaw in radians
+_UNKNOWN = 5.0  # so much greater it is while the motion is not known yet
+_GAIN = 0.3  # how fast the motion follows what was found
 
 
 def estimate_velocities(
-    sightings: Sequence[NDArray[np.float64]],
-    origins: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    *,
-    rigid: bool,
+    sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], *, rigid: bool
 ) -> NDArray[np.float64]:
     """Estimate the velocity of an actor at each of its sightings.
 
@@ -28,7 +43,6 @@ def estimate_velocities(
 
     Args:
         sightings: of each time, (M, 3) points of the actor, world.
-        origins: (F, 3) where the sensor was, world.
         seconds: (F,) times, rising.
         rigid: whether the actor keeps its shape.
 
@@ -39,23 +53,116 @@ def estimate_velocities(
     enough = np.flatnonzero(counts >= min(MIN_POINTS, counts.max(initial=0)))
     if len(enough) < 2:
         return np.zeros((len(sightings), 3))
-    chosen = [sightings[index] for index in enough.tolist()]
+    chosen, at, weights = [sightings[i] for i in enough.tolist()], seconds[enough], np.minimum(counts[enough], 200.0)
+    path = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in chosen])
     if rigid:
-        velocities = register(chosen, origins[enough], seconds[enough])[1]
-    else:
-        middles = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in chosen])
-        velocities = smooth(middles, seconds[enough], np.minimum(counts[enough], 200).astype(np.float64), _WALK_S)[1]
-    velocities = _bounded(velocities, seconds[enough], counts[enough])
-    return np.stack([np.interp(seconds, seconds[enough], velocities[:, axis]) for axis in range(3)], axis=1)
+        path = follow(chosen, at)
+    velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)[1]
+    velocities = _bounded(velocities, at, counts[enough])
+    return np.stack([np.interp(seconds, at, velocities[:, axis]) for axis in range(3)], axis=1)
+
+
+def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Register the sightings of a rigid actor that stands upright, outwards from the one that shows most of it.
+
+    Args:
+        sightings: of each time, (M, 3) points of the actor, world.
+        seconds: (F,) times, rising.
+
+    Returns:
+        (F, 3) middle of the actor, world.
+    """
+    counts = np.array([len(points) for points in sightings])
+    middles = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in sightings])
+    best = _best(counts)
+    states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
+    states[best, :3] = middles[best]
+    motion = np.append(smooth(middles, seconds, np.minimum(counts, 200.0))[1][best], 0.0)  # of these, a second
+    model = _thin(sightings[best] - middles[best])
+    seen = 0
+    for step, stop in ((1, len(counts)), (-1, -1)):
+        velocity, previous = motion, best
+        for index in range(best + step, stop, step):
+            elapsed = seconds[index] - seconds[previous]
+            predicted = states[previous] + velocity * elapsed
+            error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
+            points = sightings[index][:: -(-len(sightings[index]) // _POINTS)]
+            states[index] = _lay(points, model, _normals(model), predicted, error)
+            velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
+            motion = (
+                velocity if seen < _UNKNOWN and step == 1 else motion
+            )  # the way back starts with what is known by then
+            model = _thin(np.concatenate([model, transform_points(invert(_pose(states[index])), points)]))
+            previous, seen = index, seen + 1
+    middle = (np.quantile(model, 0.01, axis=0) + np.quantile(model, 0.99, axis=0)) / 2
+    return np.stack([transform_points(_pose(state), middle) for state in states])
+
+
+def _lay(
+    points: NDArray[np.float64],
+    model: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    error: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the state, near the predicted one, that lays points on the planes of the model."""
+    state = predicted.copy()
+    for iteration in range(_ITERATIONS):
+        reach = _FIRST_REACH_M * (_LAST_REACH_M / _FIRST_REACH_M) ** (iteration / (_ITERATIONS - 1))
+        pose = _pose(state)
+        nearest, squared = _nearest(transform_points(invert(pose), points), model)
+        pairs = np.flatnonzero(squared < reach**2)
+        information = np.diag(1 / error**2)
+        pull = information @ (predicted - state)
+        if len(pairs) >= 3:
+            arm = model[nearest[pairs]] @ pose[:3, :3].T
+            normal = normals[nearest[pairs]] @ pose[:3, :3].T
+            off = ((points[pairs] - pose[:3, 3] - arm) * normal).sum(axis=1)
+            turning = arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]
+            slope = np.column_stack([normal, turning])
+            robust = 1 / (1 + (off / (2 * _POINT_M)) ** 2)
+            weight = robust * min(1.0, _INDEPENDENT / len(pairs)) / _POINT_M**2
+            information = information + (slope * weight[:, None]).T @ slope
+            pull = pull + (slope * weight[:, None]).T @ off
+        state = state + np.linalg.solve(information, pull)
+    return state
+
+
+def _pose(state: NDArray[np.float64]) -> Transform:
+    pose = rotation_z(float(state[3]))
+    pose[:3, 3] = state[:3]
+    return pose
+
+
+def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Keep one point a cell, and at most so many."""
+    _, first = np.unique(np.floor(points / _MODEL_CELL_M).astype(np.int64), axis=0, return_index=True)
+    kept = points[np.sort(first)]
+    return kept[:: -(-len(kept) // _MODEL_POINTS)]
+
+
+def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (M, 3) normals of the planes around the model's points; the longer where the points around are flat.
+
+    A normal of length zero says that nothing is known: a lonely point, a line.
+    """
+    values, vectors = np.linalg.eigh(_covariances(model, _PLANE_M))
+    flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
+    flat[values[:, 1] < 1e-4] = 0.0
+    return vectors[:, :, 0] * np.sqrt(flat)[:, None]
+
+
+def _best(counts: NDArray[np.integer]) -> int:
+    """Return the sighting to start with: of many points, and not at an end of the track."""
+    inner = np.arange(len(counts))
+    return int(np.argmax(counts * np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)))
 
 
 def _bounded(
     velocities: NDArray[np.float64], seconds: NDArray[np.float64], counts: NDArray[np.integer]
 ) -> NDArray[np.float64]:
     """Let velocity change no faster than an actor can, going out from where it is known best: not at the ends of a track."""
-    inner = np.arange(len(counts))
-    best = int(np.argmax(counts * np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)))
-    bounded = velocities.copy()
+    best, bounded = _best(counts), velocities.copy()
     for step, stop in ((1, len(counts)), (-1, -1)):
         for index in range(best + step, stop, step):
             before = bounded[index - step]
@@ -64,3 +171,37 @@ def _bounded(
             length = float(np.linalg.norm(change))
             bounded[index] = before + change * min(1.0, most / length) if length > 0 else before
     return bounded
+
+
+@numba.njit(cache=True, nogil=True)
+def _covariances(model: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Return the (M, 3, 3) covariance of the points within a radius of each."""
+    covariances = np.zeros((len(model), 3, 3))
+    for i in range(len(model)):
+        count, total, square = 0, np.zeros(3), np.zeros((3, 3))
+        for j in range(len(model)):
+            dx, dy, dz = model[j, 0] - model[i, 0], model[j, 1] - model[i, 1], model[j, 2] - model[i, 2]
+            if dx * dx + dy * dy + dz * dz < radius * radius:
+                offset = (dx, dy, dz)
+                count += 1
+                for a in range(3):
+                    total[a] += offset[a]
+                    for b in range(3):
+                        square[a, b] += offset[a] * offset[b]
+        for a in range(3):
+            for b in range(3):
+                covariances[i, a, b] = square[a, b] / count - total[a] * total[b] / (count * count)
+    return covariances
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest(points: NDArray[np.float64], model: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the index of the model point nearest to each point, and the squared distance: all pairs, they are few."""
+    index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    for i in range(len(points)):
+        for j in range(len(model)):
+            dx, dy, dz = points[i, 0] - model[j, 0], points[i, 1] - model[j, 1], points[i, 2] - model[j, 2]
+            distance = dx * dx + dy * dy + dz * dz
+            if distance < squared[i]:
+                squared[i], index[i] = distance, j
+    return index, squared

@@ -1,0 +1,117 @@
+"""Ground truth of a converted SemanticKITTI drive, with and without traces: `python docs/studies/kitti.py [FOLDER]`.
+
+A simulated drive in heavy traffic is written as SemanticKITTI's files (right-handed, camera poses, moving classes, instances, no flow) and converted, and
+each rule's grids are scored against what 60 other sensors see at the same instant. `tube` is the rule by which SemanticKITTI's own voxels
+were made. Prints the table, and draws one scene by both rules beside the reference.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from functools import reduce
+from operator import add
+from pathlib import Path
+
+from PIL import Image
+
+import carlasc
+from carlasc import Grid, GridSpec
+from carlasc.converting import convert
+from carlasc.geometry import invert
+from carlasc.groundtruth import Observation, count_votes, regrid
+from carlasc.groundtruth.windows import Merging
+from carlasc.labels import CARLA
+from carlasc.metrics import TruthScore, score_truth
+from carlasc.rendering import ClassColors, Panel, draw_panels, grid_scene
+from carlasc.simulation import Drive
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+from helpers.kitti import write_kitti
+
+SEED, FRAMES, JUDGED = 1, range(101), (10, 30, 50, 70, 90)
+GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
+CLASSES = ("Vehicle", "Pedestrian", "Road", "Building", "Sidewalk")
+VEHICLE = CARLA.id_of("Vehicle")
+RUNS = {  # name: rule for what moves, and whether flow is estimated by the converter
+    "tube": ("tube", "none"),
+    "align, by instances": ("align", "none"),
+    "align, by instances and their estimated flow": ("align", "instances"),
+}
+
+
+def reference(drive: Drive, frame: int) -> dict[str, Grid]:
+    """Return what 60 sensors see at the instant of a frame, in each grid of the ego sensor."""
+    grid_T_world = invert(drive.sensor_poses(frame, 1)[0])
+    seen = drive.reference_observations(frame, 60)
+    observations = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in seen]
+    return {name: count_votes(observations, spec).to_grid() for name, spec in GRIDS.items()}
+
+
+def make(folder: Path, rule: str, name: str) -> dict[int, Grid]:
+    """Make the judged frames of a converted drive by one rule."""
+    grid = f"{rule}_{name.replace(' ', '')}"
+    for frame in JUDGED:
+        result = regrid(
+            folder,
+            None,
+            GRIDS[name],
+            name=f"{grid}_{frame}",
+            merging=Merging(dynamic=rule),
+            frames=(frame, frame + 1),
+            workers=1,
+        )  # type: ignore[arg-type]
+        if result.failures:
+            raise SystemExit(result.failures[0].message)
+    (sequence,) = carlasc.open(folder).sequences().values()
+    return {frame: sequence.grid(f"{grid}_{frame}", frame) for frame in JUDGED}
+
+
+def row(name: str, run: str, total: TruthScore) -> str:
+    """Return a row of the table."""
+    matrix = total.matrix
+    cells = [f"{matrix.iou[CARLA.id_of(label)]:.3f}" for label in CLASSES]
+    return (
+        f"| {name} | {run} | "
+        + " | ".join([*cells, f"{matrix.recall[VEHICLE]:.2f}", str(matrix.false_positives[VEHICLE])])
+        + " |"
+    )
+
+
+def main(out: Path) -> None:
+    """Convert, make grids by each rule, score them, draw one scene."""
+    drive = Drive(SEED, "heavy")
+    lines = [f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle |", "|---|---|" + "---:|" * 7]
+    with tempfile.TemporaryDirectory() as place:
+        write_kitti(Path(place) / "in", drive, FRAMES, voxels_every=0)
+        for flow in ("none", "instances"):
+            convert("kitti", Path(place) / "in", Path(place) / flow, grids="none", flow=flow, workers=2)  # type: ignore[arg-type]
+        truths = {frame: reference(drive, frame) for frame in JUDGED}
+        for name in GRIDS:
+            made = {run: make(Path(place) / flow, rule, name) for run, (rule, flow) in RUNS.items()}
+            for run, grids in made.items():
+                scores = (score_truth(grids[frame], truths[frame][name], CARLA.num_channels) for frame in JUDGED)
+                lines.append(row(name, run, reduce(add, scores)))
+                print(lines[-1], flush=True)
+        out.mkdir(parents=True, exist_ok=True)
+        draw(made, {frame: truth["0.2 m"] for frame, truth in truths.items()}, out / "kitti.png")
+    (out / "kitti.md").write_text("\n".join(lines) + "\n")
+
+
+def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) -> None:
+    """Draw the frame with the longest tubes: tube, align and reference side by side."""
+    tubes = made["tube"]
+    frame = max(
+        JUDGED, key=lambda f: int(score_truth(tubes[f], truths[f], CARLA.num_channels).matrix.false_positives[VEHICLE])
+    )
+    grids = {
+        "SemanticKITTI's rule (tube)": tubes[frame],
+        "carlasc convert (align)": made["align, by instances"][frame],
+        "reference: 60 sensors at that instant": truths[frame],
+    }
+    panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
+    Image.fromarray(draw_panels(panels, size=(1800, 640))).save(path)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/studies"))

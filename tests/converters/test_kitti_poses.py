@@ -1,0 +1,50 @@
+"""Poses from the scans alone."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.kitti import write_kitti
+from helpers.tiny_kitti import write_tiny_kitti
+
+import carlasc
+from carlasc import layout
+from carlasc.converting import convert
+from carlasc.simulation import Drive
+from carlasc.simulation.lidar import Lidar
+
+pytest.importorskip("kiss_icp")
+SEQUENCE = "Train/KITTI_00/cartesian"
+
+
+@pytest.mark.slow
+def test_kiss_icp_drifts_less_than_1_percent_over_100_m_of_a_drive_from_rest(tmp_path):
+    """A town with cross streets and trees, no deskewing; every other scan, which is harder and takes half the time."""
+    truth = write_kitti(tmp_path / "in", Drive(3, "light", Lidar(channels=32, points=20_000)), range(0, 190, 2), voxels_every=0)
+    (truth.folder / "poses.txt").unlink()
+    seen = []
+    options = {"grids": "none", "flow": "none", "frame": "kitti", "workers": 1}
+    convert("kitti", tmp_path / "in", tmp_path / "out", progress=lambda *step: seen.append(step), **options)
+    folder = tmp_path / "out" / SEQUENCE
+    poses = layout.decode_poses((folder / "poses.txt").read_bytes(), "poses")
+    steps = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)
+    assert steps[0] < 0.1
+    assert steps.sum() > 100
+    assert np.linalg.norm(poses[-1, :3, 3] - truth.poses[-1, :3, 3]) < 0.01 * steps.sum()
+    assert json.loads((folder / "carlasc.json").read_text())["poses"] == "kiss-icp"
+    assert seen[-1] == (190, 190)  # a step for each frame's odometry, one for its conversion
+
+
+def test_estimated_poses_are_estimated_once(tmp_path):
+    folder = write_tiny_kitti(tmp_path / "in", points=200)
+    (folder / "poses.txt").unlink()
+    (folder / "velodyne" / "000001.bin").write_bytes(b"")  # cannot be read: it gets the pose of the one before
+    options = {"grids": "none", "flow": "none", "workers": 1}
+    first = convert("kitti", tmp_path / "in", tmp_path / "out", **options)
+    assert [failure.frame for failure in first.failures] == [1]
+    poses = carlasc.open(tmp_path / "out").sequences()[SEQUENCE].poses
+    assert len(poses) == 3
+    assert np.array_equal(poses[0], poses[1])
+    steps = []
+    convert("kitti", tmp_path / "in", tmp_path / "out", progress=lambda *step: steps.append(step), **options)
+    assert steps[-1] == (3, 3)  # no odometry this time

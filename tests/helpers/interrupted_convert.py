@@ -1,0 +1,31 @@
+"""Runs `carlasc convert` and sends its whole process group a signal after so many frames: `python interrupted_convert.py SIGNAL FRAMES ARGS...`
+
+A terminal does the same when somebody presses Ctrl-C: every process of the group gets SIGINT.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import carlasc.cli.convert as command
+from carlasc.cli import main
+
+
+@contextmanager
+def interrupting_bar(description: str) -> Iterator[Callable[[int, int], None]]:
+    def interrupt(done: int, total: int) -> None:
+        if done >= frames:
+            os.killpg(os.getpgrp(), number)
+
+    yield interrupt
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    number, frames = signal.Signals[sys.argv.pop(1)], int(sys.argv.pop(1))
+    command.progress_bar = interrupting_bar  # type: ignore[assignment]
+    main()
