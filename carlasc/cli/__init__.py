@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from typing import Annotated
+from collections.abc import Iterator, MutableMapping
+from typing import Annotated, Any
 
 import typer
 
@@ -28,12 +29,54 @@ _COMMANDS = (  # in the order of `--help`: the order in which a newcomer needs t
     "capture",
 )
 
+_SETTINGS: dict[str, Any] = {
+    "pretty_exceptions_enable": False,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+
+
+class _Commands(MutableMapping[str, Any]):
+    """The commands by name; a command's file is loaded when it is asked for: reading all of them takes as long as `--help` may."""
+
+    def __init__(self) -> None:
+        self._loaded: dict[str, Any] = {
+            name: None for name in _COMMANDS if importlib.util.find_spec(f"carlasc.cli.{name}")
+        }
+
+    def __getitem__(self, name: str) -> Any:
+        if self._loaded[name] is None:
+            alone = typer.Typer(add_completion=False, **_SETTINGS)
+            alone.command(name)(getattr(importlib.import_module(f"carlasc.cli.{name}"), name))
+            self._loaded[name] = typer.main.get_command(alone)
+        return self._loaded[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._loaded[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._loaded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._loaded)
+
+    def __len__(self) -> int:
+        return len(self._loaded)
+
+
+class _Group(CommandGroup):
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.commands = _Commands()
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.commands)
+
+
 app = typer.Typer(
     name="carlasc",
-    cls=CommandGroup,
+    cls=_Group,
     no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    **_SETTINGS,
     help="Read, convert, regenerate and train on CarlaSC: complete, trace-free semantic scenes.",
 )
 
@@ -53,11 +96,6 @@ def _root(
     ] = False,
 ) -> None:
     pass
-
-
-for _name in _COMMANDS:
-    if importlib.util.find_spec(f"carlasc.cli.{_name}"):
-        app.command(_name)(getattr(importlib.import_module(f"carlasc.cli.{_name}"), _name))
 
 
 def main() -> None:
