@@ -112,7 +112,7 @@ def draw_town() -> bytes:
         _ground_truth(spec),
         REMAPS["carlasc11"].target,
         size=(1280, 720),
-        viewpoint=Viewpoint.parse("azimuth=28 elevation=35 distance=64"),
+        viewpoint=Viewpoint.parse("azimuth=28 elevation=35 distance=80 target=-2,0,-2.5"),
     )
     return _png(picture)
 

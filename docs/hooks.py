@@ -112,15 +112,15 @@ def _default(default: Any, info: ParameterInfo) -> str:
 
 
 def _layout() -> str:
-    rows = ["| file | field | type | shape | unit | | |", "|---|---|---|---|---|---|---|"]
+    rows = ["| file | field | what it holds |", "|---|---|---|"]
     grid = [layout.field_named(f"{layout.EVALUATION}/{part}") for part in layout.GRID_FIELDS]
     for field in (*layout.SCAN_FIELDS.values(), *grid):
         shape = "(X, Y, Z)" if field.name.endswith(("/labels", "/counts")) else "(N,)"
         shape = shape if field.columns is None else f"(N, {field.columns})"
-        kind = {"<f4": "float32", "<u4": "uint32", "u1": "bytes", "": "npz"}[field.dtype]
-        cells = [f"`{field.file(0)}`", f"`{field.name}`", kind, "" if kind in ("bytes", "npz") else shape]
-        cells += [field.unit, _escape(field.meaning), "" if field.published else "ours"]
-        rows.append(f"| {' | '.join(cells)} |")
+        kind = {"<f4": f"float32 {shape}", "<u4": f"uint32 {shape}", "u1": "bytes", "": "npz"}[field.dtype]
+        unit = f", {field.unit}" if field.unit in ("m", "m/s") else ""
+        ours = "" if field.published else " *(ours)*"
+        rows.append(f"| `{field.file(0)}` | `{field.name}` | {kind}{unit}: {_escape(field.meaning)}{ours} |")
     return "\n".join(rows)
 
 
