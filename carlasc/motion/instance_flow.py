@@ -26,10 +26,9 @@ _PLANE_M = 0.5  # points so near each other tell a plane
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
 _POINT_M, _INDEPENDENT = 0.05, 60  # error of a point, and how many of a sighting count as errors of their own
-_PREDICTED = np.array(
-    [0.08, 0.08, 0.03, 0.01]
-)  # error of a prediction over one scan: x, y, z in metres, yaw in radians
+_PREDICTED = np.array([0.2, 0.2, 0.05, 0.02])  # error of a prediction over a scan: x, y, z in metres, yaw in radians
 _UNKNOWN = 5.0  # so much greater it is while the motion is not known yet
+_ROBUST = 0.3  # of the reach: pairs farther off their plane count less and less
 _GAIN = 0.3  # how fast the motion follows what was found
 
 
@@ -120,7 +119,7 @@ def _lay(
             off = ((points[pairs] - pose[:3, 3] - arm) * normal).sum(axis=1)
             turning = arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]
             slope = np.column_stack([normal, turning])
-            robust = 1 / (1 + (off / (2 * _POINT_M)) ** 2)
+            robust = 1 / (1 + (off / max(2 * _POINT_M, _ROBUST * reach)) ** 2)
             weight = robust * min(1.0, _INDEPENDENT / len(pairs)) / _POINT_M**2
             information = information + (slope * weight[:, None]).T @ slope
             pull = pull + (slope * weight[:, None]).T @ off

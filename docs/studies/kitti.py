@@ -95,7 +95,7 @@ def main(out: Path) -> None:
                 print(lines[-1], flush=True)
         out.mkdir(parents=True, exist_ok=True)
         draw(made, {frame: truth["0.2 m"] for frame, truth in truths.items()}, out / "kitti.png")
-    (out / "kitti.md").write_text("\n".join(lines) + "\n")
+    Path(__file__).with_suffix(".md").write_text("\n".join(lines) + "\n")
 
 
 def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) -> None:
@@ -110,8 +110,9 @@ def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) 
         "reference: 60 sensors at that instant": truths[frame],
     }
     panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
-    Image.fromarray(draw_panels(panels, size=(1800, 640))).save(path)
+    picture = Image.fromarray(draw_panels(panels, size=(1800, 640)))
+    picture.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/studies"))
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images"))

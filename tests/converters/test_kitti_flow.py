@@ -7,7 +7,6 @@ from helpers.kitti import write_kitti
 import carlasc
 from carlasc.converting import convert
 from carlasc.simulation import Drive
-from carlasc.simulation.lidar import Lidar
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 MIRROR = np.array([1, -1, 1], np.float32)
@@ -15,7 +14,7 @@ MIRROR = np.array([1, -1, 1], np.float32)
 
 @pytest.mark.slow
 def test_flow_of_moving_vehicles_is_right_and_that_of_everything_static_exactly_zero(tmp_path):
-    truth = write_kitti(tmp_path / "in", Drive(7, "heavy", Lidar(points=60_000)), range(200, 232))
+    truth = write_kitti(tmp_path / "in", Drive(7, "heavy"), range(200, 222), voxels_every=0)
     result = convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", workers=2)
     assert not result.failures
     sequence = carlasc.open(tmp_path / "out").sequences()[SEQUENCE]
@@ -29,7 +28,7 @@ def test_flow_of_moving_vehicles_is_right_and_that_of_everything_static_exactly_
             assert (scan.flow[own] == scan.flow[own[0]]).all()
             if len(own) >= 100 and 5 <= np.linalg.norm(flow[own[0]]) <= 12:
                 errors.append(np.linalg.norm(scan.flow[own[0]] - flow[own[0]]))
-    assert len(errors) > 60
+    assert len(errors) > 30
     assert np.median(errors) < 0.15
 
 
