@@ -20,7 +20,7 @@ from carlasc.sources.base import Sequence
 
 _FASTEST_M_S, _SHARPEST_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster: its poses jump
 # Points on a square metre that outweigh one scan which saw free space there.
-_STANDING_POINTS_M2, _MOVABLE_POINTS_M2 = 3.0, 24.0
+_STANDING_POINTS_M2, _MOVABLE_POINTS_M2 = 3.0, 32.0
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 DEFAULT_ELEVATION_RAD = np.deg2rad(42.0)
 DEFAULT_FOV_RAD = np.deg2rad(32.0)
 
+_NEAREST_M = 1.0
+
 
 @dataclass(frozen=True)
 class Viewpoint:
@@ -208,6 +210,8 @@ def _axes(forward: Floats, left_handed: bool, azimuth: float = 0.0) -> Floats:
 def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[float, tuple[float, float]]:
     """Return the least distance, and the shift along right and up, from which all points are inside the picture.
 
+    No point comes nearer than `_NEAREST_M`: a very wide angle would have the camera stand in the scene's corner.
+
     A point at (x, y, z) along right, up and forward is inside when |y - shift| <= tan_y (distance + z): two lines an axis.
     """
     x, y, z = axes @ points.T
@@ -216,4 +220,4 @@ def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[floa
         above, below = (across - tangent * z).max(), (-across - tangent * z).max()
         distances.append((above + below) / (2 * tangent))
         shifts.append((above - below) / 2)
-    return float(max(*distances, 0.1)), (float(shifts[0]), float(shifts[1]))
+    return float(max(*distances, _NEAREST_M - z.min())), (float(shifts[0]), float(shifts[1]))

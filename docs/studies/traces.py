@@ -9,6 +9,8 @@ from __future__ import annotations
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,10 @@ import carlasc
 from carlasc import Grid, GridSpec, layout
 from carlasc.geometry import invert, relative_to
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.groundtruth.windows import Merging
+from carlasc.groundtruth.inputs import Recipe
+from carlasc.groundtruth.scans import ScanFrame
+from carlasc.groundtruth.voting import VoteRule
+from carlasc.groundtruth.windows import Merging, ScanFeed
 from carlasc.labels import CARLA
 from carlasc.metrics import TruthScore, score_truth
 from carlasc.rendering import ClassColors, Panel, draw_panels, grid_scene
@@ -39,15 +44,13 @@ class Run:
     name: str
     field: str  # what tells how things move
     merging: Merging
-    vote: str | None = None
+    vote: VoteRule = "point"
 
 
 RUNS = (
     Run("tube", "flow", Merging(dynamic="tube")),
-    Run("drop", "flow", Merging(dynamic="drop")),
     Run("current", "flow", Merging(dynamic="current")),
     Run("current, plain votes", "flow", Merging(dynamic="current"), "sensor"),
-    Run("align, plain votes", "flow", Merging(), "sensor"),
     Run("align", "flow", Merging()),
     Run("align, by instances", "instances", Merging()),
 )
@@ -77,34 +80,21 @@ def reference(drive: Drive, frame: int, spec: GridSpec) -> Grid:
     return count_votes(observations, spec).to_grid()
 
 
-def score(run: Run, folder: Path, name: str, spec: GridSpec, truths: dict[int, Grid]) -> TruthScore:
-    """Make the judged frames in one way, and score them."""
-    sequence = folder / run.field
-    total = None
+def make(run: Run, folder: Path) -> dict[str, dict[int, Grid]]:
+    """Make the judged frames in one way: by grid, by frame."""
+    sequence = next(iter(carlasc.open(folder / run.field).sequences().values()))
+    feed = ScanFeed(sequence, run.merging)
+    grids: dict[str, dict[int, Grid]] = {name: {} for name in GRIDS}
     for frame in JUDGED:
-        options = {
-            "observations": "scans",
-            "merging": run.merging,
-            "vote": run.vote,
-            "workers": 1,
-            "name": folder_of(run, name),
-        }
-        carlasc.regrid(sequence, None, spec, frames=(frame, frame + 1), **options)
-        grid = load(sequence, run, name, frame)
-        one = score_truth(grid, truths[frame], CARLA.num_channels)
-        total = one if total is None else total + one
-    assert total is not None
-    return total
+        for name, spec in GRIDS.items():
+            recipe = Recipe(spec, "evaluation", CARLA, run.vote, 1.5, keep_votes=False)
+            grids[name][frame] = ScanFrame(feed, frame, frame).make(recipe).grid
+    return grids
 
 
-def folder_of(run: Run, name: str) -> str:
-    """Return the folder of a run's grids."""
-    return f"{run.name}_{name}".replace(" ", "_").replace(",", "")
-
-
-def load(sequence: Path, run: Run, name: str, frame: int) -> Grid:
-    """Read a grid that a run has made."""
-    return next(iter(carlasc.open(sequence).sequences().values())).grid(folder_of(run, name), frame)
+def score(grids: dict[int, Grid], truths: dict[int, Grid]) -> TruthScore:
+    """Score grids against the references of their frames."""
+    return reduce(add, (score_truth(grids[frame], truths[frame], CARLA.num_channels) for frame in JUDGED))
 
 
 def row(name: str, total: TruthScore, tube: TruthScore) -> str:
@@ -121,10 +111,11 @@ def study(seed: int, folder: Path, out: Path) -> list[str]:
     """Return the tables of one drive; draw its picture."""
     drive = Drive(seed, "heavy")
     record_drive(drive, folder)
+    made = {run.name: make(run, folder) for run in RUNS}
     lines = []
     for name, spec in GRIDS.items():
         truths = {frame: reference(drive, frame, spec) for frame in JUDGED}
-        scores = {run.name: score(run, folder, name, spec, truths) for run in RUNS}
+        scores = {run: score(grids[name], truths) for run, grids in made.items()}
         lines += ["", f"Seed {seed}, {name}:", ""]
         lines += [
             f"| rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle | coverage |",
@@ -132,21 +123,20 @@ def study(seed: int, folder: Path, out: Path) -> list[str]:
         ]
         lines += [row(run, total, scores["tube"]) for run, total in scores.items()]
         if name == "0.2 m":
-            draw(folder, truths, out / f"traces_{seed}.png")
+            draw({run: grids[name] for run, grids in made.items()}, truths, out / f"traces_{seed}.png")
     return lines
 
 
-def draw(folder: Path, truths: dict[int, Grid], path: Path) -> None:
+def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) -> None:
     """Draw the frame with the longest tubes: tube, align and reference side by side."""
-    runs = {run.name: run for run in RUNS}
-    tubes = {frame: load(folder / "flow", runs["tube"], "0.2 m", frame) for frame in JUDGED}
+    tubes = made["tube"]
     wrong = {
         f: int(((tubes[f].labels == VEHICLE) & (truths[f].labels != VEHICLE) & truths[f].known).sum()) for f in JUDGED
     }
     frame = max(JUDGED, key=lambda f: wrong[f])
     grids = {
         "SemanticKITTI's rule (tube)": tubes[frame],
-        "carlasc (align)": load(folder / "flow", runs["align"], "0.2 m", frame),
+        "carlasc (align)": made["align"][frame],
         "reference: 60 sensors at that instant": truths[frame],
     }
     panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]

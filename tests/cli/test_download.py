@@ -58,7 +58,10 @@ def test_ctrl_c_keeps_what_came_and_the_next_run_goes_on(tmp_path: Path) -> None
     with serve(Site({ZIP: content})) as site:
         site.before = lambda number: time.sleep(0.5 if number > 2 else 0)
         arguments = ["download", "--split", "val", "--to", str(tmp_path), "--base-url", site.url, "--connections", "1"]
-        command = [sys.executable, "-m", "carlasc", *arguments]
+        listen = (
+            "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background job ignores it
+        )
+        command = [sys.executable, "-c", f"{listen}; from carlasc.cli import main; main()", *arguments]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         record = tmp_path / "val_cartesian.zip.part.json"
         deadline = time.monotonic() + 60

@@ -25,6 +25,7 @@ def interrupting_bar(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     number, frames = signal.Signals[sys.argv.pop(1)], int(sys.argv.pop(1))
     command.progress_bar = interrupting_bar  # type: ignore[assignment]
     main()

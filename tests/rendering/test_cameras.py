@@ -20,7 +20,7 @@ def test_a_fitted_camera_sees_the_whole_scene_and_fills_the_picture(azimuth, ele
     assert columns.min() > -1 and columns.max() < round(1000 * aspect) + 1
     assert rows.min() > -1 and rows.max() < 1001
     spans = np.ptp(columns) / round(1000 * aspect), np.ptp(rows) / 1000
-    assert max(spans) > 0.95
+    assert max(spans) > 0.95 or depths.min() == pytest.approx(1.0)  # nearer it does not come
 
 
 @given(angles, st.floats(-1.5, 1.5), st.booleans())
