@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import operator
 import os
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
@@ -290,28 +291,34 @@ def collate(samples: list[Sample]) -> dict[str, Any]:
     return {name: ragged[name] if name in ragged else batch[name] for name in samples[0]}
 
 
-class _RecentScans:
-    """The scans read last, decoded, in one process: frames taken in order share all but one with the frame before."""
+class _RecentScans(threading.local):
+    """The scans that a thread read last, decoded: frames taken in order share all but one with the frame before.
+
+    What is dropped is memory for what comes next, so scans are for the reading thread alone.
+    """
 
     def __init__(self, capacity: int) -> None:
+        super().__init__()
         self.capacity = capacity
         self._scans: OrderedDict[tuple[Sequence, int], NDArray[np.float32]] = OrderedDict()
 
     def read(self, sequence: Sequence, frames: list[int | None]) -> list[NDArray[np.float32] | None]:
-        """Return the (N, 4) points of each frame, None for None; what is not at hand is read in one go."""
-        missing = [frame for frame in frames if frame is not None and (sequence, frame) not in self._scans]
-        read = dict(zip(missing, sequence.read_many("points", missing), strict=True)) if missing else {}
-        scans: list[NDArray[np.float32] | None] = []
-        for frame in frames:
-            if frame is None:
-                scans.append(None)
-                continue
-            points = read[frame] if frame in read else self._scans.pop((sequence, frame))
-            self._scans[sequence, frame] = points
-            scans.append(points)
-        while len(self._scans) > self.capacity:
-            self._scans.popitem(last=False)
-        return scans
+        """Return the points of each frame as `Sequence.read_xyz` does, None for None, good until the next call.
+
+        What is not at hand is read in one go.
+        """
+        wanted = [(sequence, frame) for frame in frames if frame is not None]
+        for key in wanted:
+            if key in self._scans:
+                self._scans.move_to_end(key)
+        missing = [key for key in wanted if key not in self._scans]
+        spare = []
+        while self._scans and len(self._scans) + len(missing) > self.capacity:
+            spare.append(self._scans.popitem(last=False)[1])
+        if missing:
+            read = sequence.read_xyz([frame for _, frame in missing], spare)
+            self._scans.update(zip(missing, read, strict=True))
+        return [None if frame is None else self._scans[sequence, frame] for frame in frames]
 
 
 class _Labelling:

@@ -38,7 +38,8 @@ def stack_scans(
     """Bin scans into a stack of grids.
 
     Args:
-        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame; None leaves its grid empty.
+        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, rows or the transpose of contiguous x, y and z;
+            None leaves its grid empty.
         grid_T_scans: (T, 4, 4) transforms from each scan's frame to the grid's.
         spec: the grid.
         what: "occupancy" marks voxels that hold a point, "density" counts their points (65535 at most).
@@ -54,7 +55,12 @@ def stack_scans(
     rows = grid_T_scans[:, :3].reshape(-1, 12).tolist()
     for grid, points, row in zip(stack.reshape(len(scans), -1), scans, rows, strict=True):
         if points is not None and len(points):
-            _bin_scan(_as_words(points), tuple(row), geometry, ranges, grid)
+            planes = points[:, :3].T
+            if planes.flags.aligned and planes.strides[1] == planes.itemsize and points.dtype == np.float32:
+                x, y, z = map(_read_only, planes)
+                _bin_planes(x, y, z, tuple(row), geometry, ranges, grid)
+            else:
+                _bin_rows(_as_words(points), tuple(row), geometry, ranges, grid)
     return stack
 
 
@@ -100,6 +106,14 @@ def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
         x[n] = np.uint32(xy).view(np.float32)
         y[n] = np.uint32(xy >> np.uint64(32)).view(np.float32)
         z[n] = np.uint32(zw).view(np.float32)
+
+
+@_step
+def _copy_columns(xs, ys, zs, x, y, z):  # type: ignore[no-untyped-def]
+    for n in range(len(xs)):
+        x[n] = xs[n]
+        y[n] = ys[n]
+        z[n] = zs[n]
 
 
 @_step
@@ -190,28 +204,43 @@ def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
                 grid[cells[n]] += 1
 
 
+@_step
+def _bin_block(x, y, z, radius, azimuth, cells, count, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    near, far = ranges
+    if near > 0.0 or far < np.inf:
+        _leave_out(x, y, z, count, near * near, far * far)
+    _move(x, y, z, count, rows)
+    if geometry[5]:
+        _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1], radius, azimuth)
+        doubtful = _find_cells(radius, azimuth, z, count, geometry, cells)
+    else:
+        doubtful = _find_cells(x, y, z, count, geometry, cells)
+    for n in range(count if doubtful else 0):
+        if cells[n] == -2:
+            cells[n] = _find_cell(x[n], y[n], z[n], geometry)
+    _mark(cells, count, grid)
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _bin_scan(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+def _bin_rows(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
     x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
     cells = np.empty(_BLOCK, np.int32)
-    near, far = ranges
     for start in range(0, len(words), 2 * _BLOCK):
         block = words[start : start + 2 * _BLOCK]
-        count = len(block) // 2
         _split_columns(block, x, y, z)
-        if near > 0.0 or far < np.inf:
-            _leave_out(x, y, z, count, near * near, far * far)
-        _move(x, y, z, count, rows)
-        if geometry[5]:
-            _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1], radius, azimuth)
-            doubtful = _find_cells(radius, azimuth, z, count, geometry, cells)
-        else:
-            doubtful = _find_cells(x, y, z, count, geometry, cells)
-        for n in range(count if doubtful else 0):
-            if cells[n] == -2:
-                cells[n] = _find_cell(x[n], y[n], z[n], geometry)
-        _mark(cells, count, grid)
+        _bin_block(x, y, z, radius, azimuth, cells, len(block) // 2, rows, geometry, ranges, grid)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _bin_planes(xs, ys, zs, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    cells = np.empty(_BLOCK, np.int32)
+    for start in range(0, len(xs), _BLOCK):
+        xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
+        _copy_columns(xb, yb, zb, x, y, z)
+        _bin_block(x, y, z, radius, azimuth, cells, len(xb), rows, geometry, ranges, grid)
 
 
 @numba.njit(nogil=True, cache=True)

@@ -3,6 +3,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -319,6 +320,17 @@ def test_a_packed_store_gives_the_samples_of_the_files(world, tmp_path, ending, 
     for i in (5, 0, 12, 7):
         for name, value in plain[i].items():
             np.testing.assert_array_equal(packed[i][name], value)
+
+
+def test_threads_that_share_a_dataset_do_not_write_over_each_other(world, tmp_path):
+    pytest.importorskip("zarr")
+    pack(world, tmp_path / "packed.zarr")
+    dataset = Dataset(tmp_path / "packed.zarr", history=3)
+    alone = [dataset[i]["occupancy"] for i in range(len(dataset))]
+    order = np.random.default_rng(0).integers(0, len(dataset), 200).tolist()
+    with ThreadPoolExecutor(4) as pool:
+        for i, sample in zip(order, pool.map(dataset.__getitem__, order), strict=True):
+            np.testing.assert_array_equal(sample["occupancy"], alone[i])
 
 
 def test_scans_read_in_order_are_read_once(world, monkeypatch):

@@ -114,7 +114,16 @@ def test_density_stops_at_the_largest_uint16_instead_of_wrapping():
 
 
 @pytest.mark.parametrize(
-    "layout", ["columns of another order", "three columns", "every second row", "unaligned", "float64"]
+    "layout",
+    [
+        "columns of another order",
+        "three columns",
+        "every second row",
+        "unaligned",
+        "float64",
+        "planes",
+        "padded planes",
+    ],
 )
 def test_points_in_any_memory_layout_bin_alike(layout):
     points, spec = random_points(np.random.default_rng(5), 801), GridSpec.published()
@@ -126,6 +135,8 @@ def test_points_in_any_memory_layout_bin_alike(layout):
         "every second row": np.repeat(points, 2, axis=0)[::2],
         "unaligned": unaligned,
         "float64": points.astype(np.float64),
+        "planes": np.ascontiguousarray(points[:, :3].T).T,
+        "padded planes": np.pad(points[:, :3].T, [(0, 0), (0, 200)])[:, :801].T,
     }[layout]
     np.testing.assert_array_equal(stack_scans([same], bend(3)[2:], spec), truth)
 

@@ -18,7 +18,7 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc.grids import Coordinates
 from carlasc.sources.base import Sequence
 from carlasc.sources.chunks import StoredArray, parallel, scratch
-from carlasc.sources.packed import VERSION, Column, PackedSource, Packing, packing_of
+from carlasc.sources.packed import VERSION, Column, PackedSource, Packing, Points, packing_of
 
 STORE, SEQUENCE, FIELD, COLUMN, DOCUMENT = (
     "carlasc.store",
@@ -119,6 +119,12 @@ class ArraySequence(Sequence):
         """Read several frames: fetched in one go, decoded side by side."""
         return self._field(field).read(list(frames))
 
+    def read_xyz(
+        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Read points as they are stored, as planes: the 4th column is not looked for, and nothing is put into rows."""
+        return self._field("points").read_planes(list(frames), spare or [])
+
     def documents(self) -> tuple[str, ...]:
         """Return the text files that are there."""
         return self._documents
@@ -177,12 +183,7 @@ class _PackedField:
     def read(self, frames: list[int]) -> list[NDArray[Any]]:
         """Read frames: from a remote store all their chunks at once, then frame by frame, side by side."""
         positions = [self._position(frame) for frame in frames]
-        tasks = {name: column.tasks(positions) for name, column in self.columns.items()}
-        if not self.local:
-            with self._naming(frames):
-                for name, column in self.columns.items():
-                    column.fetch(tasks[name])
-
+        tasks = {name: self._tasks(column, frames) for name, column in self.columns.items()}
         main = self.columns.get(self.packing.columns[0].name)
         rooms = self.packing.make_room([main.count(position) if main else 0 for position in positions])
 
@@ -194,6 +195,28 @@ class _PackedField:
                 )
 
         return parallel(assemble, range(len(frames)))
+
+    def read_planes(self, frames: list[int], spare: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        """Read the points of frames as (N, 3), each coordinate contiguous, into the memory of `spare` as far as that goes."""
+        packing, column = cast(Points, self.packing), self.columns.get("xyz")
+        if column is None:
+            return [np.empty((0, 3), np.float32) for _ in frames]
+        tasks = self._tasks(column, frames)
+        rooms = [column.room_for(task, spare) for task in tasks]
+
+        def decode(k: int) -> NDArray[np.float32]:
+            with self._naming([frames[k]]):
+                return packing.to_metres(column.decode(tasks[k], rooms[k])).T
+
+        return parallel(decode, range(len(frames)))
+
+    def _tasks(self, column: _StoredColumn, frames: list[int]) -> list[_Task]:
+        """Return what is to be read of a column; from a remote store, already fetched."""
+        tasks = column.tasks([self._position(frame) for frame in frames])
+        if not self.local:
+            with self._naming(frames):
+                column.fetch(tasks)
+        return tasks
 
     @contextmanager
     def _naming(self, frames: list[int]) -> Iterator[None]:
@@ -260,21 +283,31 @@ class _StoredColumn:
         for task in tasks:
             task.fetched = [next(parts) for _ in task.chunks]
 
-    def decode(self, task: _Task) -> NDArray[Any]:
-        """Decode a frame's chunks."""
+    def room_for(self, task: _Task, spare: list[NDArray[Any]]) -> NDArray[Any]:
+        """Return memory to decode a frame into: that of a spare array that came from here, else fresh (whose pages take longer to touch)."""
+        shape = (self.column.rows or 1, len(task.chunks) * self.array.step)
+        while spare:
+            memory = spare.pop().base
+            if isinstance(memory, np.ndarray) and memory.shape == shape and memory.dtype == self.array.dtype:
+                return memory
+        return np.empty(shape, self.array.dtype)
+
+    def decode(self, task: _Task, room: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Decode a frame's chunks, into `room` if it is given."""
         parts = task.fetched if task.fetched is not None else self.array.fetch(task.chunks)
         if self.is_grid:
             return self._decode_chunk(parts[0], task.chunks[0], np.empty(self.array.chunk, self.array.dtype))[0]
         step, rows = self.array.step, self.column.rows or 1
         shape, dtype = (rows, len(parts) * step), self.array.dtype
-        whole = scratch(shape, dtype) if self.column.scratch else np.empty(shape, dtype)
+        if room is None:
+            room = scratch(shape, dtype) if self.column.scratch else np.empty(shape, dtype)
         if len(parts) == 1:  # the rule: decode into place
-            self._decode_chunk(parts[0], task.chunks[0], whole.reshape(self.array.chunk))
+            self._decode_chunk(parts[0], task.chunks[0], room.reshape(self.array.chunk))
         else:
             chunk = np.empty(self.array.chunk, dtype)
             for place, (number, part) in enumerate(zip(task.chunks, parts, strict=True)):
-                whole[:, place * step : (place + 1) * step] = self._decode_chunk(part, number, chunk)
-        values = whole[:, : task.count]
+                room[:, place * step : (place + 1) * step] = self._decode_chunk(part, number, chunk)
+        values = room[:, : task.count]
         return values if self.column.rows else values[0]
 
     def _decode_chunk(self, part: memoryview, number: int, out: NDArray[Any]) -> NDArray[Any]:

@@ -129,6 +129,20 @@ class Sequence(ABC):
         """Read one field of several frames; stores that can do so read them in one go."""
         return [self.read(field, frame) for frame in frames]
 
+    def read_xyz(
+        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Read where the points of several frames are, laid out in memory as the store has them: to be read, not to be kept.
+
+        Args:
+            frames: their numbers.
+            spare: what earlier calls returned and nobody looks at any more: the store may write over it.
+
+        Returns:
+            (N, 3) or (N, 4) float32 metres of each frame: rows, or the transpose of contiguous x, y and z.
+        """
+        return self.read_many("points", frames)
+
     @cached_property
     def metadata(self) -> Metadata:
         """What carlasc.json says, or the defaults."""

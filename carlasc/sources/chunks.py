@@ -27,9 +27,7 @@ _T = TypeVar("_T")
 _R = TypeVar("_R")
 
 NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
-BLOCK = (
-    1 << 19
-)  # bytes that Blosc compresses in one go: a scan in several, which its threads share; smaller ones cost size
+BLOCK = 1 << 21  # bytes that Blosc compresses in one go: a whole scan, where smaller blocks cost size
 
 
 @dataclass(frozen=True)
@@ -152,6 +150,15 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     if len(items) < 2 or multiprocessing.parent_process() is not None:
         return [function(item) for item in items]
     return list(_pool(os.getpid()).map(function, items))
+
+
+def crc32c(data: bytes | memoryview, extra: str) -> int:
+    """Return the CRC-32C of some bytes, which processors have an instruction for: six times as fast as CRC-32."""
+    source = data.obj if isinstance(data, memoryview) else data
+    whole = (
+        source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
+    )  # the library takes bytes only
+    return int(import_extra("google_crc32c", extra).value(whole))
 
 
 def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:

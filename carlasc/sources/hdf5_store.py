@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,13 +19,13 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extra
 from carlasc.sources.arrays import ArraySource, ArrayStore
 from carlasc.sources.arraywriter import ArraySink, ArrayStoreWriter, ChunkWriter, remove
-from carlasc.sources.chunks import Encoding, StoredArray, parallel
+from carlasc.sources.chunks import Encoding, StoredArray, crc32c, parallel
 from carlasc.sources.packed import Options
 from carlasc.sources.trees import LocalTree, RemoteTree, Tree
 
 _BLOSC = 32001  # the filter's registered number
 _AHEAD = 16  # chunks that are encoded side by side
-_CRC = "_crc32"  # ending of the data set with the checksums of another one's chunks
+_CRC = "_crc32c"  # ending of the data set with the checksums of another one's chunks
 
 
 class HDF5Source(ArraySource):
@@ -39,7 +38,7 @@ class HDF5Source(ArraySource):
             DependencyError: h5py or the codecs are not installed.
             FormatError: it is another HDF5 file, unfinished, or of a newer version.
         """
-        for module in ("h5py", "numcodecs"):
+        for module in ("h5py", "numcodecs", "google_crc32c"):
             import_extra(module, "hdf5")
         super().__init__(HDF5Store(tree, path))
 
@@ -53,7 +52,7 @@ class HDF5Sink(ArraySink):
         Raises:
             ArgumentError: `small` is asked for, which HDF5 has no filter for.
             ConflictError: something is in its place, and `overwrite` is not given.
-            DependencyError: h5py, hdf5plugin or numcodecs is not installed.
+            DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
         """
         options = options or Options()
         if options.small:
@@ -171,7 +170,7 @@ class HDF5Array(StoredArray):
 
     def verify(self, data: memoryview, number: int) -> memoryview:
         """Check a chunk against the data set of checksums."""
-        if zlib.crc32(data) != self._checksums[number]:
+        if crc32c(data, "hdf5") != self._checksums[number]:
             raise FormatError(
                 f"chunk {number} of {self.name}: the checksum does not fit: corrupted, fetch or pack it again"
             )
@@ -184,7 +183,8 @@ class HDF5StoreWriter(ArrayStoreWriter):
     def __init__(self, path: Path) -> None:
         h5py = import_extra("h5py", "hdf5")
         self._filters = import_extra("hdf5plugin", "hdf5")
-        import_extra("numcodecs", "hdf5")
+        for module in ("numcodecs", "google_crc32c"):
+            import_extra(module, "hdf5")
         self.location = str(path)
         self._path = path
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -272,7 +272,7 @@ class _HDF5ChunkWriter(ChunkWriter):
             "type": "carlasc.checksums",
             "version": 1,
             "dtype": "uint32",
-            "unit": "crc32 of a chunk's stored bytes",
+            "unit": "crc32c of a chunk's stored bytes",
         }
         self.store.write_small(self.node + _CRC, np.array(self.checksums, np.uint32), attributes)
 
@@ -284,7 +284,7 @@ class _HDF5ChunkWriter(ChunkWriter):
             shape[self.axis] = start + step
             self.dataset.resize(shape)
             self.dataset.id.write_direct_chunk(tuple(start if a == self.axis else 0 for a in range(len(shape))), data)
-            self.checksums.append(zlib.crc32(data))
+            self.checksums.append(crc32c(data, "hdf5"))
         self.held = []
 
 

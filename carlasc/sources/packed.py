@@ -108,7 +108,7 @@ class Points(Packing):
     kind = "points"
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
-        encoding = Encoding("pcodec", 8) if options.small else Encoding(shuffle=BITSHUFFLE)
+        encoding = Encoding("pcodec", 8) if options.small else Encoding(shuffle=SHUFFLE)
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
         return (
@@ -128,11 +128,14 @@ class Points(Packing):
         """Return (N, 4) float32 rows, as the published file has them."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
-        scale = self.attributes.get("scale_m")
-        for axis in range(3):
-            points[:, axis] = xyz[axis] if scale is None else xyz[axis] * scale
+        points[:, :3] = self.to_metres(xyz).T
         points[:, 3] = fourth if fourth.size else 0
         return points
+
+    def to_metres(self, xyz: NDArray[Any]) -> NDArray[np.float32]:
+        """Return (3, N) metres of what is stored."""
+        scale = self.attributes.get("scale_m")
+        return xyz if scale is None else (xyz * scale).astype(np.float32)
 
     def make_room(self, counts: list[int]) -> list[NDArray[Any] | None]:
         """Return a stack's scans as parts of one block.
@@ -198,7 +201,7 @@ class Cells(Packing):
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
         shuffle = BITSHUFFLE if self.entry.name.endswith("/counts") else NO_SHUFFLE
-        return (Column("values", "u1", Encoding(level=5, shuffle=shuffle), self.entry.unit),)
+        return (Column("values", "u1", Encoding(level=8, shuffle=shuffle), self.entry.unit),)
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Narrow the values."""

@@ -23,7 +23,7 @@ from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.files import parse_json
 from carlasc.sources.arrays import SEQUENCE, ArraySource, ArrayStore
 from carlasc.sources.arraywriter import ArraySink, ArrayStoreWriter, ChunkWriter, remove
-from carlasc.sources.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray
+from carlasc.sources.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
 from carlasc.sources.packed import Options
 from carlasc.sources.trees import LocalTree, RemoteTree, Tree
 
@@ -31,6 +31,7 @@ METADATA = "zarr.json"
 _SHARD = 32 << 20  # bytes of a shard before compression: held back while one is filled
 _MOST_CHUNKS = 256  # of a shard: its index is read whole
 _CHECKSUM = 4
+_RESIDUE = 0x48674BC7  # crc32c of any bytes with their own crc32c behind them
 _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}
 
 
@@ -347,11 +348,9 @@ def _encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
 
 
 def _verify(data: memoryview, what: str) -> memoryview:
-    crc32c = import_extra("google_crc32c", "zarr")
-    content, checksum = data[:-_CHECKSUM], data[-_CHECKSUM:]
-    if len(data) < _CHECKSUM or crc32c.value(bytes(content)) != int.from_bytes(checksum, "little"):
+    if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
         raise FormatError(f"{what}: the checksum does not fit: corrupted, fetch or pack it again")
-    return content
+    return data[:-_CHECKSUM]
 
 
 @contextmanager

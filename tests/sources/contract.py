@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import FRAMES, published_bytes, write_dataset
+from numpy.typing import NDArray
 
 from carlasc import layout
 from carlasc.errors import FormatError, MissingDataError
@@ -97,6 +98,17 @@ class SourceContract:
         order = [5, 0, 2, 5, 1]
         for frame, array in zip(order, sequence.read_many("points", order), strict=True):
             assert np.array_equal(array, sequence.read("points", frame))
+
+    def test_coordinates_are_those_of_the_points_also_where_memory_is_used_again(self, source: Source) -> None:
+        sequence = source.sequences()[WHOLE]
+        spare: list[NDArray[np.float32]] = []
+        for frames in ([0, 1, 2], [5, 2], [1, 0, 5]):
+            found = sequence.read_xyz(frames, spare)
+            for frame, xyz in zip(frames, found, strict=True):
+                points = sequence.read("points", frame)
+                assert xyz.dtype == np.float32 and xyz.shape[0] == len(points)
+                assert xyz[:, :3].tobytes() == points[:, :3].tobytes()
+            spare = found
 
     def test_no_frames_read_are_none(self, source: Source) -> None:
         assert source.sequences()[WHOLE].read_many("points", []) == []

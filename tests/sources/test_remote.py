@@ -241,6 +241,7 @@ def test_a_corrupted_chunk_far_away_names_field_and_frame(published: Path, tmp_p
         ("s3fs", lambda _: "s3://bucket/x.zip", "remote"),
         ("numcodecs", lambda folder: folder / "x.zarr", "zarr"),
         ("google_crc32c", lambda folder: folder / "x.zarr", "zarr"),
+        ("google_crc32c", lambda folder: folder / "x.h5", "hdf5"),
         ("h5py", lambda folder: folder / "x.h5", "hdf5"),
         ("pyarrow", lambda folder: folder / "x.parquet", "parquet"),
     ],
