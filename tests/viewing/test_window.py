@@ -81,7 +81,9 @@ def test_keys_step_and_toggle_scan_grid_flow_and_classes(blocks, tmp_path):
     assert blue[0] < width / 2 - 20 and blue[1] > red[1]
     assert middle_of(red_pixels(seen["last"]))[1] < red[1] - 2  # it drove on
     assert not red_pixels(seen["no_pedestrians"]).any()
-    assert (seen["pedestrians"] == seen["last"]).all()
+    back = np.abs(seen["pedestrians"].astype(int) - seen["last"]).max(-1) > 8
+    assert back.mean() < 0.01  # edges of neighbouring voxels lie on each other: which is on top is Open3D's choice
+    assert red_pixels(seen["pedestrians"]).sum() == pytest.approx(red_pixels(seen["last"]).sum(), rel=0.1)
     assert not blue_pixels(seen["no_grid"]).any()
     assert (seen["no_flow"] != seen["no_grid"]).any()
     assert red_pixels(seen["points"]).sum() > 20
