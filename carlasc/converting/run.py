@@ -31,7 +31,6 @@ from carlasc.converting.trajectory import (
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.files import to_json
 from carlasc.grids import GridSpec
-from carlasc.groundtruth.record import RECORD, agree_metadata, agree_poses, agree_times, check_grid
 from carlasc.sources.base import Metadata, SequenceWriter, Sink
 from carlasc.sources.folder import FolderSink
 from carlasc.workers import count_workers, run_all
@@ -243,6 +242,10 @@ def _plan(
 
 
 def _check_grid(plan: _Plan, target: Target, converter: type[Converter]) -> None:
+    from carlasc.groundtruth.record import (
+        check_grid,  # here: workers import this file, and Numba takes longer than they
+    )
+
     if target.grid is not None:
         frames = [handle.number for handle in plan.recording.frames]
         check_grid(plan.writer, target.grid, _voxel_params(target, converter), frames, overwrite=False)
@@ -251,7 +254,7 @@ def _check_grid(plan: _Plan, target: Target, converter: type[Converter]) -> None
 def _voxel_params(target: Target, converter: type[Converter]) -> dict[str, object]:
     spec = converter.voxels or GridSpec.published()
     record = {"version": carlasc.__version__, "source": "voxels"}
-    return spec.to_params(target.classes.num_channels) | {RECORD: record}
+    return spec.to_params(target.classes.num_channels) | {"carlasc": record}
 
 
 def _write_documents(plan: _Plan, target: Target, converter: type[Converter], metadata: Metadata, steps: Steps) -> None:
@@ -259,6 +262,8 @@ def _write_documents(plan: _Plan, target: Target, converter: type[Converter], me
 
     Estimated poses that are there already are taken as they are: a second estimate might differ in its last digits.
     """
+    from carlasc.groundtruth.record import agree_metadata, agree_poses, agree_times
+
     how = "file" if plan.poses is not None else KISS_ICP
     metadata = Metadata(**{**vars(metadata), "extra": {"poses": how}})
     there = plan.writer.read_document(layout.METADATA)

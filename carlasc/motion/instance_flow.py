@@ -23,9 +23,10 @@ _DRIVE_S = 0.5  # and a vehicle
 _POINTS = 300  # of a sighting are laid on the model
 _MODEL_CELL_M, _MODEL_POINTS = 0.15, 1200
 _PLANE_M = 0.5  # points so near each other tell a plane
+_LINE_M = 0.06  # points that spread no more across are a line, which has no plane
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
-_POINT_M, _INDEPENDENT = 0.05, 60  # error of a point, and how many of a sighting count as errors of their own
+_POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and how many of a sighting count as errors of their own
 _PREDICTED = np.array([0.2, 0.2, 0.05, 0.02])  # error of a prediction over a scan: x, y, z in metres, yaw in radians
 _UNKNOWN = 5.0  # so much greater it is while the motion is not known yet
 _ROBUST = 0.3  # of the reach: pairs farther off their plane count less and less
@@ -147,7 +148,7 @@ def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     values, vectors = np.linalg.eigh(_covariances(model, _PLANE_M))
     flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
-    flat[values[:, 1] < 1e-4] = 0.0
+    flat[values[:, 1] < _LINE_M**2] = 0.0
     return vectors[:, :, 0] * np.sqrt(flat)[:, None]
 
 
