@@ -140,7 +140,7 @@ def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) 
         "reference: 60 sensors at that instant": truths[frame],
     }
     panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
-    Image.fromarray(draw_panels(panels, size=(1800, 640))).save(path)
+    Image.fromarray(draw_panels(panels, size=(1800, 430))).quantize(128).save(path, optimize=True)
 
 
 def main(out: Path, seeds: list[int]) -> None:
