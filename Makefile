@@ -2,7 +2,7 @@
 PYTHON ?= python3
 DEMO_VENV := .venv-demo
 VENV := .venv
-SYSTEM_LIBRARIES := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1 xvfb chromium
+SYSTEM_LIBRARIES := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1 xvfb chromium chromium-driver
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
@@ -40,7 +40,7 @@ docs: $(VENV)/ready ## the documentation, built strictly into site/
 	NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet
 
 clean: ## remove environments and what was built
-	rm -rf $(VENV) $(DEMO_VENV) site demo build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(DEMO_VENV) site demo build dist test-output .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(DEMO_VENV)/ready: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -30,7 +30,12 @@ _HOME = {  # public name -> module
     "info": "inspection.overview",
     "stats": "inspection.statistics",
     "validate": "inspection.validation",
+    "convert": "converting",
+    "export": "converting",
     "evaluate": "metrics",
+    "make_page": "viewing",
+    "show": "viewing",
+    "record": "recording",
     "download": "downloads",
 }
 
