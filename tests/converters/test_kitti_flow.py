@@ -34,10 +34,10 @@ def test_flow_of_moving_vehicles_is_right_and_that_of_everything_static_exactly_
 
 def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
     """A car ahead at constant distance drives as fast as the ego vehicle; both turn."""
+    from helpers.kitti import write_poses
     from helpers.tiny_kitti import write_labels, write_tiny_kitti
 
     from carlasc.geometry import invert, rotation_z, transform_points, translation
-    from helpers.kitti import write_poses
 
     folder = write_tiny_kitti(tmp_path / "in", frames=30, points=300)
     rng = np.random.default_rng(0)
