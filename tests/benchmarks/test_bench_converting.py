@@ -1,0 +1,51 @@
+"""Converting scans of SemanticKITTI's size; without `--benchmark-enable` it runs once.
+
+`copy` is what it is measured by: the same files, copied one after the other.
+"""
+
+import shutil
+
+import numpy as np
+import pytest
+from helpers.tiny_kitti import write_tiny_kitti
+
+from carlasc.converting import convert
+from carlasc.motion.instance_flow import estimate_velocities
+
+FRAMES, POINTS = 8, 122_000
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    root = tmp_path_factory.mktemp("kitti")
+    write_tiny_kitti(root, frames=FRAMES, points=POINTS)
+    return root
+
+
+def test_bench_copy(benchmark, source, tmp_path):
+    files = [path for name in ("velodyne", "labels") for path in sorted((source / "sequences" / "00" / name).iterdir())]
+
+    def copy():
+        for path in files:
+            shutil.copyfile(path, tmp_path / f"{path.parent.name}-{path.name}")
+
+    benchmark(copy)
+    assert len(list(tmp_path.iterdir())) == 2 * FRAMES
+
+
+def test_bench_convert(benchmark, source, tmp_path):
+    def run():
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        return convert("kitti", source, tmp_path / "out", grids="none", flow="none", force=True, workers=1)
+
+    assert benchmark(run).made == FRAMES
+
+
+def test_bench_velocities(benchmark):
+    """A car of 300 points in 20 scans."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(0, 1, (300, 3)) * (4.4, 1.8, 1.5)
+    body[:150, 1] = 0  # a flank
+    sightings = [body + (0.8 * i, 0, 0) + rng.uniform(-0.02, 0.02, body.shape) for i in range(20)]
+    velocities = benchmark(estimate_velocities, sightings, np.arange(20) * 0.1, rigid=True)
+    assert np.abs(velocities - (8, 0, 0)).max() < 0.5
