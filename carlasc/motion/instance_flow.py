@@ -50,7 +50,7 @@ def estimate_velocities(
         (F, 3) m/s over ground, world.
     """
     counts = np.array([len(points) for points in sightings])
-    enough = np.flatnonzero(counts >= min(MIN_POINTS, counts.max(initial=0)))
+    enough = np.flatnonzero(counts >= max(1, min(MIN_POINTS, counts.max(initial=0))))
     if len(enough) < 2:
         return np.zeros((len(sightings), 3))
     chosen, at, weights = [sightings[i] for i in enough.tolist()], seconds[enough], np.minimum(counts[enough], 200.0)
