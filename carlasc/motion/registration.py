@@ -23,6 +23,7 @@ _POINTS = 200  # of a sighting are looked at
 _CELL_M, _MODEL_POINTS = 0.15, 1500
 _COMPARED, _APART_S = 12, 1.0  # pairs of sightings, and how far apart in time, that tell standing from moving
 _FAR_M, _DOUBT_M = 0.5, 0.02
+_OVERLAID_M = 0.38  # sightings of what stands are nearer to each other, though each shows another side of it
 _SMOOTH_S = 0.5  # half width of the window in which motion is taken as uniformly accelerated
 _HEADING_S = 0.8  # half width of the window that the direction of motion comes from
 _HEADING_SPEED_M_S = 0.7  # slower actors are not going anywhere
@@ -76,7 +77,10 @@ def _stands(
         if j != i:
             still.append(_apart(sightings[i], sightings[j]))
             moved.append(_apart(body[i], body[j]))
-    return not still or float(np.mean(still)) < float(np.mean(moved)) + _DOUBT_M
+    if not still:
+        return True
+    # A path that was lost overlays badly too: standing must also look like standing.
+    return float(np.mean(still)) < min(float(np.mean(moved)) + _DOUBT_M, _OVERLAID_M)
 
 
 def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
