@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
-from carlasc.files import append_line, write_atomic
+from carlasc.errors import ConflictError, FormatError, MissingDataError
+from carlasc.files import append_line, parse_json, write_atomic, write_json
 from carlasc.geometry import Transform, check_rigid
 from carlasc.labels import CARLA, ClassTable
 from carlasc.scans import Scan, check_finite
@@ -219,6 +219,36 @@ class CaptureWriter:
         """Remember the sequence's folder: files go to `<root>/raw`."""
         self.raw = Path(root) / RAW
         self.location = str(self.raw)
+
+    def check_settings(self, file: str, settings: Mapping[str, Any], command: str) -> None:
+        """Check that what is there was made with the same settings, or that nothing is there yet.
+
+        Args:
+            file: the file in raw/ that holds them.
+            settings: those of this run, as JSON has them.
+            command: what makes such captures, for the error.
+
+        Raises:
+            ConflictError: another capture is there; names the difference.
+        """
+        path = self.raw / file
+        if not path.is_file():
+            if self.raw.is_dir() and any(self.raw.iterdir()):
+                raise ConflictError(
+                    f"{self.raw}: expected nothing or a capture of `{command}`, found a capture without {file}: choose another folder"
+                )
+            return
+        theirs = parse_json(path.read_bytes(), str(path))
+        differing = [key for key in sorted(settings.keys() | theirs.keys()) if settings.get(key) != theirs.get(key)]
+        if differing:
+            wanted, there = (", ".join(f"{key} {side.get(key)!r}" for key in differing) for side in (settings, theirs))
+            raise ConflictError(
+                f"{path}: expected {wanted}, found {there}: choose another folder, or the settings it was made with"
+            )
+
+    def write_settings(self, file: str, settings: Mapping[str, Any]) -> None:
+        """Write down what the capture is made from."""
+        write_json(self.raw / file, dict(settings))
 
     def has(self, sensor: int, frame: int) -> bool:
         """Whether all of a sensor's files of a frame are there; each is whole, because files are renamed into place."""

@@ -13,7 +13,6 @@ import numpy as np
 
 from carlasc.capture import Capture, CaptureWriter, Recording
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.files import parse_json, write_json
 from carlasc.recording.sensors import ActorNumbers, LidarModel, Rig, sensor_offsets
 from carlasc.recording.server import Server
 from carlasc.recording.traffic import populate
@@ -114,7 +113,7 @@ def record(
     writer, done = CaptureWriter(out), 0
     with Server(host, port, timeout_s, carla) as server:
         settings = _Settings(town, traffic, sensors, seed, bev, server.version, lidar or LidarModel())
-        _check_settings(writer, settings)
+        writer.check_settings(SETTINGS, dataclasses.asdict(settings), "carlasc capture")
         missing = {frame for frame in range(frames) if not _is_there(writer, settings, frame)}
         if not missing:
             return RecordResult(Path(out), frames, 0, sensors, 0, 0, server.version)
@@ -128,7 +127,7 @@ def record(
         numbers = ActorNumbers(
             [*server.ids_before, *(int(a.id) for a in (moving.ego, *moving.vehicles, *moving.walkers))]
         )
-        write_json(writer.raw / SETTINGS, dataclasses.asdict(settings))  # not before: a town may have been misspelt
+        writer.write_settings(SETTINGS, dataclasses.asdict(settings))  # not before: a town may have been misspelt
         for frame in range(max(missing) + 1):
             recordings, seconds, picture = rig.measure(server.tick(), frame, numbers)
             if frame in missing:
@@ -172,26 +171,6 @@ def _check_replay(writer: CaptureWriter, frame: int, replayed: Recording) -> Non
         raise ConflictError(
             f"{writer.raw}: frame {frame}: expected the replay to follow the recorded drive, found it {distance:.2f} m off:"
             " the server's physics differ from run to run; record to another folder"
-        )
-
-
-def _check_settings(writer: CaptureWriter, settings: _Settings) -> None:
-    """Raise ConflictError where what is there was not recorded with these settings."""
-    path = writer.raw / SETTINGS
-    ours = dataclasses.asdict(settings)
-    if not path.is_file():
-        if writer.raw.is_dir() and any(writer.raw.iterdir()):
-            raise ConflictError(
-                f"{writer.raw}: expected nothing or a capture of `carlasc capture`, found a capture without {SETTINGS}: choose another folder"
-            )
-        return
-    theirs = parse_json(path.read_bytes(), str(path))
-    differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
-    if differing:
-        wanted = ", ".join(f"{key} {ours.get(key)!r}" for key in differing)
-        there = ", ".join(f"{key} {theirs.get(key)!r}" for key in differing)
-        raise ConflictError(
-            f"{path}: expected {wanted}, found {there}: choose another folder, or the settings it was recorded with"
         )
 
 

@@ -156,6 +156,19 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
     return first, second
 
 
+def in_one_table(data: Input, truth: Input | None, classes: str | None) -> tuple[Input, Input | None]:
+    """Bring prediction and truth to the classes asked for, or to the same ones."""
+    if classes is not None:
+        target = table_by_name(classes)
+        return data.shown_as(target), None if truth is None else truth.shown_as(target)
+    if truth is None or truth.table == data.table:
+        return data, truth
+    try:
+        return data, truth.shown_as(data.table)
+    except ArgumentError:
+        return data.shown_as(truth.table), truth
+
+
 def table_by_name(name: str) -> ClassTable:
     """Return a class table that a caller names.
 

@@ -16,7 +16,7 @@ from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.rendering.cameras import Viewpoint
 from carlasc.rendering.colors import ClassColors, PaletteName, merge_legends
 from carlasc.rendering.encoding import check_ending, encodable_size, is_film, write_pictures
-from carlasc.rendering.inputs import Input, find_truth, frames_in, open_input, table_by_name
+from carlasc.rendering.inputs import Input, find_truth, frames_in, in_one_table, open_input
 from carlasc.rendering.pages import LARGEST, SMALLEST
 from carlasc.rendering.pictures import DEFAULT_SIZE
 from carlasc.rendering.shots import (
@@ -133,7 +133,7 @@ def render(
     _check_size(size)
     data = open_input(path, sequence, path_classes)
     reference = None if truth is None else find_truth(truth, data.sequence)
-    data, reference = _in_one_table(data, reference, classes)
+    data, reference = in_one_table(data, reference, classes)
 
     kinds, views = choose_kinds(data, reference, what), choose_views(view)
     drawn = {"grid", "errors"} & set(kinds)
@@ -199,19 +199,6 @@ def _reported(
         yield picture
         if progress is not None:
             progress(done, total)
-
-
-def _in_one_table(data: Input, truth: Input | None, classes: str | None) -> tuple[Input, Input | None]:
-    """Bring prediction and truth to the classes asked for, or to the same ones."""
-    if classes is not None:
-        target = table_by_name(classes)
-        return data.shown_as(target), None if truth is None else truth.shown_as(target)
-    if truth is None or truth.table == data.table:
-        return data, truth
-    try:
-        return data, truth.shown_as(data.table)
-    except ArgumentError:
-        return data.shown_as(truth.table), truth
 
 
 def _choose_frames(

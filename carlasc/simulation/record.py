@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.capture import Capture, CaptureWriter, Recording
-from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.files import parse_json, write_json
+from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.labels import CARLA
 from carlasc.layout import FRAME_PERIOD_S
 from carlasc.simulation.actors import TRAFFIC
@@ -116,7 +115,8 @@ def simulate(
         raise ArgumentError(f"traffic: expected one of {', '.join(TRAFFIC)}, found {traffic!r}")
     settings = _Settings(seed, traffic, sensors, bev, Lidar(channels, points, max_range_m))
     writer = CaptureWriter(out)
-    _claim(writer, settings)
+    writer.check_settings(SETTINGS, dataclasses.asdict(settings), "carlasc simulate")
+    writer.write_settings(SETTINGS, dataclasses.asdict(settings))
 
     wanted = range(first_frame, first_frame + frames)
     missing = [frame for frame in wanted if not _is_done(writer, settings, frame)]
@@ -160,31 +160,6 @@ def _labels(recording: Recording) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 def _drive(seed: int, traffic: str, lidar: Lidar) -> Drive:
     """A process's drive: the town is built once."""
     return Drive(seed, traffic, lidar)
-
-
-def _claim(writer: CaptureWriter, settings: _Settings) -> None:
-    """Write down what the capture is made from, or check that it is what is there.
-
-    Raises:
-        ConflictError: it is another.
-    """
-    path = writer.raw / SETTINGS
-    ours = dataclasses.asdict(settings)
-    if not path.is_file():
-        if writer.raw.is_dir() and any(writer.raw.iterdir()):
-            raise ConflictError(
-                f"{writer.raw}: expected nothing or a capture of `carlasc simulate`, found a capture without {SETTINGS}: choose another folder"
-            )
-        write_json(path, ours)
-        return
-    theirs = parse_json(path.read_bytes(), str(path))
-    differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
-    if differing:
-        wanted = ", ".join(f"{key} {ours.get(key)!r}" for key in differing)
-        there = ", ".join(f"{key} {theirs.get(key)!r}" for key in differing)
-        raise ConflictError(
-            f"{path}: expected {wanted}, found {there}: choose another folder, or the settings it was made with"
-        )
 
 
 def _is_done(writer: CaptureWriter, settings: _Settings, frame: int) -> bool:

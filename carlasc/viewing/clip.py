@@ -12,7 +12,7 @@ from carlasc.grids import Grid, GridSpec
 from carlasc.labels import ClassTable
 from carlasc.rendering import colors as palette
 from carlasc.rendering.colors import ClassColors, PaletteName
-from carlasc.rendering.inputs import Input, find_truth, frames_in, open_input, table_by_name
+from carlasc.rendering.inputs import Input, find_truth, frames_in, in_one_table, open_input
 from carlasc.rendering.scenes import check_same_spec
 from carlasc.scans import Scan
 from carlasc.sources import Sequence, Source
@@ -190,7 +190,7 @@ def open_clip(
         raise ArgumentError(f"palette {palette!r}: expected class or colorblind")
     data = open_input(path, sequence, path_classes)
     reference = None if truth is None else find_truth(truth, data.sequence)
-    data, reference = _in_one_table(data, reference, classes)
+    data, reference = in_one_table(data, reference, classes)
     wants_grid = grid is not None or data.grid is not None or reference is not None or bool(data.sequence.grids)
     own_grid = data.choose_grid(grid) if wants_grid and not (data.scan and grid is None) else ""
     truth_name = "" if reference is None else reference.choose_grid(truth_grid)
@@ -256,16 +256,3 @@ def _available(data: Input, truth: Input | None, grid: str, truth_grid: str) -> 
 
 def _span(frames: np.ndarray) -> str:
     return f"{frames[0]} to {frames[-1]} ({len(frames)} frames)" if len(frames) else "none"
-
-
-def _in_one_table(data: Input, truth: Input | None, classes: str | None) -> tuple[Input, Input | None]:
-    """Bring prediction and truth to the classes asked for, or to the same ones."""
-    if classes is not None:
-        target = table_by_name(classes)
-        return data.shown_as(target), None if truth is None else truth.shown_as(target)
-    if truth is None or truth.table == data.table:
-        return data, truth
-    try:
-        return data, truth.shown_as(data.table)
-    except ArgumentError:
-        return data.shown_as(truth.table), truth
