@@ -7,9 +7,9 @@ import json
 import os
 import re
 import socket
-import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,25 +26,21 @@ def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], 
     Raises:
         StorageError: the disk is full or the folder cannot be written to; nothing is left behind.
     """
-    temporary: str | None = None
+    # Named before it is made: whenever a signal ends this, there is a name to remove.
+    temporary = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}.{os.urandom(4).hex()}{_PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(
-            prefix=f".{path.name}.{_HOST}-{os.getpid()}.", suffix=_PART, dir=path.parent
-        )
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             if callable(content):
                 content(file)
             else:
                 file.write(content)
-        os.chmod(temporary, 0o666 & ~_UMASK)
-        os.replace(temporary, path)
-        temporary = None
+        temporary.replace(path)
     except OSError as error:
         raise _storage_error(path, error) from error
     finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
+        with suppress(OSError):  # gone where all went well; no folder where there is a file in its way
+            temporary.unlink()
 
 
 def append_line(path: Path, line: str) -> None:
@@ -117,12 +113,5 @@ def parse_json(data: bytes, where: str) -> dict[str, Any]:
     return value
 
 
-def _read_umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
 _PART = ".part"
 _HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
-_UMASK = _read_umask()  # read once, at import: asking sets it for a moment, which threads would notice
