@@ -1,15 +1,15 @@
 """A mini benchmark that can be run again: `python examples/benchmark.py OUT` (`--size full` on a GPU).
 
 Simulates towns for training, validation and test, makes their ground truth, trains LMSCNet SS, SSCNet-full, MotionSC T=1 and T=5, and prints the
-paper's two tables. Beside them, MotionSC T=5 with its history shuffled and with pose alignment off, three seeds each. Seeds and settings are fixed
-here; the towns are never changed to suit a network. A run that was stopped goes on where it was.
+paper's two tables. Beside them, MotionSC without history, with it, with it shuffled and with pose alignment off, three seeds each. Seeds and settings
+are fixed here; the towns are never changed to suit a network. A run that was stopped goes on where it was.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -29,7 +29,7 @@ from completion.weights import load_weights, read_weights
 
 from carlasc import GridSpec
 from carlasc.labels import CARLASC11
-from carlasc.metrics import Evaluation, geometric_table, semantic_table
+from carlasc.metrics import Evaluation, Table, geometric_table, semantic_table
 
 TRAFFIC = ("light", "medium", "heavy")
 SPLITS = (("Train", 100), ("Val", 200), ("Test", 300))  # and the seed of its first town
@@ -91,19 +91,19 @@ def list_entries(size: Size) -> list[Entry]:
     ]
 
 
-def list_history_entries(size: Size) -> list[Entry]:
-    """Return MotionSC T=5 as it is, with its history shuffled, and with alignment off, a run a seed."""
-    plain = list_entries(size)[3].config
+def list_history_entries(size: Size) -> dict[str, list[Entry]]:
+    """Return MotionSC without history, with it, with it shuffled, and with alignment off, a run a seed."""
+    single, plain = (entry.config for entry in list_entries(size)[2:])
     variants = {
+        "T=1": single,
         "T=5": plain,
         "T=5, history shuffled": replace(plain, shuffle_history=True),
         "T=5, not aligned": replace(plain, align=False),
     }
-    return [
-        Entry(f"{name}, seed {seed}", replace(config, seed=seed))
+    return {
+        name: [Entry(f"{name}, seed {seed}", replace(config, seed=seed)) for seed in range(size.seeds)]
         for name, config in variants.items()
-        for seed in range(size.seeds)
-    ]
+    }
 
 
 def build_data(out: Path, size: Size, workers: int | None) -> None:
@@ -139,9 +139,21 @@ def run_entry(entry: Entry, data: Path, out: Path, processes: Processes) -> Eval
     return Evaluation(entry.name, CARLASC11, matrix, {}, len(test), "known", "zero", [])
 
 
-def print_tables(evaluations: Sequence[Evaluation]) -> None:
-    """Print the paper's two tables as Markdown."""
-    for table in (semantic_table(evaluations), geometric_table(evaluations)):
+def average_seeds(groups: Mapping[str, Sequence[Evaluation]]) -> list[Table]:
+    """Return the paper's two tables with a row a group: the mean of its runs, and their standard deviation."""
+    tables = []
+    for make in (semantic_table, geometric_table):
+        rows: list[tuple[str, ...]] = []
+        for name, runs in groups.items():
+            table = make(runs)
+            rows.append((name, *(_mean(column) for column in list(zip(*table.rows, strict=True))[1:])))
+        tables.append(Table(f"{table.title}, mean and standard deviation over seeds", table.header, tuple(rows)))
+    return tables
+
+
+def print_tables(tables: Sequence[Table]) -> None:
+    """Print tables as Markdown."""
+    for table in tables:
         rows = [list(table.header), ["---"] * len(table.header), *table.texts()]
         print(f"\n{table.title}\n", *(f"| {' | '.join(row)} |" for row in rows), sep="\n")
 
@@ -152,7 +164,7 @@ def main(
         Literal["tiny", "small", "full"], typer.Option(help="tiny and small: on a CPU; full: on a GPU.")
     ] = "tiny",
     history: Annotated[
-        bool, typer.Option("--history", help="Also the study of history: shuffled, and not aligned.")
+        bool, typer.Option("--history", help="Also the study of history: none, in order, shuffled, and not aligned.")
     ] = False,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
     workers: Annotated[int | None, typer.Option(help="Processes that simulate; all cores if not given.")] = None,
@@ -160,22 +172,29 @@ def main(
     """Simulate, train, score, and print the tables."""
     chosen = SIZES[size]
     data = out / "data"
-    entries = list_entries(chosen) + (list_history_entries(chosen) if history else [])
+    groups = {"": list_entries(chosen), **(list_history_entries(chosen) if history else {})}
     with join_processes(device) as processes:
         if processes.first:
             build_data(data, chosen, workers)
         processes.wait()
-        results = [run_entry(entry, data, out / "runs" / entry.name.replace(" ", "_"), processes) for entry in entries]
+        results = {
+            group: [run_entry(entry, data, out / "runs" / entry.name.replace(" ", "_"), processes) for entry in entries]
+            for group, entries in groups.items()
+        }
         if processes.first:
-            print_tables(results[:4])
-            if history:
-                print_tables(results[4:])
             figures = {
                 "size": size,
                 "device": _describe(processes),
-                "results": [result.figures() for result in results],
+                "results": [result.figures() for runs in results.values() for result in runs],
             }
+            networks = results.pop("")
+            print_tables([semantic_table(networks), geometric_table(networks), *average_seeds(results)])
             (out / "results.json").write_text(json.dumps(figures, indent=1))
+
+
+def _mean(values: Sequence[float]) -> str:
+    spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.2f}{spread}"
 
 
 def _describe(processes: Processes) -> str:
