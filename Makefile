@@ -22,7 +22,7 @@ lint: $(VENV)/ready ## ruff
 
 types: $(VENV)/ready ## mypy
 	$(RUN)/mypy
-	cd examples && MYPYPATH=. ../$(RUN)/mypy --config-file ../pyproject.toml -p completion -p motionsc -p lmscnet -p sscnet
+	cd examples && MYPYPATH=. ../$(RUN)/mypy --config-file ../pyproject.toml .
 
 unit: $(VENV)/ready ## the tests
 	$(RUN)/pytest -n auto --dist worksteal -q

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +91,8 @@ class _Read:
 class ScanFeed:
     """The scans of one sequence, as merging needs them.
 
-    It pickles as the sequence and the settings; what it remembers is shared by all its copies in a process.
+    It pickles as the sequence and the settings; what it remembers is shared by all its copies in a process. Another feed of the same sequence
+    shares nothing with it: its files may have changed in between.
 
     Attributes:
         sequence: where the scans are.
@@ -110,9 +112,10 @@ class ScanFeed:
         self._scans: OrderedDict[int, _Read] = OrderedDict()
         self._merger: tuple[int, Merger] | None = None
         self._lock = threading.RLock()  # an executor may be of threads
+        self._name = uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
-        return _restore, (bare(self.sequence), self.merging, self._given_poses)
+        return _restore, (self._name, bare(self.sequence), self.merging, self._given_poses)
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
@@ -262,16 +265,17 @@ class _Scans(Mapping[int, PreparedScan]):
         return len(self._feed.frames)
 
 
-_FEEDS: OrderedDict[tuple[str, Merging], ScanFeed] = OrderedDict()  # of this process: see ScanFeed
+_FEEDS: dict[str, ScanFeed] = {}  # of this process, by the name of the feed they are copies of: see ScanFeed
 
 
-def _restore(sequence: Sequence, merging: Merging, poses: NDArray[np.float64] | None) -> ScanFeed:
-    key = (f"{sequence.location}/{sequence.path}", merging)
-    if key not in _FEEDS:
-        _FEEDS[key] = ScanFeed(sequence, merging, poses)
-        while len(_FEEDS) > 1:  # a run goes through its sequences one after the other
-            _FEEDS.popitem(last=False)
-    return _FEEDS[key]
+def _restore(name: str, sequence: Sequence, merging: Merging, poses: NDArray[np.float64] | None) -> ScanFeed:
+    feed = _FEEDS.get(name)
+    if feed is None:
+        feed = ScanFeed(sequence, merging, poses)
+        feed._name = name
+        _FEEDS.clear()  # a run goes through its sequences one after the other
+        _FEEDS[name] = feed
+    return feed
 
 
 def bare(sequence: Sequence) -> Sequence:

@@ -2,7 +2,9 @@
 
 import json
 import pickle
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -115,6 +117,20 @@ def test_processes_make_the_same_grids(street):
     carlasc.regrid(street, None, passing.SPEC, name="two", frames=(18, 22), observations="scans", workers=2)
     for frame in range(18, 22):
         assert (grid_of(street, "one", frame).labels == grid_of(street, "two", frame).labels).all()
+
+
+def test_an_executor_that_outlives_a_run_sees_the_files_of_the_next(tmp_path):
+    street = passing.write_sequence(tmp_path)
+    with ProcessPoolExecutor(1, get_context("spawn")) as executor:
+        make(street, "before", executor=executor)
+        for path in street.rglob(f"velodyne/{FRAME:06d}.bin"):
+            points = np.fromfile(path, np.float32).reshape(-1, 4)
+            points[:, :3] *= 0.9
+            path.write_bytes(points.tobytes())
+        make(street, "after", executor=executor)
+    make(street, "plain")
+    assert (grid_of(street, "after").labels == grid_of(street, "plain").labels).all()
+    assert (grid_of(street, "after").labels != grid_of(street, "before").labels).any()
 
 
 def test_frames_keep_their_numbers_and_the_record_says_how(street):
