@@ -26,35 +26,42 @@ class Input:
 
     Attributes:
         sequence: where frames are read from.
-        table: class table of its labels.
+        table: the classes shown: all labels are brought to them.
+        stored: class table of all labels there, if a caller says it; None goes by what stands beside them.
         grid: the grid that the path named, or None.
         frame: the frame that the path named, or None.
         scan: the path named a file of a scan.
         note: what was chosen where there was a choice, or None.
-        remaps: applied to all labels, one after the other.
     """
 
     sequence: Sequence
     table: ClassTable
+    stored: ClassTable | None = None
     grid: str | None = None
     frame: int | None = None
     scan: bool = False
     note: str | None = None
-    remaps: tuple[Remap, ...] = ()
 
-    def shown_as(self, target: ClassTable) -> Input:
+    def stored_table(self, grid: str) -> ClassTable:
+        """Return the class table of a grid's labels, with "" of the scans': a prediction's beside them may be another."""
+        if self.stored is not None:
+            return self.stored
+        return self.sequence.classes_of(grid) if grid else self.sequence.metadata.classes
+
+    def shown_as(self, target: ClassTable, grid: str) -> Input:
         """Return the input with its labels remapped to a table.
 
         Raises:
-            ArgumentError: there is no way from its classes to those.
+            ArgumentError: there is no way from the grid's classes (with "", the scans') to those.
         """
-        return replace(self, table=target, remaps=self.remaps + remaps_between(self.table, target))
+        remaps_between(self.stored_table(grid), target)
+        return replace(self, table=target)
 
     def read_grid(self, grid: str, frame: int) -> Grid:
         """Read a grid, remapped."""
         found = self.sequence.grid(grid, frame)
         labels = found.labels
-        for remap in self.remaps:
+        for remap in remaps_between(self.stored_table(grid), self.table):
             labels = remap(labels, f"{self.sequence.location}: {grid}, frame {frame}")
         return replace(found, labels=labels)
 
@@ -64,7 +71,7 @@ class Input:
         if scan.labels is None:
             return scan
         labels = scan.labels
-        for remap in self.remaps:
+        for remap in remaps_between(self.stored_table(""), self.table):
             labels = remap(labels, f"{self.sequence.location}: labels, frame {frame}")
         return replace(scan, labels=labels)
 
@@ -107,7 +114,7 @@ def open_input(path: Path_ | Source | Sequence, sequence: str | None = None, cla
         found = _in_folder(local.absolute().parent, grid=local.absolute().name)
     else:
         found = _choose(open_source(path), sequence)
-    return found if classes is None else replace(found, table=_table(classes))
+    return found if classes is None else replace(found, table=_table(classes), stored=_table(classes))
 
 
 def find_truth(truth: Path_ | Source | Sequence, of: Sequence) -> Input:
@@ -156,26 +163,24 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
     return first, second
 
 
-def in_one_table(data: Input, truth: Input | None, classes: str | None) -> tuple[Input, Input | None]:
-    """Bring prediction and truth to the classes asked for, or to the same ones."""
-    if classes is not None:
-        target = table_by_name(classes)
-        return data.shown_as(target), None if truth is None else truth.shown_as(target)
-    if truth is None or truth.table == data.table:
-        return data, truth
-    try:
-        return data, truth.shown_as(data.table)
-    except ArgumentError:
-        return data.shown_as(truth.table), truth
-
-
-def table_by_name(name: str) -> ClassTable:
-    """Return a class table that a caller names.
+def in_one_table(
+    data: Input, grid: str, truth: Input | None, truth_grid: str, classes: str | None
+) -> tuple[Input, Input | None]:
+    """Bring a grid and its truth to the classes asked for, or to the same ones; "" stands for the scans, where no grid is shown.
 
     Raises:
-        ArgumentError: there is none of that name.
+        ArgumentError: no class table of that name, or no way from the labels' classes to it.
     """
-    return _table(name)
+    own = data.stored_table(grid)
+    if truth is None:
+        return data.shown_as(own if classes is None else _table(classes), grid), None
+    if classes is not None:
+        return data.shown_as(_table(classes), grid), truth.shown_as(_table(classes), truth_grid)
+    try:
+        return data.shown_as(own, grid), truth.shown_as(own, truth_grid)
+    except ArgumentError:
+        other = truth.stored_table(truth_grid)
+        return data.shown_as(other, grid), truth.shown_as(other, truth_grid)
 
 
 def _table(name: str) -> ClassTable:

@@ -133,12 +133,11 @@ def render(
     _check_size(size)
     data = open_input(path, sequence, path_classes)
     reference = None if truth is None else find_truth(truth, data.sequence)
-    data, reference = in_one_table(data, reference, classes)
-
     kinds, views = choose_kinds(data, reference, what), choose_views(view)
     drawn = {"grid", "errors"} & set(kinds)
     grid = data.choose_grid(grid) if drawn else ""
     truth_grid = reference.choose_grid(truth_grid) if reference is not None else ""
+    data, reference = in_one_table(data, grid, reference, truth_grid, classes)
     available = available_frames(data, reference, kinds, grid, truth_grid)
     film_wanted = is_film(Path(out)) if out is not None else orbit or frames is not None
     chosen = _choose_frames(data, available, data.frame if frame is None else frame, frames, film_wanted and not orbit)

@@ -190,10 +190,10 @@ def open_clip(
         raise ArgumentError(f"palette {palette!r}: expected class or colorblind")
     data = open_input(path, sequence, path_classes)
     reference = None if truth is None else find_truth(truth, data.sequence)
-    data, reference = in_one_table(data, reference, classes)
     wants_grid = grid is not None or data.grid is not None or reference is not None or bool(data.sequence.grids)
     own_grid = data.choose_grid(grid) if wants_grid and not (data.scan and grid is None) else ""
     truth_name = "" if reference is None else reference.choose_grid(truth_grid)
+    data, reference = in_one_table(data, own_grid, reference, truth_name, classes)
     notes = [data.note] if data.note else []
 
     available = _available(data, reference, own_grid, truth_name)

@@ -155,6 +155,28 @@ def test_a_prediction_in_eleven_classes_meets_a_truth_in_twenty_three(drive, tmp
     assert orange(wrong.out) and not orange(result.out)
 
 
+def test_a_prediction_beside_the_data_is_shown_in_its_own_classes(tmp_path):
+    """Scans are CARLA's 4, a pedestrian; the prediction's params.json says eleven classes, of which 6 is road."""
+    folder = write_sequence(tmp_path)
+    params = COARSE.to_params() | {"carlasc": {"classes": "carlasc11"}}
+    writer = FolderSink(tmp_path).sequence("Train/Town01_Light/cartesian")
+    writer.write_document(f"completion/{layout.PARAMS}", to_json(params))
+    writer.write("completion/labels", 0, grid_with({(10, 5, -0.5): CARLASC11.id_of("Road")}, COARSE, size_m=2.4).labels)
+    options = {"grid": "completion", "view": "bev", "size": SIZE, "ego": False, "legend": False}
+    result = render(folder, tmp_path / "a.png", **options)
+    assert result.classes == "carlasc11"
+
+    def shows(path, name):
+        color = np.array(CARLASC11.palette[CARLASC11.id_of(name)])
+        return (np.abs(picture(path).astype(int) - color).max(-1) < 40).any()
+
+    assert shows(result.out, "Road")
+    both = render(folder, tmp_path / "b.png", what="grid,scan", **options)
+    assert shows(both.out, "Road") and shows(both.out, "Pedestrian")
+    wrong = render(folder, tmp_path / "c.png", truth=folder, what="errors", **options)
+    assert (np.abs(picture(wrong.out).astype(int) - (213, 70, 0)).max(-1) < 20).any()
+
+
 def test_the_papers_eleven_classes_can_be_shown(drive, tmp_path):
     result = render(drive, tmp_path / "a.png", classes="carlasc11", palette="colorblind", size=(640, 360))
     assert result.classes == "carlasc11"

@@ -1,6 +1,7 @@
 import base64
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from helpers.blocks import write_blocks
 
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.grids import Grid, GridSpec
+from carlasc.labels import REMAPS
 from carlasc.sources import open as open_source
 from carlasc.viewing import make_page, open_clip
 from carlasc.viewing.clip import INVENTED, MISSED, RIGHT, WRONG, compare
@@ -84,6 +86,22 @@ def test_a_prediction_in_eleven_classes_is_shown_beside_its_truth_in_the_same(bl
     clip = open_clip(prediction, truth=blocks)
     assert {panel.colors.table.name for panel in clip.panels} == {"carlasc11", "errors"}
     assert clip.read(0).grids[1].labels.max() <= 10
+
+
+def test_a_prediction_beside_the_data_brings_points_and_truth_to_its_classes(tmp_path):
+    folder = write_blocks(tmp_path / "Train" / "Town01_Light" / "cartesian")
+    shutil.copytree(folder / "evaluation", folder / "completion")
+    params = json.loads((folder / "evaluation" / "params.json").read_text())
+    (folder / "completion" / "params.json").write_text(json.dumps(params | {"carlasc": {"classes": "carlasc11"}}))
+    for path in (folder / "completion").glob("*.label"):
+        path.write_bytes(REMAPS["carlasc11"](np.fromfile(path, np.uint32)).astype(np.uint32).tobytes())
+    clip = open_clip(folder, grid="completion", truth=folder)
+    content = clip.read(0)
+    assert [panel.colors.table.name for panel in clip.panels] == ["carlasc11", "carlasc11", "errors"]
+    assert clip.colors.table.name == "carlasc11"
+    assert set(np.unique(content.grids[2].labels)) == {0, RIGHT}
+    assert content.scan is not None and content.scan.labels.max() <= 10
+    assert open_clip(folder).colors.table.name == "carla"
 
 
 def test_what_is_not_there_is_named(blocks, tmp_path):
