@@ -335,22 +335,11 @@ TABLES: Mapping[str, ClassTable] = MappingProxyType(
 
 TRAIN_VOXEL_COUNTS = np.array(
     [
-        4166593275,
-        42309744,
-        8550180,
-        478193,
-        905663,
-        2801091,
-        6452733,
-        229316930,
-        112863867,
-        29816894,
-        13839655,
-        15581458,
-    ]
-    + [221821, 0, 7931550, 467989, 3354, 9201043, 61011, 3796746, 3217865, 215372, 79669695],
+        4166593275, 42309744, 8550180, 478193, 905663, 2801091, 6452733, 229316930, 112863867, 29816894, 13839655, 15581458,
+        221821, 0, 7931550, 467989, 3354, 9201043, 61011, 3796746, 3217865, 215372, 79669695,
+    ],
     np.int64,
-)
+)  # fmt: skip
 """(23,) voxels of each CARLA class in the training split, coarse Cartesian (FORMAT section 2)."""
 
 
@@ -374,6 +363,47 @@ def remap_named(name: str) -> Remap:
     if name not in REMAPS:
         raise ArgumentError(f"remap {name!r}: expected one of {', '.join(REMAPS)}")
     return REMAPS[name]
+
+
+def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
+    """Return the remaps that lead from one table to another: none, one, or two by way of CARLA's.
+
+    Raises:
+        ArgumentError: none do.
+    """
+
+    def direct(one: ClassTable, other: ClassTable) -> Remap | None:
+        return next((r for r in REMAPS.values() if r.source == one and r.target == other), None)
+
+    if source == target:
+        return ()
+    if (remap := direct(source, target)) is not None:
+        return (remap,)
+    first, second = direct(source, CARLA), direct(CARLA, target)
+    if first is None or second is None:
+        ways = sorted({r.target.name for r in REMAPS.values() if r.source == source} | {source.name})
+        raise ArgumentError(f"classes {target.name}: expected one of {', '.join(ways)} for labels of {source.name}")
+    return first, second
+
+
+def to_table(
+    labels: NDArray[np.unsignedinteger], source: ClassTable, target: ClassTable, where: str
+) -> NDArray[np.unsignedinteger]:
+    """Return labels of one table as ids of another.
+
+    Args:
+        labels: ids of `source`.
+        source: their table.
+        target: the table wanted.
+        where: file or field, for the error message.
+
+    Raises:
+        ArgumentError: no remaps lead from one to the other.
+        FormatError: a label is not of `source`.
+    """
+    for remap in remaps_between(source, target):
+        labels = remap(labels, where)
+    return labels
 
 
 def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None) -> NDArray[np.float64]:

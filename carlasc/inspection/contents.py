@@ -44,12 +44,19 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
     for name, spec in grids.items():
         file, params = f"{where}/{layout.params_file(name)}", sequence.params(name)
         channels = params.get("num_channels")
+        try:
+            classes = sequence.classes_of(name)
+        except CarlascError as error:
+            yield Finding.from_error("params", sequence.path, file, error)
         if not isinstance(channels, int | float) or (classes is not None and channels < max(classes.names) + 1):
             expected = f"num_channels of at least {max(classes.names) + 1}" if classes else "a number in num_channels"
             yield Finding("warning", "params", sequence.path, file, expected, repr(channels))
         if sequence.path.split("/")[-1] in layout.COORDINATES and spec.coordinates != sequence.coordinates:
             expected = f"a {sequence.coordinates} grid, as the folder says"
             yield Finding("warning", "params", sequence.path, file, expected, f"a {spec.coordinates} one")
+        if f"{name}/counts" not in sequence.fields() and sequence.predicted_by(name) is None:
+            folder, advice = f"{where}/{name}", "every voxel will be taken for known"
+            yield Finding("warning", "frame-counts", sequence.path, folder, "counts beside the labels", "none", advice)
 
 
 def _check_grid_folders(sequence: FolderSequence, grids: set[str]) -> Iterator[Finding]:
@@ -86,9 +93,6 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
             continue
         for part in parts[1:]:
             yield from _compare_frames(sequence, f"{grid}/{part}", f"{grid}/labels", "error")
-        if "counts" not in parts:
-            where, advice = f"{sequence.location}/{grid}", "every voxel will be taken for known"
-            yield Finding("warning", "frame-counts", sequence.path, where, "counts beside the labels", "none", advice)
         if "points" in fields:
             yield from _compare_frames(sequence, f"{grid}/labels", "points", "note", orphans="warning")
 
@@ -118,7 +122,6 @@ def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Ite
 def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
     """Check what is in a frame's files; those that cannot be read are `check_shapes`'s to report."""
     arrays = _read_all(sequence, frame)
-    classes = sequence.metadata.classes
     for name in ("points", "flow"):
         if name in arrays:
             rows = np.isfinite(arrays[name]).all(axis=1)
@@ -132,12 +135,14 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
                 expected = f"velocities below {_FASTEST_M_S:.0f} m/s"
                 yield Finding("warning", "flow", sequence.path, _file(sequence, name, frame), expected, found)
     if "labels" in arrays:
-        yield from _check_classes(sequence, arrays["labels"], classes, _file(sequence, "labels", frame))
+        yield from _check_classes(
+            sequence, arrays["labels"], sequence.metadata.classes, _file(sequence, "labels", frame)
+        )
     if "bev" in arrays and arrays["bev"][:2].tobytes() != b"\xff\xd8":
         yield Finding("warning", "bev", sequence.path, _file(sequence, "bev", frame), "a JPEG picture", "other bytes")
     for grid in sequence.grids:
         if f"{grid}/labels" in arrays:
-            yield from _check_grid(sequence, grid, frame, arrays, classes)
+            yield from _check_grid(sequence, grid, frame, arrays, sequence.classes_of(grid))
 
 
 def _check_grid(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.inspection.opening import open_source
-from carlasc.labels import REMAPS, ClassTable, Remap, class_weights, remap_named
+from carlasc.labels import REMAPS, ClassTable, Remap, class_weights, remap_named, remaps_between, to_table
 from carlasc.layout import EVALUATION
 from carlasc.sources.base import Sequence, Source
 from carlasc.workers import count_workers, run_all
@@ -182,11 +182,11 @@ def stats(
         raise ArgumentError(f"every: expected 1 or more, found {every}")
     opened = open_source(source)
     sequences = opened.sequences()
-    classes = _common_table(sequences.values())
-    chosen = _choose_remap(remap, classes)
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
         raise MissingDataError(f"{opened.location}: expected labels of points or the grid {grid}, found neither")
+    classes = _common_table(tasks)
+    chosen = _choose_remap(remap, classes)
     total, done = sum(len(frames) for _, _, frames in tasks), 0
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
@@ -228,8 +228,10 @@ def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str,
 
 
 def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable) -> Histogram:
+    where, stored = f"{sequence.location}: {field} of frame {frame}", _table_of(sequence, field)
     labels = sequence.read(field, frame)
-    classes.check(labels, f"{sequence.location}: {field} of frame {frame}")
+    stored.check(labels, where)
+    labels = to_table(labels, stored, classes, where)
     nothing = np.zeros(classes.num_channels, np.int64)
     if field == "labels":
         return Histogram(np.bincount(labels, minlength=classes.num_channels), nothing, scans=1)
@@ -243,11 +245,24 @@ def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable
     return Histogram(nothing, np.bincount(labels, minlength=classes.num_channels), unknown, grids=1)
 
 
-def _common_table(sequences: Any) -> ClassTable:
-    tables = {sequence.metadata.classes.name: sequence.metadata.classes for sequence in sequences}
+def _table_of(sequence: Sequence, field: str) -> ClassTable:
+    return sequence.metadata.classes if field == "labels" else sequence.classes_of(field.removesuffix("/labels"))
+
+
+def _common_table(tasks: Iterable[_Task]) -> ClassTable:
+    """The grids' table, or the points' where there are no grids: points beside a prediction are counted in its classes."""
+    fields = {(sequence.path, field): _table_of(sequence, field) for sequence, field, _ in tasks}
+    grids = [table for (_, field), table in fields.items() if field != "labels"]
+    tables = {table.name: table for table in grids or fields.values()}
     if len(tables) > 1:
         raise FormatError(f"classes: expected one table, found {', '.join(sorted(tables))}: count the sequences apart")
-    return next(iter(tables.values()))
+    (classes,) = tables.values()
+    try:
+        for table in fields.values():
+            remaps_between(table, classes)
+    except ArgumentError as error:
+        raise FormatError(f"{error}: count the sequences apart") from error
+    return classes
 
 
 def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | None:

@@ -148,6 +148,8 @@ def _gather(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -
     except CarlascError:
         return
     for name in sequence.grids:
+        if sequence.predicted_by(name) is not None:  # a network may be wrong, and its classes others than the points'
+            continue
         try:
             grid = sequence.grid(name, frame)
         except CarlascError:

@@ -11,7 +11,7 @@ import numpy as np
 from carlasc import layout
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.grids import Grid
-from carlasc.labels import CARLA, REMAPS, ClassTable, Remap, table_named
+from carlasc.labels import ClassTable, remaps_between, table_named, to_table
 from carlasc.scans import Scan
 from carlasc.sources import Sequence, Source
 from carlasc.sources import open as open_source
@@ -60,20 +60,16 @@ class Input:
     def read_grid(self, grid: str, frame: int) -> Grid:
         """Read a grid, remapped."""
         found = self.sequence.grid(grid, frame)
-        labels = found.labels
-        for remap in remaps_between(self.stored_table(grid), self.table):
-            labels = remap(labels, f"{self.sequence.location}: {grid}, frame {frame}")
-        return replace(found, labels=labels)
+        where = f"{self.sequence.location}: {grid}, frame {frame}"
+        return replace(found, labels=to_table(found.labels, self.stored_table(grid), self.table, where))
 
     def read_scan(self, frame: int) -> Scan:
         """Read a scan, remapped."""
         scan = self.sequence.scan(frame)
         if scan.labels is None:
             return scan
-        labels = scan.labels
-        for remap in remaps_between(self.stored_table(""), self.table):
-            labels = remap(labels, f"{self.sequence.location}: labels, frame {frame}")
-        return replace(scan, labels=labels)
+        where = f"{self.sequence.location}: labels, frame {frame}"
+        return replace(scan, labels=to_table(scan.labels, self.stored_table(""), self.table, where))
 
     def choose_grid(self, name: str | None) -> str:
         """Return the grid that is meant: the one named, `evaluation`, or the first.
@@ -140,27 +136,6 @@ def find_truth(truth: Path_ | Source | Sequence, of: Sequence) -> Input:
             f"{source.location}: expected the sequence {of.name} ({of.coordinates}), found {_listed(list(sequences))}: give its folder"
         )
     return Input(match, match.metadata.classes)
-
-
-def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
-    """Return the remaps that lead from one table to another: none, one, or two by way of CARLA's.
-
-    Raises:
-        ArgumentError: none do.
-    """
-
-    def direct(one: ClassTable, other: ClassTable) -> Remap | None:
-        return next((r for r in REMAPS.values() if r.source == one and r.target == other), None)
-
-    if source == target:
-        return ()
-    if (remap := direct(source, target)) is not None:
-        return (remap,)
-    first, second = direct(source, CARLA), direct(CARLA, target)
-    if first is None or second is None:
-        ways = sorted({r.target.name for r in REMAPS.values() if r.source == source} | {source.name})
-        raise ArgumentError(f"classes {target.name}: expected one of {', '.join(ways)} for labels of {source.name}")
-    return first, second
 
 
 def in_one_table(

@@ -168,9 +168,18 @@ class Sequence(ABC):
 
     def classes_of(self, grid: str) -> ClassTable:
         """Return the class table of a grid's labels: the sequence's, unless its params.json names another under `carlasc` (predictions)."""
-        record = self.params(grid).get("carlasc")
-        name = record.get("classes") if isinstance(record, dict) else None
+        name = self._record(grid).get("classes")
         return self.metadata.classes if name is None else table_named(str(name))
+
+    def predicted_by(self, grid: str) -> str | None:
+        """Return the network that predicted a grid, as its params.json says under `carlasc`; None: it is no prediction."""
+        name = self._record(grid).get("network")
+        return None if name is None else str(name)
+
+    def _record(self, grid: str) -> Mapping[str, Any]:
+        """How a grid was made: params.json's `carlasc`, empty if there is none."""
+        record = self.params(grid).get("carlasc")
+        return record if isinstance(record, dict) else {}
 
     @cached_property
     def poses(self) -> NDArray[np.float64]:

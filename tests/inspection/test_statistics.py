@@ -11,10 +11,11 @@ import pytest
 
 from carlasc import layout
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.files import to_json
 from carlasc.grids import GridSpec
 from carlasc.inspection.charts import draw_histograms
 from carlasc.inspection.statistics import Statistics, stats
-from carlasc.labels import CARLA, REMAPS, SEMANTICKITTI, class_weights
+from carlasc.labels import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, class_weights
 from carlasc.sources import FolderSink, Metadata
 
 SPEC = GridSpec("cartesian", (8, 8, 4), (-4.0, -4.0, -2.0), (4.0, 4.0, 2.0))
@@ -175,3 +176,21 @@ def test_a_chart_is_drawn(
 def test_a_chart_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match="expected a file ending in .png"):
         draw_histograms(Statistics("", CARLA, None, {}, {}), tmp_path / "classes.doc")
+
+
+def test_points_beside_a_prediction_are_counted_in_its_classes(tmp_path: Path) -> None:
+    writer = FolderSink(tmp_path).sequence("cartesian")
+    writer.write("points", 0, np.zeros((3, 4), np.float32))
+    writer.write("labels", 0, np.array([7, 14, 22], np.uint32))  # road, ground and terrain
+    spec = GridSpec("cartesian", (2, 2, 1), (-1, -1, -1), (1, 1, 1))
+    params = spec.to_params(11) | {"carlasc": {"classes": "carlasc11"}}
+    writer.write_document(layout.params_file("completion"), to_json(params))
+    writer.write("completion/labels", 0, np.array([0, 7, 7, 10], np.uint32).reshape(2, 2, 1))
+    result = stats(tmp_path, grid="completion")
+    assert result.classes == CARLASC11
+    assert result.named(result.total.points)["Ground"] == 2
+    assert result.named(result.total.voxels) == dict.fromkeys(CARLASC11.names.values(), 0) | {
+        "Free": 1,
+        "Ground": 2,
+        "Vehicles": 1,
+    }

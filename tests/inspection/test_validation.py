@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.scenes import MIRROR, camera_poses, drive, write_drive
 
+import carlasc
 from carlasc import layout
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.geometry import invert
@@ -120,6 +121,28 @@ def test_other_grids_raise_no_false_alarm(tmp_path: Path, name: str, labelled: b
     spec = GridSpec.published(name)
     write_drive(tmp_path / spec.coordinates, drive(4, turn_rad=0.05), spec=spec, labelled=labelled, seed=5)
     assert validate(tmp_path).findings == ()
+
+
+def test_a_prediction_beside_the_data_is_judged_by_its_own_classes_and_not_as_truth(copy: Path) -> None:
+    shutil.copytree(copy / "evaluation", copy / "completion")
+    for path in (copy / "completion").glob("*.bin"):
+        path.unlink()
+    params = json.loads((copy / "evaluation/params.json").read_text())
+    record = {"classes": "carlasc11", "network": "lmscnet_ss"}
+    (copy / "completion/params.json").write_text(json.dumps(params | {"num_channels": 11, "carlasc": record}))
+    for path in (copy / "completion").glob("*.label"):
+        path.write_bytes(np.where(np.fromfile(path, np.uint32) > 0, 9, 0).astype(np.uint32).tobytes())
+    assert not validate(copy).findings
+    path.write_bytes(np.full(128 * 128 * 8, 11, np.uint32).tobytes())
+    assert "ids of the classes of carlasc11" in found(validate(copy, every=1))["class-ids"]
+
+
+@pytest.mark.parametrize("ending", ["zarr", "h5"])
+def test_a_packed_store_is_as_sound_as_what_it_was_packed_from(turning: Path, tmp_path: Path, ending: str) -> None:
+    """Stores keep labels as uint8: all checks hold there too."""
+    store = tmp_path / f"drive.{ending}"
+    carlasc.pack(turning, store)
+    assert validate(store).findings == validate(turning).findings
 
 
 def test_a_zip_is_validated_in_place(turning: Path, tmp_path: Path) -> None:
