@@ -9,7 +9,22 @@ from typing import Annotated
 import typer
 
 from carlasc.cli.common import Json, Workers, print_json, progress_bar, report_failures
-from carlasc.cli.regrid import Coordinates, Dynamics, Preset, Vote, merging_of, parse_grid
+from carlasc.cli.grid_options import (
+    BoundsOption,
+    Coordinates,
+    CoordinatesOption,
+    DynamicOption,
+    Preset,
+    PresetOption,
+    ResOption,
+    SizeOption,
+    StrideOption,
+    VoteOption,
+    WindowMOption,
+    WindowOption,
+    merging_of,
+    parse_grid,
+)
 from carlasc.errors import ArgumentError
 
 
@@ -52,9 +67,6 @@ class Flow(StrEnum):
     none = "none"
 
 
-_GRIDS = "Grids from scans"
-
-
 def _print_list(wanted: bool) -> None:
     if wanted:
         from carlasc.converting import converter_names, load_converter
@@ -79,7 +91,10 @@ def convert(
         Frame, typer.Option(help="carlasc: y mirrored into CarlaSC's left-handed frame; kitti: right-handed, as it is.")
     ] = Frame.carlasc,
     grids: Annotated[
-        Grids, typer.Option(help="scans: made of scans merged over time; voxels: the data set's own; none.")
+        Grids,
+        typer.Option(
+            help="scans: made of scans merged over time, coarse ones if no grid is given; voxels: the data set's own; none."
+        ),
     ] = Grids.scans,
     poses: Annotated[
         PoseSource,
@@ -94,29 +109,16 @@ def convert(
     force: Annotated[
         bool, typer.Option("--force", help="Go on with poses that do not put scans on each other, or lack Tr.")
     ] = False,
-    preset: Annotated[
-        Preset | None, typer.Option(help="A published grid; coarse if no grid is given.", rich_help_panel=_GRIDS)
-    ] = None,
-    res: Annotated[
-        str | None, typer.Option(help="Size of a voxel, metres, or one value an axis.", rich_help_panel=_GRIDS)
-    ] = None,
-    size: Annotated[str | None, typer.Option(help="Number of voxels an axis, X,Y,Z.", rich_help_panel=_GRIDS)] = None,
-    coordinates: Annotated[
-        Coordinates | None, typer.Option(help="Axes of the grid; cartesian if not given.", rich_help_panel=_GRIDS)
-    ] = None,
-    bounds: Annotated[str | None, typer.Option(help="x0,x1,y0,y1,z0,z1 as in regrid.", rich_help_panel=_GRIDS)] = None,
-    vote: Annotated[Vote | None, typer.Option(help="How votes are counted.", rich_help_panel=_GRIDS)] = None,
-    window: Annotated[
-        str | None, typer.Option(help="Scans A:B around each frame; -30:30 if not given.", rich_help_panel=_GRIDS)
-    ] = None,
-    window_m: Annotated[
-        float | None, typer.Option(help="Of those, only scans within so many metres driven.", rich_help_panel=_GRIDS)
-    ] = None,
-    stride: Annotated[int | None, typer.Option(help="Every so manyth scan.", rich_help_panel=_GRIDS)] = None,
-    dynamic: Annotated[
-        Dynamics | None,
-        typer.Option(help="What moves: align (the default), current, drop or tube.", rich_help_panel=_GRIDS),
-    ] = None,
+    preset: PresetOption = None,
+    res: ResOption = None,
+    size: SizeOption = None,
+    coordinates: CoordinatesOption = None,
+    bounds: BoundsOption = None,
+    vote: VoteOption = None,
+    window: WindowOption = None,
+    window_m: WindowMOption = None,
+    stride: StrideOption = None,
+    dynamic: DynamicOption = None,
     workers: Workers = None,
     json: Json = False,
     _list: Annotated[

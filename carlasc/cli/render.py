@@ -8,6 +8,14 @@ from typing import Annotated, Literal
 import typer
 
 from carlasc.cli.common import Json, Overwrite, parse_frames, print_json, progress_bar
+from carlasc.cli.scene_options import (
+    ClassesOption,
+    GridOption,
+    PathClassesOption,
+    SequenceOption,
+    TruthGridOption,
+    TruthOption,
+)
 from carlasc.errors import ArgumentError
 
 
@@ -30,18 +38,12 @@ def render(
     view: Annotated[
         Literal["perspective", "bev", "both"], typer.Option(help="From behind and above, from straight above, or both.")
     ] = "perspective",
-    grid: Annotated[str | None, typer.Option(help="The grid's folder; `evaluation` if not given.")] = None,
-    truth: Annotated[str | None, typer.Option(help="Ground truth to show a prediction beside.")] = None,
-    truth_grid: Annotated[str | None, typer.Option(help="The truth's grid; `evaluation` if not given.")] = None,
-    sequence: Annotated[
-        str | None, typer.Option(help="The sequence, where there are several; the first if not given.")
-    ] = None,
-    classes: Annotated[
-        str | None, typer.Option(help="Classes to show: carlasc11 for the paper's eleven; the data's own if not given.")
-    ] = None,
-    path_classes: Annotated[
-        str | None, typer.Option(help="Class table of PATH's labels, where nothing beside them says.")
-    ] = None,
+    grid: GridOption = None,
+    truth: TruthOption = None,
+    truth_grid: TruthGridOption = None,
+    sequence: SequenceOption = None,
+    classes: ClassesOption = None,
+    path_classes: PathClassesOption = None,
     palette: Annotated[
         Literal["class", "colorblind", "height"],
         typer.Option(help="The classes' own colours, ones that the colour-blind tell apart, or by height."),

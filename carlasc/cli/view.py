@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from carlasc.cli.common import Json, parse_frames, print_json, progress_bar
+from carlasc.cli.scene_options import (
+    ClassesOption,
+    GridOption,
+    PathClassesOption,
+    SequenceOption,
+    TruthGridOption,
+    TruthOption,
+)
 from carlasc.errors import ArgumentError
 
 
@@ -25,20 +33,12 @@ def view(
         str | None, typer.Option(help="Frames A:B (B not included); all if not given, the first 60 in a page.")
     ] = None,
     every: Annotated[int, typer.Option(help="Take each N-th of them.", min=1)] = 1,
-    grid: Annotated[str | None, typer.Option(help="The grid's folder; `evaluation` if not given.")] = None,
-    truth: Annotated[
-        str | None, typer.Option(help="Ground truth to show beside PATH, a prediction; and where it errs.")
-    ] = None,
-    truth_grid: Annotated[str | None, typer.Option(help="The truth's grid; `evaluation` if not given.")] = None,
-    sequence: Annotated[
-        str | None, typer.Option(help="The sequence, where there are several; the first if not given.")
-    ] = None,
-    classes: Annotated[
-        str | None, typer.Option(help="Classes to show: carlasc11 for the paper's eleven; the data's own if not given.")
-    ] = None,
-    path_classes: Annotated[
-        str | None, typer.Option(help="Class table of PATH's labels, where nothing beside them says.")
-    ] = None,
+    grid: GridOption = None,
+    truth: TruthOption = None,
+    truth_grid: TruthGridOption = None,
+    sequence: SequenceOption = None,
+    classes: ClassesOption = None,
+    path_classes: PathClassesOption = None,
     palette: Annotated[
         Literal["class", "colorblind"],
         typer.Option(help="The classes' own colours, or ones that the colour-blind tell apart."),
@@ -53,40 +53,24 @@ def view(
     """
     from carlasc.viewing import make_page, show
 
+    chosen: dict[str, Any] = {
+        "sequence": sequence,
+        "frames": parse_frames(frames),
+        "every": every,
+        "grid": grid,
+        "truth": truth,
+        "truth_grid": truth_grid,
+        "classes": classes,
+        "path_classes": path_classes,
+        "palette": palette,
+    }
     if html is None:
         if as_json:
             raise ArgumentError("--json: expected --html beside it: a window has no figures")
-        show(
-            path,
-            sequence=sequence,
-            frames=parse_frames(frames),
-            every=every,
-            grid=grid,
-            truth=truth,
-            truth_grid=truth_grid,
-            classes=classes,
-            path_classes=path_classes,
-            palette=palette,
-            report=typer.echo,
-        )
+        show(path, **chosen, report=typer.echo)
         return
     with progress_bar("Writing the page") as progress:
-        result = make_page(
-            path,
-            html,
-            sequence=sequence,
-            frames=parse_frames(frames),
-            every=every,
-            grid=grid,
-            truth=truth,
-            truth_grid=truth_grid,
-            classes=classes,
-            path_classes=path_classes,
-            palette=palette,
-            thin_m=thin,
-            overwrite=overwrite,
-            progress=progress,
-        )
+        result = make_page(path, html, **chosen, thin_m=thin, overwrite=overwrite, progress=progress)
     if as_json:
         print_json(result)
         return

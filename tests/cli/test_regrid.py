@@ -7,7 +7,7 @@ from helpers.captures import read_tree, write_capture
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.cli.regrid import Coordinates, Preset, parse_grid
+from carlasc.cli.grid_options import Coordinates, Preset, parse_grid
 from carlasc.errors import ArgumentError
 from carlasc.grids import GridSpec
 
