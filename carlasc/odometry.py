@@ -42,7 +42,7 @@ def estimate_poses(
 
     Raises:
         DependencyError: kiss-icp is not installed.
-        ArgumentError: a scan has hardly any points.
+        ArgumentError: a scan of several has hardly any points.
     """
     pipeline: Any = import_extra("kiss_icp.kiss_icp", "kitti")
     config: Any = import_extra("kiss_icp.config", "kitti").KISSConfig()
@@ -50,11 +50,13 @@ def estimate_poses(
     config.data.max_range, config.data.min_range = max_range_m, min_range_m
     config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
     odometry = pipeline.KissICP(config)
-    poses = []
+    poses: list[NDArray[np.float64]] = []
+    sizes: list[int] = []
     for number, points in enumerate(scans):
-        if len(points) < MIN_POINTS:
+        sizes.append(len(points))
+        if number and min(sizes) < MIN_POINTS:  # a scan alone has moved nowhere, however few its points
             raise ArgumentError(
-                f"odometry: expected at least {MIN_POINTS} points in every scan, found {len(points)} in scan {number}: leave it out"
+                f"odometry: expected at least {MIN_POINTS} points in every scan, found {min(sizes)} in scan {sizes.index(min(sizes))}: leave it out"
             )
         standing = (points[:, 2] > -_GROUND_M) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
         odometry.register_frame(np.ascontiguousarray(points[standing, :3], np.float64), np.zeros(0))

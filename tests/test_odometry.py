@@ -41,8 +41,12 @@ def test_kiss_icp_finds_a_known_trajectory_that_starts_at_rest():
 
 def test_an_empty_scan_is_named():
     with pytest.raises(ArgumentError, match="found 3 in scan 0"):
-        estimate_poses([np.zeros((3, 3))])
+        estimate_poses([np.zeros((3, 3))] * 2)
 
 
 def test_no_scans_have_no_poses():
     assert estimate_poses([]).shape == (0, 4, 4)
+
+
+def test_a_scan_alone_is_where_it_is_however_few_its_points():
+    assert np.array_equal(estimate_poses([np.zeros((5, 3))]), np.eye(4)[None])

@@ -47,7 +47,7 @@ class _Commands(MutableMapping[str, Any]):
         if self._loaded[name] is None:
             alone = typer.Typer(add_completion=False, **_SETTINGS)
             alone.command(name)(getattr(importlib.import_module(f"carlasc.cli.{name}"), name))
-            self._loaded[name] = typer.main.get_command(alone)
+            self._loaded[name] = _without_flag_types(typer.main.get_command(alone))
         return self._loaded[name]
 
     def __setitem__(self, name: str, command: Any) -> None:
@@ -63,10 +63,19 @@ class _Commands(MutableMapping[str, Any]):
         return len(self._loaded)
 
 
+def _without_flag_types(command: Any) -> Any:
+    """Take the type out of the help of flags: "--overwrite <bool>" would say that a value follows."""
+    for parameter in command.params:
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+    return command
+
+
 class _Group(CommandGroup):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.commands = _Commands()
+        _without_flag_types(self)
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)

@@ -7,6 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from carlasc.cli import app
 from carlasc.cli.common import CommandGroup, parse_frames, parse_numbers, print_json, report_failures
 from carlasc.errors import ArgumentError, FormatError
 
@@ -79,3 +80,10 @@ def test_version_and_unknown_commands():
         subprocess.run([sys.executable, "-m", "carlasc", "frobnicate"], capture_output=True, check=False).returncode
         == 2
     )
+
+
+def test_help_of_a_flag_names_no_value():
+    result = CliRunner().invoke(app, ["regrid", "--help"], terminal_width=200)
+    (flag,) = (line for line in result.output.splitlines() if "--overwrite" in line)
+    assert "bool" not in flag
+    assert "<" in next(line for line in result.output.splitlines() if "--workers" in line)
