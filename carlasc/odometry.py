@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, import_extra
+from carlasc.geometry import invert
 
 MIN_POINTS = 100  # fewer say nothing about the motion
 _GROUND_M, _NEAR_M = 1.5, 8.0  # far points so deep below the sensor are ground
@@ -63,4 +64,4 @@ def estimate_poses(
         poses.append(np.array(odometry.last_pose))
         if progress:
             progress(number + 1, total or number + 1)
-    return np.linalg.inv(poses[0]) @ np.stack(poses) if poses else np.empty((0, 4, 4))
+    return invert(poses[0]) @ np.stack(poses) if poses else np.empty((0, 4, 4))

@@ -17,7 +17,7 @@ from carlasc.converting.results import Steps
 from carlasc.errors import CarlascError
 from carlasc.geometry import invert, transform_points
 from carlasc.labels import ClassTable
-from carlasc.motion.instance_flow import estimate_velocities
+from carlasc.motion.paths import estimate_path
 from carlasc.workers import run_all
 
 _BLOCK = 16  # frames that a worker looks at in one go
@@ -128,7 +128,7 @@ def _follow(chase: _Chase) -> list[tuple[float, ...]]:
     """Return the actor's velocity in each of its frames, sensor frame; nothing where it goes nowhere."""
     sightings = [_points(chase, index) for index in range(len(chase.handles))]
     rigid = chase.label not in chase.classes.deformable
-    velocities = estimate_velocities(sightings, chase.seconds, rigid=rigid)
+    velocities = estimate_path(sightings, chase.seconds, rigid=rigid)[1]
     if not chase.classes.moving:
         way = np.trapezoid(velocities, chase.seconds, axis=0)
         if np.linalg.norm(way) < _STANDING_M:

@@ -199,9 +199,8 @@ class ScanFeed:
             ):  # only tracks tell which of these move
                 segments = [segment for scan in scans for segment in scan.segments]
                 times = {frame: self._time(frame) for frame in near}
-                tracks = link_segments(
-                    segments, times, {frame: s.standing for frame, s in zip(near, scans, strict=True)}
-                )
+                standing = {frame: scan.standing for frame, scan in zip(near, scans, strict=True)}
+                tracks = link_segments(segments, times, standing, deformable=self.classes.deformable)
         return Merger(_Scans(self), tracks, moving, self.classes, self.merging.dynamic)
 
     def _time(self, frame: int) -> float:

@@ -1,9 +1,8 @@
-"""Where an actor was, from its points alone.
+"""Registration: the sightings of a rigid actor laid on each other.
 
-Of a car one sees the sides that face the sensor, and others a second later, so the middle of what is seen wanders over the car, and
-points laid on points slide along its flanks. But the end nearest to the sensor is always in sight. So each sighting is hung up by its
-near end and its near side, the car's length and width coming from the sightings that show the most of it, and then laid on what
-all of them together show. Because an actor's acceleration is bounded, and the error of a sighting is not, the path is smoothed.
+Of a car that drives by one sees a flank for long, and points laid on points slide along it. So an actor is followed from scan to scan: where it
+will be is predicted from its motion so far, and its points, laid on the planes of all that was seen of it before, correct the prediction
+only as far as those planes tell: across a flank, and along the way where its front or back is in sight.
 """
 
 from __future__ import annotations
@@ -14,180 +13,148 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import rotation_z
+from carlasc.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.motion.smoothing import smooth
 
-_OUTLIERS = 0.01  # share of points at either end that may be somebody else's
-_FULL = 0.9  # the quantile of sightings, by what they show, that counts as showing all
-_ROUNDS, _SETTLINGS = 4, 2
-_POINTS = 200  # of a sighting are looked at
-_CELL_M, _MODEL_POINTS = 0.15, 1500
-_COMPARED, _APART_S = 12, 1.0  # pairs of sightings, and how far apart in time, that tell standing from moving
-_FAR_M, _DOUBT_M = 0.5, 0.02
-_OVERLAID_M = 0.38  # sightings of what stands are nearer to each other, though each shows another side of it
-_SMOOTH_S = 0.5  # half width of the window in which motion is taken as uniformly accelerated
-_HEADING_S = 0.8  # half width of the window that the direction of motion comes from
-_HEADING_SPEED_M_S = 0.7  # slower actors are not going anywhere
+_FIRST_LOOK_S = 0.5  # half width of the window in which the first guess of the motion is even
+_POINTS = 300  # of a sighting are laid on the model
+_MODEL_CELL_M, _MODEL_POINTS = 0.15, 1200
+_PLANE_M = 0.5  # points so near each other tell a plane
+_LINE_M = 0.06  # points that spread no more across are a line, which has no plane
+_ITERATIONS = 8
+_FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
+_POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and how many of a sighting count as errors of their own
+_PREDICTED = np.array([0.2, 0.2, 0.05, 0.02])  # error of a prediction over a scan: x, y, z in metres, yaw in radians
+_UNKNOWN = 5.0  # so much greater it is while the motion is not known yet
+_ROBUST = 0.3  # of the reach: pairs farther off their plane count less and less
+_GAIN = 0.3  # how fast the motion follows what was found
 
 
-def register(
-    sightings: Sequence[NDArray[np.float64]], origins: NDArray[np.float64], seconds: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Estimate the path of an upright actor that stands or moves forward.
+def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Register the sightings of a rigid actor that stands upright, outwards from the one that shows most of it.
 
     Args:
         sightings: of each time, (M, 3) points of the actor, world.
-        origins: (F, 3) where the sensor was, world.
         seconds: (F,) times, rising.
 
     Returns:
-        positions: (F, 3) middle of the actor's box, world.
-        velocities: (F, 3) m/s; all zero for an actor that stands.
-        headings: (F,) radians, unwrapped: the direction of motion.
+        (F, 3) middle of the actor, world.
     """
-    thinned = [points[:: -(-len(points) // _POINTS)] for points in sightings]
-    weights = np.minimum([len(points) for points in sightings], _POINTS).astype(np.float64)
-    middles = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in sightings])
-    positions, velocities = smooth(middles, seconds, weights)
-    headings = _headings(positions, seconds, weights)
-    for _ in range(_ROUNDS):
-        middles, trust = _hang_up(sightings, origins, headings)
-        positions, velocities = smooth(middles, seconds, weights * trust)
-        headings = _headings(positions, seconds, weights)
-    for _ in range(_SETTLINGS):
-        settled = _settle(thinned, positions, headings)
-        positions, velocities = smooth(settled, seconds, weights)
-        headings = _headings(positions, seconds, weights)
-    if _stands(thinned, positions, headings, seconds):
-        middle = (np.concatenate(thinned).min(axis=0) + np.concatenate(thinned).max(axis=0)) / 2
-        return np.tile(middle, (len(seconds), 1)), np.zeros_like(positions), np.zeros(len(seconds))
-    return positions, velocities, headings
-
-
-def _stands(
-    sightings: Sequence[NDArray[np.float64]],
-    positions: NDArray[np.float64],
-    headings: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-) -> bool:
-    """Whether sightings lie on each other as well without any motion as with the one found."""
-    body = [_to_body(points, positions[i], headings[i]) for i, points in enumerate(sightings)]
-    still, moved = [], []
-    for i in np.unique(np.linspace(0, len(seconds) - 1, _COMPARED).astype(int)):
-        j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
-        if j != i:
-            still.append(_apart(sightings[i], sightings[j]))
-            moved.append(_apart(body[i], body[j]))
-    if not still:
-        return True
-    # A path that was lost overlays badly too: standing must also look like standing.
-    return float(np.mean(still)) < min(float(np.mean(moved)) + _DOUBT_M, _OVERLAID_M)
-
-
-def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return how far, in the mean, points are from the nearest of others; farther than `_FAR_M` counts as that."""
-    return float(np.minimum(np.sqrt(_nearest(points, others)[1]), _FAR_M).mean())
-
-
-def _settle(
-    sightings: Sequence[NDArray[np.float64]], positions: NDArray[np.float64], headings: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return (F, 3) positions after each sighting was laid, by its nearest points, on what all of them together show."""
-    body = [_to_body(points, positions[i], headings[i]) for i, points in enumerate(sightings)]
-    together = np.concatenate(body)
-    _, first = np.unique(np.floor(together / _CELL_M).astype(np.int64), axis=0, return_index=True)
-    model = together[np.sort(first)]
-    model = model[:: -(-len(model) // _MODEL_POINTS)]
-    settled = positions.copy()
-    for i, points in enumerate(body):
-        shift = np.zeros(3)
-        for reach in (0.6, 0.4, 0.3):
-            nearest, squared = _nearest(points + shift, model)
-            pairs = squared < reach**2
-            if np.count_nonzero(pairs) >= 3:
-                shift = shift + (model[nearest[pairs]] - points[pairs] - shift).mean(axis=0)
-        settled[i] = positions[i] - rotation_z(headings[i])[:3, :3] @ shift
-    return settled
-
-
-def _to_body(points: NDArray[np.float64], position: NDArray[np.float64], heading: float) -> NDArray[np.float64]:
-    return (points - position) @ rotation_z(heading)[:3, :3]
-
-
-def _hang_up(
-    sightings: Sequence[NDArray[np.float64]],
-    origins: NDArray[np.float64],
-    headings: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (F, 3) middles of the actor's box, each found from the ends that face the sensor, and how far to trust each: (F,)."""
-    cos, sin = np.cos(headings), np.sin(headings)
-    turn = np.zeros((len(headings), 3, 3))  # world to heading
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cos, sin, -sin, cos, 1.0
-    ends = np.stack(
-        [np.quantile(points @ turn[i].T, [_OUTLIERS, 1 - _OUTLIERS], axis=0) for i, points in enumerate(sightings)]
-    )
-    lower, upper = ends[:, 0], ends[:, 1]
     counts = np.array([len(points) for points in sightings])
-    size = np.quantile((upper - lower)[counts >= np.median(counts)], _FULL, axis=0)
-    eye = np.einsum("fij,fj->fi", turn, origins)
-    middles = (lower + upper) / 2
-    middles = np.where(eye <= lower, lower + size / 2, middles)
-    middles = np.where(eye >= upper, upper - size / 2, middles)
-    beside = ((eye > lower) & (eye < upper))[:, 0]
-    half_hidden = beside & ((upper - lower)[:, 0] < 0.8 * size[0])  # of such a flank, nothing tells which part it is
-    return np.einsum("fji,fj->fi", turn, middles), np.where(half_hidden, 0.1, 1.0)
+    middles = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in sightings])
+    best = best_sighting(counts)
+    states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
+    states[best, :3] = middles[best]
+    motion = np.append(
+        smooth(middles, seconds, np.minimum(counts, 200.0), _FIRST_LOOK_S)[1][best], 0.0
+    )  # of these, a second
+    model = _thin(sightings[best] - middles[best])
+    seen = 0
+    for step, stop in ((1, len(counts)), (-1, -1)):
+        velocity, previous = motion, best
+        for index in range(best + step, stop, step):
+            elapsed = seconds[index] - seconds[previous]
+            predicted = states[previous] + velocity * elapsed
+            error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
+            points = sightings[index][:: -(-len(sightings[index]) // _POINTS)]
+            states[index] = _lay(points, model, _normals(model), predicted, error)
+            velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
+            motion = (
+                velocity if seen < _UNKNOWN and step == 1 else motion
+            )  # the way back starts with what is known by then
+            model = _thin(np.concatenate([model, transform_points(invert(_pose(states[index])), points)]))
+            previous, seen = index, seen + 1
+    middle = (np.quantile(model, 0.01, axis=0) + np.quantile(model, 0.99, axis=0)) / 2
+    return np.stack([transform_points(_pose(state), middle) for state in states])
 
 
-def smooth(
-    values: NDArray[np.float64], seconds: NDArray[np.float64], weights: NDArray[np.float64], half_s: float = _SMOOTH_S
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a parabola around each time, robustly; a straight line where there are few values.
-
-    Args:
-        values: (F, D).
-        seconds: (F,) times, rising.
-        weights: (F,) of the values.
-        half_s: half width of the window of each fit, seconds.
-
-    Returns:
-        (F, D) values of the fits, and their (F, D) derivatives.
-    """
-    smoothed, slopes = values.copy(), np.zeros_like(values)
-    for index, now in enumerate(seconds):
-        near = np.flatnonzero(np.abs(seconds - now) <= half_s + 1e-9)
-        if len(near) < 4:  # a window that reaches as far as it must
-            near = np.sort(np.argsort(np.abs(seconds - now), kind="stable")[:4])
-        offsets = seconds[near] - now
-        degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
-        design = offsets[:, None] ** np.arange(degree + 1)
-        weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
-        for _ in range(3):  # reweighted: a sighting half hidden must not bend the path
-            root = np.sqrt(weight)[:, None]
-            fit = np.linalg.lstsq(design * root, values[near] * root, rcond=None)[0]
-            error = np.linalg.norm(values[near] - design @ fit, axis=1)
-            weight = weight / (1 + (error / max(3 * float(np.median(error)), 0.02)) ** 2)
-        smoothed[index] = fit[0]
-        slopes[index] = fit[1] if degree else 0.0
-    return smoothed, slopes
-
-
-def _headings(
-    positions: NDArray[np.float64], seconds: NDArray[np.float64], weights: NDArray[np.float64]
+def _lay(
+    points: NDArray[np.float64],
+    model: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    error: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return (F,) directions of motion, unwrapped; where the actor is slow, those before and after."""
-    velocities = smooth(positions[:, :2], seconds, weights, _HEADING_S)[1]
-    fast = np.flatnonzero(np.linalg.norm(velocities, axis=1) > _HEADING_SPEED_M_S)
-    if not len(fast):
-        way = positions[-1, :2] - positions[0, :2]
-        return np.full(len(positions), np.arctan2(way[1], way[0]))
-    angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
-    return np.interp(np.arange(len(positions)), fast, angles)
+    """Return the state, near the predicted one, that lays points on the planes of the model."""
+    state = predicted.copy()
+    for iteration in range(_ITERATIONS):
+        reach = _FIRST_REACH_M * (_LAST_REACH_M / _FIRST_REACH_M) ** (iteration / (_ITERATIONS - 1))
+        pose = _pose(state)
+        nearest, squared = nearest_points(transform_points(invert(pose), points), model)
+        pairs = np.flatnonzero(squared < reach**2)
+        information = np.diag(1 / error**2)
+        pull = information @ (predicted - state)
+        if len(pairs) >= 3:
+            arm = model[nearest[pairs]] @ pose[:3, :3].T
+            normal = normals[nearest[pairs]] @ pose[:3, :3].T
+            off = ((points[pairs] - pose[:3, 3] - arm) * normal).sum(axis=1)
+            turning = arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]
+            slope = np.column_stack([normal, turning])
+            robust = 1 / (1 + (off / max(2 * _POINT_M, _ROBUST * reach)) ** 2)
+            weight = robust * min(1.0, _INDEPENDENT / len(pairs)) / _POINT_M**2
+            information = information + (slope * weight[:, None]).T @ slope
+            pull = pull + (slope * weight[:, None]).T @ off
+        state = state + np.linalg.solve(information, pull)
+    return state
+
+
+def _pose(state: NDArray[np.float64]) -> Transform:
+    pose = rotation_z(float(state[3]))
+    pose[:3, 3] = state[:3]
+    return pose
+
+
+def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Keep one point a cell, and at most so many."""
+    _, first = np.unique(np.floor(points / _MODEL_CELL_M).astype(np.int64), axis=0, return_index=True)
+    kept = points[np.sort(first)]
+    return kept[:: -(-len(kept) // _MODEL_POINTS)]
+
+
+def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (M, 3) normals of the planes around the model's points; the longer where the points around are flat.
+
+    A normal of length zero says that nothing is known: a lonely point, a line.
+    """
+    values, vectors = np.linalg.eigh(_covariances(model, _PLANE_M))
+    flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
+    flat[values[:, 1] < _LINE_M**2] = 0.0
+    return vectors[:, :, 0] * np.sqrt(flat)[:, None]
+
+
+def best_sighting(counts: NDArray[np.integer]) -> int:
+    """Return the sighting to start with: of many points, and not at an end of the track."""
+    inner = np.arange(len(counts))
+    return int(np.argmax(counts * np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)))
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest(points: NDArray[np.float64], model: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _covariances(model: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Return the (M, 3, 3) covariance of the points within a radius of each."""
+    covariances = np.zeros((len(model), 3, 3))
+    for i in range(len(model)):
+        count, total, square = 0, np.zeros(3), np.zeros((3, 3))
+        for j in range(len(model)):
+            dx, dy, dz = model[j, 0] - model[i, 0], model[j, 1] - model[i, 1], model[j, 2] - model[i, 2]
+            if dx * dx + dy * dy + dz * dz < radius * radius:
+                offset = (dx, dy, dz)
+                count += 1
+                for a in range(3):
+                    total[a] += offset[a]
+                    for b in range(3):
+                        square[a, b] += offset[a] * offset[b]
+        for a in range(3):
+            for b in range(3):
+                covariances[i, a, b] = square[a, b] / count - total[a] * total[b] / (count * count)
+    return covariances
+
+
+@numba.njit(cache=True, nogil=True)
+def nearest_points(
+    points: NDArray[np.float64], model: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the index of the model point nearest to each point, and the squared distance: all pairs, they are few."""
-    index = np.zeros(len(points), np.int64)
-    squared = np.full(len(points), np.inf)
+    index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     for i in range(len(points)):
         for j in range(len(model)):
             dx, dy, dz = points[i, 0] - model[j, 0], points[i, 1] - model[j, 1], points[i, 2] - model[j, 2]

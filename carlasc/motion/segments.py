@@ -27,7 +27,6 @@ class Segment:
         members: (M,) int64 indices into the scan's points.
         points: (M, 3) float64 metres, world.
         velocity: (3,) m/s over ground, world; None where the scan has no flow.
-        origin: (3,) where the sensor was, world.
         instance: number of the actor, 0 where actors have none.
     """
 
@@ -36,7 +35,6 @@ class Segment:
     members: NDArray[np.int64]
     points: NDArray[np.float64]
     velocity: NDArray[np.float64] | None
-    origin: NDArray[np.float64]
     instance: int = 0
 
     @property
@@ -71,9 +69,9 @@ def segment_by_flow(
     points = transform_points(world_T_sensor, scan.points[moving])
     velocity = rotate_vectors(world_T_sensor, flow[moving])
     labels = scan.labels[moving].astype(np.int64)
-    actor, origin = _join(points, velocity, labels), world_T_sensor[:3, 3]
+    actor = _join(points, velocity, labels)
     return [
-        Segment(frame, int(labels[own[0]]), moving[own], points[own], np.median(velocity[own], axis=0), origin)
+        Segment(frame, int(labels[own[0]]), moving[own], points[own], np.median(velocity[own], axis=0))
         for own in _groups(actor)
     ]
 
@@ -99,11 +97,7 @@ def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> l
         members = numbered[own]
         label = int(np.bincount(scan.labels[members]).argmax())
         velocity = None if flow is None else np.median(flow[own], axis=0)
-        segments.append(
-            Segment(
-                frame, label, members, points[own], velocity, world_T_sensor[:3, 3], int(scan.instances[members[0]])
-            )
-        )
+        segments.append(Segment(frame, label, members, points[own], velocity, int(scan.instances[members[0]])))
     return segments
 
 
@@ -116,19 +110,17 @@ class Standing:
         members: (M,) int64 indices into the scan's points.
         labels: (M,) class of each.
         points: (M, 3) float64 metres, world.
-        origin: (3,) where the sensor was, world.
     """
 
     frame: int
     members: NDArray[np.int64]
     labels: NDArray[np.int64]
     points: NDArray[np.float64]
-    origin: NDArray[np.float64]
 
     @classmethod
     def none(cls, frame: int) -> Standing:
         """Return no points at all."""
-        return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)), np.zeros(3))
+        return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
     def in_place_of(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
         """Return the standing points of a segment's class where the segment was, None where there are hardly any."""
@@ -138,7 +130,7 @@ class Standing:
         )
         if len(own) < max(5, len(segment.members) // 5):
             return None
-        return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3), self.origin)
+        return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3))
 
 
 def standing_points(
@@ -150,7 +142,7 @@ def standing_points(
     slow = ~(np.square(np.nan_to_num(scan.flow)).sum(axis=1) > min_speed_m_s**2)
     members = np.flatnonzero(slow & np.isin(scan.labels, sorted(labels)))
     points = transform_points(world_T_sensor, scan.points[members])
-    return Standing(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
+    return Standing(frame, members, scan.labels[members].astype(np.int64), points)
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.geometry import Transform, invert, rotation_z, transform_points
-from carlasc.motion.registration import register
+from carlasc.motion.paths import estimate_path, headings_of, stands
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment, Standing
 
 _REACH_M, _FASTEST_M_S = 15.0, 40.0  # a quick look first: nothing is longer or faster
@@ -18,7 +18,6 @@ _SAME_VELOCITY_M_S = 2.0  # an actor's velocity changes by no more between two s
 _STOPPING_M_S = 1.5  # slower actors may stand still in the next scan, or have stood still in the last
 _MAX_GAP = 15  # frames that an actor may be hidden and still be the same
 _EXTRAPOLATE = 5  # frames that a track goes on before its first and after its last sighting
-_HEADING_SPEED_M_S = 1.0  # faster actors look where they go
 _STANDING_M = 0.5  # what is seen of a standing actor may wander as much
 _TRIM = 0.01  # share of points that may stick out of an actor's box: flying pixels, a neighbour's
 _MARGIN_M = 0.1
@@ -71,7 +70,11 @@ class Track:
 
 
 def link_segments(
-    segments: Iterable[Segment], times: Mapping[int, float], standing: Mapping[int, Standing] | None = None
+    segments: Iterable[Segment],
+    times: Mapping[int, float],
+    standing: Mapping[int, Standing] | None = None,
+    *,
+    deformable: Collection[int] = (),
 ) -> list[Track]:
     """Link the segments of several scans into tracks.
 
@@ -82,6 +85,7 @@ def link_segments(
         segments: of all scans, in any order.
         times: seconds by frame, for every frame of a segment.
         standing: of each scan, points that stand still: an actor that stops at a crossing is found among them, until it goes on.
+        deformable: classes whose actors bend as they move: without flow, their middle is followed.
 
     Returns:
         Tracks in the order of their first sighting.
@@ -90,7 +94,7 @@ def link_segments(
     chains = _chains(ordered, times, standing or {})
     for chain in chains:
         _look_back(chain, standing or {})
-    return [_make_track(chain, times) for chain in chains]
+    return [_make_track(chain, times, deformable) for chain in chains]
 
 
 def _chains(
@@ -173,16 +177,19 @@ def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
     return distance + change + 0.1 * offset
 
 
-def _make_track(chain: list[Segment], times: Mapping[int, float]) -> Track:
+def _make_track(chain: list[Segment], times: Mapping[int, float], deformable: Collection[int]) -> Track:
     """Turn linked segments into a path, then into poses with the box around everything that was seen."""
     seconds = np.array([times[segment.frame] for segment in chain])
+    label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
     if any(segment.velocity is None for segment in chain):
-        origins = np.stack([segment.origin for segment in chain])
-        positions, velocities, headings = register([segment.points for segment in chain], origins, seconds)
+        sightings = [segment.points for segment in chain]
+        positions, velocities = estimate_path(sightings, seconds, rigid=label not in deformable)
+        if stands(sightings, positions, headings_of(velocities), seconds):
+            positions, velocities = np.zeros_like(positions), np.zeros_like(velocities)
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
         positions = _integrate(velocities, seconds, chain)
-        headings = _headings(velocities)
+    headings = headings_of(velocities)
     positions, lower, upper = _fit_box(chain, positions, headings)
     first, last = chain[0].frame - _EXTRAPOLATE, chain[-1].frame + _EXTRAPOLATE
     frames = np.arange(first, last + 1)
@@ -190,10 +197,7 @@ def _make_track(chain: list[Segment], times: Mapping[int, float]) -> Track:
     path, speed, angle = _resample(at, seconds, positions, velocities, headings)
     poses = np.stack([rotation_z(a) for a in angle])
     poses[:, :3, 3] = path
-    labels = np.bincount([s.label for s in chain], [len(s.members) for s in chain])
-    return Track(
-        int(labels.argmax()), chain[0].instance, {s.frame: s for s in chain}, first, poses, speed, lower, upper
-    )
+    return Track(label, chain[0].instance, {s.frame: s for s in chain}, first, poses, speed, lower, upper)
 
 
 def _integrate(
@@ -204,16 +208,6 @@ def _integrate(
     path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     best = int(np.argmax([len(segment.members) for segment in chain]))
     return path - path[best] + chain[best].center
-
-
-def _headings(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) headings in radians, unwrapped: the direction of motion, held while the actor is slow."""
-    fast = np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
-    if not len(fast):
-        mean = velocities.mean(axis=0)
-        return np.full(len(velocities), np.arctan2(mean[1], mean[0]))
-    angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
-    return np.interp(np.arange(len(velocities)), fast, angles)
 
 
 def _fit_box(

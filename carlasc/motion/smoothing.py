@@ -1,0 +1,39 @@
+"""Smoothing: an actor's acceleration is bounded, the error of where it was seen is not."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def smooth(
+    values: NDArray[np.float64], seconds: NDArray[np.float64], weights: NDArray[np.float64], half_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fit a parabola around each time, robustly; a straight line where there are few values.
+
+    Args:
+        values: (F, D).
+        seconds: (F,) times, rising.
+        weights: (F,) of the values.
+        half_s: half width of the window of each fit, seconds.
+
+    Returns:
+        (F, D) values of the fits, and their (F, D) derivatives.
+    """
+    smoothed, slopes = values.copy(), np.zeros_like(values)
+    for index, now in enumerate(seconds):
+        near = np.flatnonzero(np.abs(seconds - now) <= half_s + 1e-9)
+        if len(near) < 4:  # a window that reaches as far as it must
+            near = np.sort(np.argsort(np.abs(seconds - now), kind="stable")[:4])
+        offsets = seconds[near] - now
+        degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
+        design = offsets[:, None] ** np.arange(degree + 1)
+        weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
+        for _ in range(3):  # reweighted: a sighting half hidden must not bend the path
+            root = np.sqrt(weight)[:, None]
+            fit = np.linalg.lstsq(design * root, values[near] * root, rcond=None)[0]
+            error = np.linalg.norm(values[near] - design @ fit, axis=1)
+            weight = weight / (1 + (error / max(3 * float(np.median(error)), 0.02)) ** 2)
+        smoothed[index] = fit[0]
+        slopes[index] = fit[1] if degree else 0.0
+    return smoothed, slopes
