@@ -48,7 +48,7 @@ def estimate_path(
         follow(chosen, at) if rigid else np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in chosen])
     )
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
-    velocities = _bounded(velocities, at, counts[enough])
+    velocities = _bounded(velocities, at, best_sighting(chosen))
     beyond = np.minimum(seconds - at[0], 0) + np.maximum(seconds - at[-1], 0)
     velocities = np.stack([np.interp(seconds, at, velocities[:, axis]) for axis in range(3)], axis=1)
     positions = np.stack([np.interp(seconds, at, positions[:, axis]) for axis in range(3)], axis=1)
@@ -98,12 +98,10 @@ def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
     return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _FAR_M).mean())
 
 
-def _bounded(
-    velocities: NDArray[np.float64], seconds: NDArray[np.float64], counts: NDArray[np.integer]
-) -> NDArray[np.float64]:
+def _bounded(velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int) -> NDArray[np.float64]:
     """Let velocity change no faster than an actor can, going out from where it is known best: not at the ends of a track."""
-    best, bounded = best_sighting(counts), velocities.copy()
-    for step, stop in ((1, len(counts)), (-1, -1)):
+    bounded = velocities.copy()
+    for step, stop in ((1, len(seconds)), (-1, -1)):
         for index in range(best + step, stop, step):
             before = bounded[index - step]
             change = velocities[index] - before

@@ -24,14 +24,16 @@ _LINE_M = 0.06  # points that spread no more across are a line, which has no pla
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
 _POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and how many of a sighting count as errors of their own
-_PREDICTED = np.array([0.2, 0.2, 0.05, 0.02])  # error of a prediction over a scan: x, y, z in metres, yaw in radians
+_PREDICTED = np.array(
+    [0.2, 0.2, 0.01, 0.02]
+)  # error of a prediction over a scan: x, y, z in metres (streets are even), yaw in radians
 _UNKNOWN = 5.0  # so much greater it is while the motion is not known yet
 _ROBUST = 0.3  # of the reach: pairs farther off their plane count less and less
 _GAIN = 0.3  # how fast the motion follows what was found
 
 
 def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Register the sightings of a rigid actor that stands upright, outwards from the one that shows most of it.
+    """Register the sightings of a rigid actor that stands upright, outwards from the one that shows it best.
 
     Args:
         sightings: of each time, (M, 3) points of the actor, world.
@@ -42,12 +44,11 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
     """
     counts = np.array([len(points) for points in sightings])
     middles = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in sightings])
-    best = best_sighting(counts)
+    best = best_sighting(sightings)
     states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
     states[best, :3] = middles[best]
-    motion = np.append(
-        smooth(middles, seconds, np.minimum(counts, 200.0), _FIRST_LOOK_S)[1][best], 0.0
-    )  # of these, a second
+    first_look = smooth(middles, seconds, np.minimum(counts, 200.0), _FIRST_LOOK_S)[1]
+    motion = np.append(first_look[best], 0.0)  # of these, a second
     model = _thin(sightings[best] - middles[best])
     seen = 0
     for step, stop in ((1, len(counts)), (-1, -1)):
@@ -59,9 +60,8 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
             points = sightings[index][:: -(-len(sightings[index]) // _POINTS)]
             states[index] = _lay(points, model, _normals(model), predicted, error)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
-            motion = (
-                velocity if seen < _UNKNOWN and step == 1 else motion
-            )  # the way back starts with what is known by then
+            if seen < _UNKNOWN and step == 1:
+                motion = velocity  # the way back starts with what is known by then
             model = _thin(np.concatenate([model, transform_points(invert(_pose(states[index])), points)]))
             previous, seen = index, seen + 1
     middle = (np.quantile(model, 0.01, axis=0) + np.quantile(model, 0.99, axis=0)) / 2
@@ -122,10 +122,14 @@ def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors[:, :, 0] * np.sqrt(flat)[:, None]
 
 
-def best_sighting(counts: NDArray[np.integer]) -> int:
-    """Return the sighting to start with: of many points, and not at an end of the track."""
-    inner = np.arange(len(counts))
-    return int(np.argmax(counts * np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)))
+def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
+    """Return the sighting to start with: its points scatter most across, so it shows two sides, and it is not at an end of the track."""
+    across = [
+        len(points) * np.linalg.eigvalsh(np.cov(points[:, :2], rowvar=False))[0] if len(points) > 2 else 0.0
+        for points in sightings
+    ]
+    inner = np.arange(len(sightings))
+    return int(np.argmax(np.array(across) * np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)))
 
 
 @numba.njit(cache=True, nogil=True)
