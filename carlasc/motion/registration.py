@@ -20,6 +20,7 @@ _FIRST_LOOK_S = 0.5  # half width of the window in which the first guess of the 
 _POINTS = 300  # of a sighting are laid on the model
 _MODEL_CELL_M, _MODEL_POINTS = 0.15, 1200
 _PLANE_M = 0.5  # points so near each other tell a plane
+_FLANK_M = 0.14  # points of a flank alone scatter no more across it
 _LINE_M = 0.06  # points that spread no more across are a line, which has no plane
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
@@ -123,13 +124,12 @@ def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
-    """Return the sighting to start with: its points scatter most across, so it shows two sides, and it is not at an end of the track."""
-    across = [
-        len(points) * np.linalg.eigvalsh(np.cov(points[:, :2], rowvar=False))[0] if len(points) > 2 else 0.0
-        for points in sightings
-    ]
+    """Return the sighting to start with: of many points, more than a bare flank, and not at an end of the track."""
+    counts = np.array([len(points) for points in sightings])
+    across = [np.linalg.eigvalsh(np.cov(p[:, :2], rowvar=False))[0] if len(p) > 2 else 0.0 for p in sightings]
     inner = np.arange(len(sightings))
-    return int(np.argmax(np.array(across) * np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)))
+    amid = np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)
+    return int(np.argmax(counts * np.clip(np.array(across) / _FLANK_M**2, 1e-6, 1.0) * amid))
 
 
 @numba.njit(cache=True, nogil=True)

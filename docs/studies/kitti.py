@@ -95,7 +95,7 @@ def main(out: Path) -> None:
                 print(lines[-1], flush=True)
         out.mkdir(parents=True, exist_ok=True)
         draw(made, {frame: truth["0.2 m"] for frame, truth in truths.items()}, out / "kitti.png")
-    Path(__file__).with_suffix(".md").write_text("\n".join(lines) + "\n")
+    (out / "kitti.md").write_text("\n".join(lines) + "\n")
 
 
 def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) -> None:

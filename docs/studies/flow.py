@@ -1,0 +1,63 @@
+"""How true is the flow that `carlasc convert kitti` estimates? `python docs/studies/flow.py [SEED ...]` prints the table.
+
+Simulated drives in heavy traffic are written as SemanticKITTI's files, which have no flow, and converted; the velocity that each sighting of a moving
+actor was given is compared with the simulator's.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import carlasc
+from carlasc.converting import convert
+from carlasc.labels import CARLA
+from carlasc.simulation import Drive
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+from helpers.kitti import write_kitti
+
+FRAMES = range(20, 100)
+MIRROR = np.array([1, -1, 1])
+VEHICLE, PEDESTRIAN = (float(CARLA.id_of(name)) for name in ("Vehicle", "Pedestrian"))
+ROWS = {  # name: class, speeds in m/s, numbers of points
+    "vehicles at 5 to 12 m/s, 100 points or more": (VEHICLE, (5.0, 12.0), (100, np.inf)),
+    "vehicles from 5 m/s, 20 to 99 points": (VEHICLE, (5.0, np.inf), (20, 99)),
+    "slower vehicles, 100 points or more": (VEHICLE, (0.3, 5.0), (100, np.inf)),
+    "pedestrians, 30 points or more": (PEDESTRIAN, (0.3, np.inf), (30, np.inf)),
+}
+
+
+def compare(seed: int) -> NDArray[np.float64]:
+    """Return (S, 4) of a drive's sightings of moving actors: class, true speed, number of points, end-point error."""
+    drive, found = Drive(seed, "heavy"), []
+    with tempfile.TemporaryDirectory() as place:
+        root = Path(place)
+        truth = write_kitti(root / "in", drive, FRAMES, voxels_every=0)
+        convert("kitti", root / "in", root / "out", grids="none", workers=2)
+        (sequence,) = carlasc.open(root / "out").sequences().values()
+        for number in truth.frames:
+            scan, flow = sequence.scan(number), truth.flow[number] * MIRROR
+            assert scan.flow is not None and scan.labels is not None and scan.instances is not None
+            for actor in np.unique(scan.instances[np.abs(flow).max(axis=1) > 0]).tolist():
+                own = np.flatnonzero(scan.instances == actor)
+                error = np.linalg.norm(scan.flow[own[0]] - flow[own[0]])
+                found.append((scan.labels[own[0]], np.linalg.norm(flow[own[0]]), len(own), error))
+    return np.array(found, np.float64)
+
+
+def main(seeds: list[int]) -> None:
+    """Print the table."""
+    label, speed, points, error = np.concatenate([compare(seed) for seed in seeds]).T
+    print("| | median | 3 of 4 below | sightings |", "|---|---:|---:|---:|", sep="\n")
+    for name, (wanted, (slowest, fastest), (fewest, most)) in ROWS.items():
+        own = error[(label == wanted) & (speed >= slowest) & (speed < fastest) & (points >= fewest) & (points <= most)]
+        print(f"| {name} | {np.median(own):.3f} | {np.quantile(own, 0.75):.3f} | {len(own)} |")
+
+
+if __name__ == "__main__":
+    main([int(seed) for seed in sys.argv[1:]] or [1, 2])
