@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import scan, write_dataset
+from helpers.sequences import scan
 from sources.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
@@ -16,6 +15,7 @@ from carlasc.sources.hdf5_store import HDF5Sink
 from carlasc.sources.packed import Options
 
 h5py = pytest.importorskip("h5py")
+ENDING = ".h5"
 
 
 class TestHDF5Source(SourceContract):
@@ -30,21 +30,6 @@ class TestHDF5Sink(SinkContract):
 
     def read(self, out: Path) -> Source:
         return carlasc.open(out)
-
-
-@pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("published") / "data")
-
-
-@pytest.fixture(scope="module")
-def packed(published: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return pack(published, tmp_path_factory.mktemp("packed") / "x.h5").out
-
-
-@pytest.fixture
-def store(packed: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copy(packed, tmp_path / "x.h5"))
 
 
 def test_h5py_with_hdf5plugin_reads_the_same_numbers(published: Path, store: Path) -> None:

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import FRAMES, write_dataset
+from helpers.sequences import FRAMES
 from sources.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
@@ -17,6 +16,7 @@ from carlasc.sources.packed import Options
 from carlasc.sources.tablewriter import ParquetSink
 
 parquet = pytest.importorskip("pyarrow.parquet")
+ENDING = ".parquet"
 
 
 class TestParquetSource(SourceContract):
@@ -31,21 +31,6 @@ class TestParquetSink(SinkContract):
 
     def read(self, out: Path) -> Source:
         return carlasc.open(out)
-
-
-@pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("published") / "data")
-
-
-@pytest.fixture(scope="module")
-def packed(published: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return pack(published, tmp_path_factory.mktemp("packed") / "x.parquet").out
-
-
-@pytest.fixture
-def store(packed: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(packed, tmp_path / "x.parquet")
 
 
 def test_frames_are_rows_with_pose_time_and_statistics(published: Path, packed: Path) -> None:

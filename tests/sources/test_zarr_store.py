@@ -1,13 +1,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import files_of, scan, write_dataset
+from helpers.sequences import files_of, scan
 from sources.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
@@ -19,6 +18,7 @@ from carlasc.sources.packed import Options
 from carlasc.sources.zarr_store import ZarrSink
 
 zarr = pytest.importorskip("zarr")
+ENDING = ".zarr"
 
 
 class TestZarrSource(SourceContract):
@@ -52,21 +52,6 @@ class TestZarrSink(SinkContract):
 
     def read(self, out: Path) -> Source:
         return carlasc.open(out)
-
-
-@pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("published") / "data")
-
-
-@pytest.fixture(scope="module")
-def packed(published: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return pack(published, tmp_path_factory.mktemp("packed") / "x.zarr").out
-
-
-@pytest.fixture
-def store(packed: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(packed, tmp_path / "x.zarr")
 
 
 @pytest.mark.parametrize("small", [False, True])
