@@ -188,11 +188,11 @@ def scan_fields(sequence: Sequence, frame: int) -> tuple[str, ...]:
 
 
 def check_trajectory(sequence: Sequence, *, force: bool) -> None:
-    """Check that a sequence has poses, that they are rigid, and that they do not jump.
+    """Check that a sequence has poses, that they are rigid, and that they do not jump; and that its times, if it has any, rise.
 
     Raises:
         MissingDataError: it has none.
-        FormatError: a pose is not rigid, or jumps and `force` is not given; names the frame.
+        FormatError: a pose is not rigid, or jumps and `force` is not given, or a time does not rise; names the frame.
     """
     if "poses" not in vars(sequence) and layout.POSES not in sequence.documents():
         raise MissingDataError(
@@ -200,9 +200,10 @@ def check_trajectory(sequence: Sequence, *, force: bool) -> None:
             " estimated by KISS-ICP (`--poses kiss-icp`)"
         )
     check_rigid(sequence.poses, f"{sequence.location}/{layout.POSES}")
+    frames = sequence.frames("points")
+    _check_times(sequence, frames)
     if force:
         return
-    frames = sequence.frames("points")
     poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
     elapsed = np.diff(frames) * layout.FRAME_PERIOD_S
     speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / elapsed
@@ -214,6 +215,19 @@ def check_trajectory(sequence: Sequence, *, force: bool) -> None:
         raise FormatError(
             f"{sequence.location}/{layout.POSES}: expected a continuous drive, found a jump of {speed[row]:.0f} m/s and"
             f" {turning[row]:.1f} rad/s at frame {frames[row + 1]} ({len(jumps)} jumps in all): mend the poses, or go on with --force"
+        )
+
+
+def _check_times(sequence: Sequence, frames: NDArray[np.int64]) -> None:
+    if layout.TIMES not in sequence.documents():
+        return
+    times = np.array([sequence.read_time(int(frame)) for frame in frames])
+    falls = np.flatnonzero(~(np.diff(times) > 0))
+    if len(falls):
+        row = int(falls[0])
+        raise FormatError(
+            f"{sequence.location}/{layout.TIMES}: expected times that rise, found {times[row]:g} s and {times[row + 1]:g} s at frames {frames[row]}"
+            f" and {frames[row + 1]}: mend the file, or remove it: frames are 0.1 s apart then"
         )
 
 

@@ -133,6 +133,20 @@ def test_an_executor_that_outlives_a_run_sees_the_files_of_the_next(tmp_path):
     assert (grid_of(street, "after").labels != grid_of(street, "before").labels).any()
 
 
+def test_times_that_do_not_rise_are_named(tmp_path):
+    street = passing.write_sequence(tmp_path, ("labels", "instances"))
+    (path,) = street.rglob(layout.TIMES)
+    times = np.arange(passing.FRAMES) * 0.1
+    times[22] = times[21]
+    path.write_bytes(layout.encode_times(times))
+    with pytest.raises(
+        FormatError, match=r"times.txt: expected times that rise, found 2.1 s and 2.1 s at frames 21 and 22"
+    ):
+        make(street, "broken")
+    path.unlink()
+    assert make(street, "without").made == 1
+
+
 def test_frames_keep_their_numbers_and_the_record_says_how(street):
     result = make(street, "numbered", frames=(30, 33), settings={"window": (-4, 4), "stride": 2})
     assert result.made == 3
