@@ -23,11 +23,12 @@ _PER_POINT = ("labels", "flow", "instances")
 def check_documents(sequence: Sequence) -> Iterator[Finding]:
     """Check carlasc.json and each grid's params.json, and that there is something to read at all."""
     where = sequence.location
+    described = True
     try:
-        classes: ClassTable | None = sequence.metadata.classes
+        _ = sequence.metadata
     except CarlascError as error:
+        described = False
         yield Finding.from_error("metadata", sequence.path, f"{where}/{layout.METADATA}", error)
-        classes = None
     try:
         grids = sequence.grids
     except CarlascError as error:
@@ -44,10 +45,12 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
     for name, spec in grids.items():
         file, params = f"{where}/{layout.params_file(name)}", sequence.params(name)
         channels = params.get("num_channels")
+        classes: ClassTable | None = None
         try:
             classes = sequence.classes_of(name)
         except CarlascError as error:
-            yield Finding.from_error("params", sequence.path, file, error)
+            if described:  # else it is the same error again
+                yield Finding.from_error("params", sequence.path, file, error)
         if not isinstance(channels, int | float) or (classes is not None and channels < max(classes.names) + 1):
             expected = f"num_channels of at least {max(classes.names) + 1}" if classes else "a number in num_channels"
             yield Finding("warning", "params", sequence.path, file, expected, repr(channels))
@@ -142,14 +145,14 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
         yield Finding("warning", "bev", sequence.path, _file(sequence, "bev", frame), "a JPEG picture", "other bytes")
     for grid in sequence.grids:
         if f"{grid}/labels" in arrays:
-            yield from _check_grid(sequence, grid, frame, arrays, sequence.classes_of(grid))
+            yield from _check_grid(sequence, grid, frame, arrays)
 
 
-def _check_grid(
-    sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]], classes: ClassTable
-) -> Iterator[Finding]:
+def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
     labels, where = arrays[f"{grid}/labels"], _file(sequence, f"{grid}/labels", frame)
-    yield from _check_classes(sequence, labels, classes, where)
+    classes = _classes_of(sequence, grid)
+    if classes is not None:
+        yield from _check_classes(sequence, labels, classes, where)
     if f"{grid}/counts" not in arrays:
         return
     counts, file = arrays[f"{grid}/counts"], _file(sequence, f"{grid}/counts", frame)
@@ -164,6 +167,14 @@ def _check_grid(
         yield Finding("error", "counts", sequence.path, file, "a vote in each voxel that has a label", found, advice)
     if not (counts > 0).any():
         yield Finding("warning", "counts", sequence.path, file, "known voxels", "a grid without any vote")
+
+
+def _classes_of(sequence: Sequence, grid: str) -> ClassTable | None:
+    """The classes of a grid's labels; None where its params.json names unknown ones, which `check_documents` reports."""
+    try:
+        return sequence.classes_of(grid)
+    except CarlascError:
+        return None
 
 
 def _check_classes(

@@ -162,14 +162,25 @@ class Sequence(ABC):
         }
 
     def params(self, grid: str) -> dict[str, Any]:
-        """Return a grid's params.json."""
-        name = layout.params_file(grid)
-        return parse_json(self.read_document(name), f"{self.location}/{name}")
+        """Return a grid's params.json; it is read once."""
+        if grid not in self._params:
+            name = layout.params_file(grid)
+            self._params[grid] = parse_json(self.read_document(name), f"{self.location}/{name}")
+        return self._params[grid]
+
+    @cached_property
+    def _params(self) -> dict[str, dict[str, Any]]:
+        return {}
 
     def classes_of(self, grid: str) -> ClassTable:
         """Return the class table of a grid's labels: the sequence's, unless its params.json names another under `carlasc` (predictions)."""
         name = self._record(grid).get("classes")
-        return self.metadata.classes if name is None else table_named(str(name))
+        if name is None:
+            return self.metadata.classes
+        try:
+            return table_named(str(name))
+        except FormatError as error:
+            raise FormatError(f"{self.location}/{layout.params_file(grid)}: {error}") from error
 
     def predicted_by(self, grid: str) -> str | None:
         """Return the network that predicted a grid, as its params.json says under `carlasc`; None: it is no prediction."""

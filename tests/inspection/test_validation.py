@@ -473,3 +473,11 @@ def test_the_result_turns_into_json(copy: Path) -> None:
     assert values["ok"] is False
     assert values["counts"]["error"] == 1
     assert values["findings"][0]["check"] == "poses"
+
+
+def test_a_grid_of_unknown_classes_is_one_finding_and_the_rest_is_still_checked(copy: Path) -> None:
+    path = copy / "evaluation/params.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"carlasc": {"classes": "lab"}}))
+    result = found(validate(copy))
+    assert "params.json" in result["params"] and "class table 'lab'" in result["params"]
+    assert "class-ids" not in result
