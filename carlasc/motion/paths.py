@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from carlasc.geometry import rotation_z
 from carlasc.motion.registration import best_sighting, follow, nearest_points
-from carlasc.motion.smoothing import smooth
+from carlasc.motion.smoothing import resample, smooth
 
 MIN_POINTS = 10  # fewer say too little; such a sighting inherits from its track
 _FASTEST_CHANGE_M_S2 = 6.0  # of velocity: hard braking, a sharp bend
@@ -49,10 +49,7 @@ def estimate_path(
     )
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
     velocities = _bounded(velocities, at, best_sighting(chosen))
-    beyond = np.minimum(seconds - at[0], 0) + np.maximum(seconds - at[-1], 0)
-    velocities = np.stack([np.interp(seconds, at, velocities[:, axis]) for axis in range(3)], axis=1)
-    positions = np.stack([np.interp(seconds, at, positions[:, axis]) for axis in range(3)], axis=1)
-    return positions + velocities * beyond[:, None], velocities
+    return resample(seconds, at, positions, velocities)
 
 
 def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:

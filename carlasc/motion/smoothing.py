@@ -37,3 +37,16 @@ def smooth(
         smoothed[index] = fit[0]
         slopes[index] = fit[1] if degree else 0.0
     return smoothed, slopes
+
+
+def resample(
+    at: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    velocities: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (A, 3) positions and velocities at the times `at`: linear between the (F,) times known, straight on beyond them."""
+    path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
+    speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
+    beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
+    return path + speed * beyond[:, None], speed

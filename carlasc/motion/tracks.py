@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from carlasc.geometry import Transform, invert, rotation_z, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, stands
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment, Standing
+from carlasc.motion.smoothing import resample
 
 _REACH_M, _FASTEST_M_S = 15.0, 40.0  # a quick look first: nothing is longer or faster
 _GATE_M = 1.5  # a segment is where its track predicts it, to this
@@ -194,8 +195,8 @@ def _make_track(chain: list[Segment], times: Mapping[int, float], deformable: Co
     first, last = chain[0].frame - _EXTRAPOLATE, chain[-1].frame + _EXTRAPOLATE
     frames = np.arange(first, last + 1)
     at = _frame_times(frames, times)
-    path, speed, angle = _resample(at, seconds, positions, velocities, headings)
-    poses = np.stack([rotation_z(a) for a in angle])
+    path, speed = resample(at, seconds, positions, velocities)
+    poses = np.stack([rotation_z(angle) for angle in np.interp(at, seconds, headings)])
     poses[:, :3, 3] = path
     return Track(label, chain[0].instance, {s.frame: s for s in chain}, first, poses, speed, lower, upper)
 
@@ -241,17 +242,3 @@ def _frame_times(frames: NDArray[np.int64], times: Mapping[int, float]) -> NDArr
     inside = np.interp(frames, known, seconds)
     before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
     return inside + (before + after) * period
-
-
-def _resample(
-    at: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    velocities: NDArray[np.float64],
-    headings: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions, velocities and headings at the times `at`: linear between sightings, straight on beyond them."""
-    path = np.stack([np.interp(at, seconds, positions[:, a]) for a in range(3)], axis=1)
-    speed = np.stack([np.interp(at, seconds, velocities[:, a]) for a in range(3)], axis=1)
-    beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
-    return path + speed * beyond[:, None], speed, np.interp(at, seconds, headings)

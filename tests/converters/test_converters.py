@@ -169,7 +169,7 @@ def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path
     write_tiny_kitti(tmp_path / "in", frames=60)
     convert("kitti", tmp_path / "in", tmp_path / "whole", grids="none", workers=1)
     arguments = ["kitti", str(tmp_path / "in"), str(tmp_path / "out"), "--grids", "none", "--workers", "1"]
-    helper = Path(__file__).parents[1] / "helpers" / "interrupted_convert.py"
+    helper = Path(__file__).parents[1] / "helpers" / "interrupted.py"
     done = subprocess.run(
         [sys.executable, helper, name, "100", "convert", *arguments],
         start_new_session=True,

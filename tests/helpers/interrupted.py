@@ -1,24 +1,24 @@
-"""Runs `carlasc regrid` and sends its whole process group a signal after so many frames: `python interrupted.py SIGNAL FRAMES ARGS...`
+"""Runs a command and sends its whole process group a signal after so many frames: `python interrupted.py SIGNAL FRAMES COMMAND ARGS...`
 
 A terminal does the same when somebody presses Ctrl-C: every process of the group gets SIGINT.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import carlasc.cli.regrid as command
 from carlasc.cli import main
 
 
 @contextmanager
 def interrupting_bar(description: str) -> Iterator[Callable[[int, int], None]]:
     def interrupt(done: int, total: int) -> None:
-        if done == frames:
+        if done >= frames:
             os.killpg(os.getpgrp(), number)
 
     yield interrupt
@@ -27,5 +27,6 @@ def interrupting_bar(description: str) -> Iterator[Callable[[int, int], None]]:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     number, frames = signal.Signals[sys.argv.pop(1)], int(sys.argv.pop(1))
-    command.progress_bar = interrupting_bar  # type: ignore[assignment]
+    command = importlib.import_module(f"carlasc.cli.{sys.argv[1]}")
+    command.progress_bar = interrupting_bar  # type: ignore[attr-defined]
     main()
