@@ -25,9 +25,20 @@ from carlasc.geometry import Transform, check_rigid
 from carlasc.labels import CARLA, ClassTable
 from carlasc.scans import Scan, check_finite
 
+EGO_SENSOR_M = (-0.5, 0.0, 1.8)  # in the vehicle's frame (FORMAT section 3)
+SPREAD_M, HEIGHTS_M = 20.0, (1.0, 5.0)  # the other sensors are within this of the vehicle, in x and y, and so high
+TRAFFIC = {"light": 25, "medium": 50, "heavy": 100}
+"""Vehicles under way, and as many pedestrians, by the name of the traffic (FORMAT section 1)."""
+
 RAW = "raw"
 _BEV = "bev"
 _DEPTH = 3  # <root>/<split>/<sequence>, and one folder around it
+
+
+def sensor_offsets(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return where the sensors are on the vehicle: (count, 3) metres, the ego one first, the others anywhere around."""
+    low, high = (-SPREAD_M, -SPREAD_M, HEIGHTS_M[0]), (SPREAD_M, SPREAD_M, HEIGHTS_M[1])
+    return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (count - 1, 3))])
 
 
 @dataclass(frozen=True)

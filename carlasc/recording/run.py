@@ -11,14 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.capture import Capture, CaptureWriter, Recording
+from carlasc.capture import TRAFFIC, Capture, CaptureWriter, Recording, sensor_offsets
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.recording.sensors import ActorNumbers, LidarModel, Rig, sensor_offsets
+from carlasc.recording.sensors import ActorNumbers, LidarModel, Rig
 from carlasc.recording.server import Server
 from carlasc.recording.traffic import populate
-
-TRAFFIC = {"light": 25, "medium": 50, "heavy": 100}
-"""Vehicles, and as many pedestrians, by the name of the traffic (FORMAT section 1)."""
 
 SETTINGS = "recording.json"
 _SAME_PLACE_M = 0.02  # how far a replayed drive may be from the recorded one

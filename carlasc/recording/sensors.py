@@ -17,8 +17,6 @@ from carlasc.labels import CARLA, REMAPS
 from carlasc.recording.server import SemanticSweep, Server, decode_sweep
 from carlasc.scans import Scan
 
-EGO_SENSOR_M = (-0.5, 0.0, 1.8)  # in the vehicle's frame (FORMAT section 3)
-SPREAD_M, HEIGHTS_M = 20.0, (1.0, 5.0)
 BEV_SIZE, BEV_HEIGHT_M = (1920, 1080), 50.0
 NEW_TAGS_FROM = (0, 9, 14)  # the version that renumbered the classes
 _QUALITY = 88
@@ -51,12 +49,6 @@ class LidarModel:
             )
         if not 0 < self.range_m < 1000:
             raise ArgumentError(f"range: expected 0 to 1000 m, found {self.range_m}")
-
-
-def sensor_offsets(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return where the sensors are on the vehicle: (count, 3) metres, the ego one first, the others anywhere around."""
-    low, high = (-SPREAD_M, -SPREAD_M, HEIGHTS_M[0]), (SPREAD_M, SPREAD_M, HEIGHTS_M[1])
-    return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (count - 1, 3))])
 
 
 class Rig:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.capture import TRAFFIC
 from carlasc.errors import ArgumentError
 from carlasc.geometry import Transform
 from carlasc.layout import FRAME_PERIOD_S
@@ -23,9 +24,6 @@ from carlasc.simulation.shapes import (
 )
 from carlasc.simulation.town import Town
 from carlasc.simulation.traffic import Traffic, Walk, draw_walks, place_vehicles
-
-TRAFFIC = {"light": 25, "medium": 50, "heavy": 100}
-"""Vehicles under way, and as many pedestrians, by the name of the traffic (FORMAT section 1)."""
 
 EGO_ID = 1
 PARKED_SHARE = 0.4  # of the town's parking spaces

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.capture import Recording
+from carlasc.capture import EGO_SENSOR_M, HEIGHTS_M, Recording, sensor_offsets
 from carlasc.errors import ArgumentError
 from carlasc.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.scans import Scan
@@ -21,9 +21,6 @@ from carlasc.simulation.lidar import Lidar, RayScene, turned
 from carlasc.simulation.meshes import Mesh
 from carlasc.simulation.town import Town, build_town
 
-EGO_SENSOR_M = (-0.5, 0.0, 1.8)  # in the vehicle's frame (FORMAT section 3)
-SPREAD_M = 20.0  # the other sensors are within this of the vehicle, in x and y
-HEIGHTS_M = (1.0, 5.0)
 REFERENCE_SPREAD_M = 25.6  # half the width of the published grid
 CROP_MARGIN_M = 37.0  # sensors may be this far from the ego vehicle
 
@@ -98,9 +95,7 @@ class Drive:
         """
         if count < 1:
             raise ArgumentError(f"sensors: expected at least 1, found {count}")
-        low, high = (-SPREAD_M, -SPREAD_M, HEIGHTS_M[0]), (SPREAD_M, SPREAD_M, HEIGHTS_M[1])
-        others = self._random(_SENSORS).uniform(low, high, (count - 1, 3))
-        return np.concatenate([[EGO_SENSOR_M], others])
+        return sensor_offsets(count, self._random(_SENSORS))
 
     def sensor_poses(self, frame: int, count: int) -> NDArray[np.float64]:
         """Return (count, 4, 4) world_T_sensor: offsets as above, orientation the vehicle's."""

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.capture import Capture, CaptureWriter, Recording
+from carlasc.capture import TRAFFIC, Capture, CaptureWriter, Recording
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.labels import CARLA
 from carlasc.layout import FRAME_PERIOD_S
-from carlasc.simulation.actors import TRAFFIC
 from carlasc.simulation.birdseye import render_birdseye
 from carlasc.simulation.drive import Drive
 from carlasc.simulation.lidar import Lidar

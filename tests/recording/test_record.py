@@ -12,12 +12,12 @@ pytest.importorskip("carla", reason="the carla package is not installed: pip ins
 import carla
 from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, StandIn
 
-from carlasc.capture import Capture
+from carlasc.capture import Capture, sensor_offsets
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, ConflictError
 from carlasc.geometry import transform_points
 from carlasc.recording import record
-from carlasc.recording.sensors import LidarModel, sensor_offsets
+from carlasc.recording.sensors import LidarModel
 from carlasc.recording.server import DETECTION, Server, ServerError, decode_sweep
 
 ROAD, VEHICLE, WALKER = 7, 10, 4

@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from carlasc.capture import TRAFFIC
 from carlasc.geometry import invert, transform_points
-from carlasc.simulation.actors import EGO_ID, TRAFFIC, Actor
+from carlasc.simulation.actors import EGO_ID, Actor
 from carlasc.simulation.drive import Drive
 from carlasc.simulation.plots import Rectangle
 from carlasc.simulation.shapes import VEHICLE
