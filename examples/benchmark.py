@@ -193,6 +193,8 @@ def main(
 
 
 def _mean(values: Sequence[float]) -> str:
+    if np.isnan(values).any():  # as the tables write it: nothing to divide by
+        return "-"
     spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
     return f"{np.mean(values):.2f}{spread}"
 

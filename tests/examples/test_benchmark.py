@@ -55,6 +55,7 @@ def test_seeds_are_averaged_and_their_spread_is_told():
     assert semantic.rows[0][semantic.header.index("Building")] == "50.00 ± 14.14"
     assert semantic.rows[1][semantic.header.index("Building")] == "50.00"
     assert geometric.rows[0] == ("two", "100.00 ± 0.00", "50.00 ± 14.14", "50.00 ± 14.14")
+    assert semantic.rows[0][semantic.header.index("Pole")] == "-"
 
 
 @pytest.mark.slow
