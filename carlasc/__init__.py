@@ -1,53 +1,123 @@
 """`carlasc`: the SDK for CarlaSC, the data set of complete, trace-free semantic scenes.
 
-Importing it loads NumPy and nothing heavier; the names below are found in their modules on first use.
+Importing it loads nothing heavy: a public name, or a room such as `carlasc.metrics`, is loaded on first use.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-_HOME = {  # public name -> module
-    "GridSpec": "grids",
-    "Grid": "grids",
-    "Scan": "scans",
-    "ClassTable": "labels",
-    "Remap": "labels",
-    "open": "sources",
-    "Source": "sources",
-    "Sink": "sources",
-    "Dataset": "dataset",
-    "collate": "dataset",
-    "Flip": "transforms",
-    "regrid": "groundtruth",
-    "simulate": "simulation",
-    "render": "rendering",
-    "pack": "packing",
-    "unpack": "packing",
-    "info": "inspection.overview",
-    "stats": "inspection.statistics",
-    "validate": "inspection.validation",
-    "convert": "converting",
-    "export": "converting",
-    "evaluate": "metrics",
-    "make_page": "viewing",
-    "show": "viewing",
-    "record": "recording",
-    "download": "downloads",
+if TYPE_CHECKING:  # what type checkers and editors see; the table below says the same to Python
+    from carlasc import captures as captures
+    from carlasc import converting as converting
+    from carlasc import core as core
+    from carlasc import dataset as dataset
+    from carlasc import errors as errors
+    from carlasc import groundtruth as groundtruth
+    from carlasc import inspection as inspection
+    from carlasc import metrics as metrics
+    from carlasc import motion as motion
+    from carlasc import running as running
+    from carlasc import storage as storage
+    from carlasc import viewing as viewing
+    from carlasc.captures import record as record
+    from carlasc.captures import simulate as simulate
+    from carlasc.converting import convert as convert
+    from carlasc.converting import export as export
+    from carlasc.core import ClassTable as ClassTable
+    from carlasc.core import Grid as Grid
+    from carlasc.core import GridSpec as GridSpec
+    from carlasc.core import Remap as Remap
+    from carlasc.core import Scan as Scan
+    from carlasc.dataset import Dataset as Dataset
+    from carlasc.dataset import Flip as Flip
+    from carlasc.dataset import collate as collate
+    from carlasc.groundtruth import regrid as regrid
+    from carlasc.inspection import info as info
+    from carlasc.inspection import stats as stats
+    from carlasc.inspection import validate as validate
+    from carlasc.metrics import evaluate as evaluate
+    from carlasc.storage import Sink as Sink
+    from carlasc.storage import Source as Source
+    from carlasc.storage import download as download
+    from carlasc.storage import open as open
+    from carlasc.storage import pack as pack
+    from carlasc.storage import unpack as unpack
+    from carlasc.viewing import make_page as make_page
+    from carlasc.viewing import render as render
+    from carlasc.viewing import show as show
+else:
+
+    def __getattr__(name: str) -> object:
+        if name in _ROOMS:
+            return importlib.import_module(f"carlasc.{name}")
+        for room, names in _HOMES.items():
+            if name in names:
+                return getattr(importlib.import_module(f"carlasc.{room}"), name)
+        raise AttributeError(f"module 'carlasc' has no attribute {name!r}")
+
+
+_ROOMS = (
+    "captures",
+    "converting",
+    "core",
+    "dataset",
+    "errors",
+    "groundtruth",
+    "inspection",
+    "metrics",
+    "motion",
+    "running",
+    "storage",
+    "viewing",
+)
+_HOMES = {  # room -> its names that are also names of `carlasc`
+    "core": (
+        "ClassTable",
+        "Grid",
+        "GridSpec",
+        "Remap",
+        "Scan",
+    ),
+    "storage": (
+        "Sink",
+        "Source",
+        "download",
+        "open",
+        "pack",
+        "unpack",
+    ),
+    "captures": (
+        "record",
+        "simulate",
+    ),
+    "groundtruth": ("regrid",),
+    "dataset": (
+        "Dataset",
+        "Flip",
+        "collate",
+    ),
+    "metrics": ("evaluate",),
+    "inspection": (
+        "info",
+        "stats",
+        "validate",
+    ),
+    "converting": (
+        "convert",
+        "export",
+    ),
+    "viewing": (
+        "make_page",
+        "render",
+        "show",
+    ),
 }
 
-__all__ = ["__version__", "errors", *_HOME]  # noqa: PLE0604 (names of the table)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"carlasc.{_HOME[name]}"), name)
-    if name in ("errors", "metrics", "labels", "geometry", "layout"):
-        return importlib.import_module(f"carlasc.{name}")
-    raise AttributeError(f"module 'carlasc' has no attribute {name!r}")
+__all__ = ["__version__", *_ROOMS, *(name for names in _HOMES.values() for name in names)]  # noqa: PLE0604
 
 
 def __dir__() -> list[str]:

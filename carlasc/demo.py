@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError
-from carlasc.grids import GridSpec
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
@@ -72,17 +72,17 @@ def demonstrate(
         ConflictError: the folder holds something else.
         DependencyError: the simulate and render extras are missing.
     """
+    from carlasc.captures.town import simulate
     from carlasc.groundtruth import regrid
     from carlasc.inspection.statistics import stats
     from carlasc.inspection.validation import validate
-    from carlasc.rendering import render
-    from carlasc.simulation import simulate
+    from carlasc.viewing.rendering import render
 
     start, out, step = time.perf_counter(), Path(out), step or _silently
     sequence = out / SEQUENCE
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not sequence.is_dir())):
         raise ConflictError(
-            f"{out}: expected an empty folder or an earlier demo, found something else: give another name"
+            out, expected="an empty folder or an earlier demo", found="something else", advice="give another name"
         )
 
     with step("simulate a town") as progress:

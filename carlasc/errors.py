@@ -1,40 +1,73 @@
-"""The few kinds of error a user can meet, and the check for optional packages.
+"""The few kinds of error that a user can meet, and the check for optional packages.
 
-Every message is one line: the file (or argument) it is about, what was expected, what was found, what to do.
+Every message is one line: what it is about (a file, a field, an argument), what was expected, what was found, what to do.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib
 from types import ModuleType
+from typing import Self
 
 
 class CarlascError(Exception):
-    """Base of every error that `carlasc` raises on purpose."""
+    """Base of every error that `carlasc` raises on purpose.
+
+    The message is put together from the attributes: `WHERE: PROBLEM: expected EXPECTED, found FOUND: ADVICE`, without the parts that
+    are empty.
+
+    Attributes:
+        where: what it is about: a file, a URL, a field, or the name of an argument.
+        problem: what went wrong, where "expected ..., found ..." does not say it.
+        expected: what should have been found.
+        found: what was found instead.
+        advice: what to do about it. Arguments stand in it as `` `overwrite=True` ``; the command line turns these into its options.
+    """
+
+    def __init__(
+        self, where: object, *, problem: str = "", expected: str = "", found: str = "", advice: str = ""
+    ) -> None:
+        super().__init__(where)  # the only positional argument, so that errors pickle: the rest travels in __dict__
+        self.where, self.problem = str(where), problem
+        self.expected, self.found, self.advice = expected, found, advice
+
+    def __str__(self) -> str:
+        comparison = ", ".join(
+            f"{verb} {text}" for verb, text in (("expected", self.expected), ("found", self.found)) if text
+        )
+        text = ": ".join(part for part in (self.where, self.problem, comparison, self.advice) if part)
+        return " ".join(text.splitlines())  # other libraries' messages may have several lines
+
+    def within(self, where: object) -> Self:
+        """Return the same error with the place that this place is in before it: `within("a.zip")` of "b" says "a.zip: b"."""
+        error = copy.copy(self)
+        error.where = f"{where}: {self.where}"
+        return error
 
 
-class FormatError(CarlascError):
+class FormatError(CarlascError, ValueError):
     """A file or store does not hold what the format says it must."""
 
 
 class MissingDataError(CarlascError):
-    """Something that was asked for is not there: a file, a frame, a field, a sequence."""
+    """Something that was asked for does not exist: a file, a frame, a field, a sequence."""
 
 
-class DependencyError(CarlascError):
+class DependencyError(CarlascError, ImportError):
     """An optional package is not installed, or cannot be loaded."""
 
 
 class ArgumentError(CarlascError, ValueError):
-    """A value given by the caller makes no sense (the command line exits with 2 for these)."""
+    """A value given by the caller makes no sense (the command line exits with 2 for these). `where` is the argument's name."""
 
 
 class ConflictError(CarlascError):
-    """Writing would destroy or mix with something that is already there."""
+    """Writing would destroy, or mix with, something that already exists."""
 
 
 class StorageError(CarlascError):
-    """The output cannot be written: a full disk, a folder that is not ours. Whatever comes next would meet the same."""
+    """The output cannot be written: a full disk, a folder without write permission. Every further write would fail alike."""
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
@@ -54,5 +87,7 @@ def import_extra(module: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
-        reason = "is not installed" if error.name == package else f"does not load ({error})"
-        raise DependencyError(f"{package} {reason}: install it with `pip install 'carlasc[{extra}]'`") from error
+        problem = "is not installed" if error.name == package else f"does not load ({error})"
+        raise DependencyError(
+            f"{package} {problem}", advice=f"install it with `pip install 'carlasc[{extra}]'`"
+        ) from error

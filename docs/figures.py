@@ -17,12 +17,12 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from carlasc.geometry import relative_to
-from carlasc.grids import Grid, GridSpec
+from carlasc.captures.town import Drive
+from carlasc.core.geometry import relative_to
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLA, REMAPS
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.labels import CARLA, REMAPS
-from carlasc.rendering import ClassColors, Panel, Viewpoint, draw_panels, grid_scene, render_grid
-from carlasc.simulation import Drive
+from carlasc.viewing.rendering import ClassColors, Panel, Viewpoint, draw_panels, grid_scene, render_grid
 
 IMAGES = Path(__file__).parent / "images"
 SENSORS, FRAME = 20, 60

@@ -17,9 +17,11 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from typer.models import ArgumentInfo, ParameterInfo
 
-from carlasc import cli, layout
-from carlasc.grids import GridSpec
-from carlasc.labels import CARLA, REMAPS, ClassTable
+from carlasc import cli
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA, REMAPS
+from carlasc.storage import layout
 
 LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
 _MARKER = re.compile(r"<!-- generated: ([a-z-]+) -->")

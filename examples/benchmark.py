@@ -28,7 +28,7 @@ from completion.training import BEST, LAST, train
 from completion.weights import load_weights, read_weights
 
 from carlasc import GridSpec
-from carlasc.labels import CARLASC11
+from carlasc.core.tables import CARLASC11
 from carlasc.metrics import Evaluation, Table, geometric_table, semantic_table
 
 TRAFFIC = ("light", "medium", "heavy")

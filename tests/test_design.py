@@ -2,6 +2,7 @@
 
 import ast
 import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +33,21 @@ def imported(path):
 def test_every_room_stands_in_the_table():
     there = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
     assert set(rooms()) == there - {"__init__", "__main__"}
+
+
+def modules():
+    """Return the modules of the package, packages apart: their `__init__` only gather names."""
+    files = [path for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py")]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+
+
+def test_no_two_modules_import_each_other():
+    graph = {}
+    for name, path in modules().items():
+        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        wanted = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names} | {n.module for n in nodes}
+        graph[name] = wanted & set(modules())
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the modules
 
 
 def test_no_room_imports_one_below_it():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers.drives import write_drive
 
-from carlasc.grids import GridSpec
+from carlasc.core.grids import GridSpec
 
 ROOT = Path(__file__).parents[1]
 HOWTO, README = ROOT / "docs" / "howto" / "train.md", ROOT / "README.md"

@@ -35,8 +35,8 @@ def capture(
 
     The server is left as it was, after Ctrl-C and errors too: no actor stays, its settings are restored.
     """
-    from carlasc.recording import record
-    from carlasc.recording.sensors import LidarModel
+    from carlasc.captures.carla import record
+    from carlasc.captures.carla.sensors import LidarModel
 
     signal.signal(signal.SIGTERM, _interrupt)  # a batch system's end is cleaned up after too
     with progress_bar("Recording") as progress:

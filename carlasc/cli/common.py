@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -22,6 +24,10 @@ _Number = TypeVar("_Number", int, float)
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
+_ARGUMENT = re.compile(
+    r"`(\w+)(?:=([^`]+))?`"
+)  # how the library's errors name an argument: `workers`, `overwrite=True`
+
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Workers = Annotated[int | None, typer.Option(help="Processes that work side by side; all cores if not given.", min=1)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
@@ -35,14 +41,37 @@ class CommandGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except ArgumentError as error:
-            fail(str(error), WRONG_USAGE)
+            fail(str(self._with_options(ctx, error)), WRONG_USAGE)
         except CarlascError as error:
-            fail(str(error))
+            fail(str(self._with_options(ctx, error)))
         except KeyboardInterrupt:
             fail("interrupted: what is written is whole; run the same command again to go on", INTERRUPTED)
         except BrokenPipeError:  # `carlasc info | head`
             sys.stderr.close()
             raise typer.Exit(FAILED) from None
+
+    def _with_options(self, ctx: Any, error: CarlascError) -> CarlascError:
+        """Return an error of the library with the command's options for the names of arguments: `--window` for window."""
+        command = self.commands.get(ctx.invoked_subcommand or "")
+        options = {} if command is None else {p.name: option_of(p) for p in command.params if p.name}
+        changed = copy.copy(error)
+        changed.where = options.get(error.where, error.where)
+        for part in ("problem", "expected", "found", "advice"):
+            setattr(changed, part, _ARGUMENT.sub(lambda match: _as_option(match, options), getattr(error, part)))
+        return changed
+
+
+def option_of(parameter: Any) -> str:
+    """Return what a user types for a parameter of a command: `--frames`, or `SOURCE`."""
+    longest = max(parameter.opts, key=len)
+    return longest if longest.startswith("-") else (parameter.metavar or longest).upper()
+
+
+def _as_option(match: re.Match[str], options: Mapping[str, str]) -> str:
+    name, value = match[1], match[2]
+    if name not in options:
+        return match[0]
+    return f"`{options[name]}`" if value in ("True", None) else f"`{options[name]} {value.strip(chr(34))}`"
 
 
 def fail(message: str, code: int = FAILED) -> None:
@@ -56,7 +85,7 @@ def report_failures(failures: list[tuple[Any, str]], total: int, what: str = "fr
     if failures:
         for _, message in failures:
             typer.echo(f"carlasc: {message}", err=True)
-        fail(f"{len(failures)} of {total} {what} failed; the others are done: mend these and run again")
+        fail(f"{len(failures)} of {total} {what} failed; the others are done: fix these and run again")
 
 
 @contextmanager
@@ -115,7 +144,7 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     if len(values) not in counts:
         wanted = " or ".join(map(str, counts))
         raise ArgumentError(
-            f"{option}: expected {wanted} {'whole ' if kind is int else ''}numbers with commas between, found {text!r}"
+            option, expected=f"{wanted} {'whole ' if kind is int else ''}numbers with commas between", found=f"{text!r}"
         )
     return values
 
@@ -132,11 +161,11 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     try:
         start, stop = int(first) if first else None, int(last) if last else None
     except ValueError:
-        raise ArgumentError(f"--frames: expected A:B, A:, :B or a frame number, found {text!r}") from None
+        raise ArgumentError("--frames", expected="A:B, A:, :B or a frame number", found=f"{text!r}") from None
     if not colon:
         return start, None if start is None else start + 1
     if start is not None and stop is not None and start >= stop:
-        raise ArgumentError(f"--frames: expected a range that holds a frame, found {text!r}")
+        raise ArgumentError("--frames", expected="a range that holds a frame", found=f"{text!r}")
     return start, stop
 
 

@@ -135,7 +135,9 @@ def convert(
     merging = merging_of(window, window_m, stride, dynamic, None, None)
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, vote, merging))
     if asked and grids is not Grids.scans:
-        raise ArgumentError(f"grid options are for --grids scans: expected none of them, found some with {grids.value}")
+        raise ArgumentError(
+            "grid options are for --grids scans", expected="none of them", found=f"some with {grids.value}"
+        )
     if preset is None and res is None and size is None:
         preset = Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse
     spec = parse_grid(res, size, preset, coordinates, bounds) if grids is Grids.scans else None

@@ -29,9 +29,9 @@ def download(
 
     A zip need not be unpacked: every command reads it in place.
     """
-    from carlasc.downloads import download as fetch
-    from carlasc.downloads.transfer import Settings
     from carlasc.errors import ArgumentError
+    from carlasc.storage.downloads import download as fetch
+    from carlasc.storage.downloads.transfer import Settings
 
     if keep and not extract:
         raise ArgumentError("--keep: expected --extract beside it; without it zips are always kept")

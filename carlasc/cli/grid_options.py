@@ -12,8 +12,8 @@ from carlasc.cli.common import parse_numbers
 from carlasc.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from carlasc.grids import GridSpec
-    from carlasc.groundtruth.windows import Merging
+    from carlasc.core.grids import GridSpec
+    from carlasc.groundtruth.from_scans.windows import Merging
 
 
 class Coordinates(StrEnum):
@@ -113,7 +113,7 @@ def merging_of(
     max_range: float | None,
 ) -> Merging | None:
     """Return how scans are merged, None if nothing was said of it."""
-    from carlasc.groundtruth.windows import Merging
+    from carlasc.groundtruth.from_scans.windows import Merging
 
     given: dict[str, Any] = {"window_m": window_m, "stride": stride, "min_range_m": min_range, "max_range_m": max_range}
     given["dynamic"] = None if dynamic is None else dynamic.value
@@ -128,7 +128,7 @@ def _parse_window(text: str) -> tuple[int, int]:
         return int(first), int(last)
     except ValueError:
         raise ArgumentError(
-            f"--window: expected A:B in frames around the current one such as -30:30, found {text!r}"
+            "--window", expected="A:B in frames around the current one such as -30:30", found=f"{text!r}"
         ) from None
 
 
@@ -140,16 +140,18 @@ def parse_grid(
     Raises:
         ArgumentError: not exactly one of the three, or values that make no grid.
     """
-    from carlasc.grids import GridSpec
+    from carlasc.core.grids import GridSpec
 
     given = [option for option, value in (("--res", res), ("--size", size), ("--preset", preset)) if value is not None]
     if len(given) != 1:
         found = " and ".join(given) or "none of them"
         raise ArgumentError(f"expected one of --res, --size and --preset, found {found}: try --res 0.2")
     if preset is Preset.cylindrical and coordinates is Coordinates.cartesian:
-        raise ArgumentError("--preset cylindrical: expected no --coordinates, or cylindrical, found cartesian")
+        raise ArgumentError("--preset cylindrical", expected="no --coordinates, or cylindrical", found="cartesian")
     if preset is not None and bounds is not None:
-        raise ArgumentError("--bounds: expected --res or --size with it, found --preset, which has bounds of its own")
+        raise ArgumentError(
+            "--bounds", expected="--res or --size with it", found="--preset, which has bounds of its own"
+        )
     cylindrical = preset is Preset.cylindrical or coordinates is Coordinates.cylindrical
     spec = GridSpec.published("cylindrical" if cylindrical else "cartesian")
     if bounds is not None:

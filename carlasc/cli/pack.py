@@ -10,7 +10,7 @@ import typer
 from carlasc.cli.common import Json, console, print_json, progress_bar
 
 if TYPE_CHECKING:
-    from carlasc.packing import PackResult
+    from carlasc.storage.packing import PackResult
 
 
 def pack(
@@ -30,7 +30,7 @@ def pack(
 
     A run that was cut off is finished by running the same command again.
     """
-    from carlasc.packing import pack as pack_sequences
+    from carlasc.storage.packing import pack as pack_sequences
 
     with progress_bar("Packing", "files") as progress:
         result = pack_sequences(

@@ -72,8 +72,8 @@ def render(
 
     No screen and no GPU are needed. The camera stands behind and above the ego vehicle and follows it.
     """
-    from carlasc.rendering import Viewpoint
-    from carlasc.rendering import render as draw
+    from carlasc.viewing.rendering import Viewpoint
+    from carlasc.viewing.rendering import render as draw
 
     with progress_bar("Rendering", "pictures") as progress:
         result = draw(
@@ -116,5 +116,5 @@ def _parse_size(text: str) -> tuple[int, int]:
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:
-        raise ArgumentError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found {text!r}") from None
+        raise ArgumentError("--size", expected="WIDTHxHEIGHT such as 1280x720", found=f"{text!r}") from None
     return width, height

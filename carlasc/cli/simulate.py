@@ -34,7 +34,7 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Record a drive through a simulated town as a raw capture; a second run goes on where the first one stopped."""
-    from carlasc.simulation.record import simulate as run
+    from carlasc.captures.town.record import simulate as run
 
     with progress_bar("simulate") as progress:
         result = run(

@@ -23,7 +23,7 @@ def unpack(
 
     A run that was cut off is finished by running the same command again.
     """
-    from carlasc.packing import unpack as unpack_sequences
+    from carlasc.storage.packing import unpack as unpack_sequences
 
     with progress_bar("Unpacking", "files") as progress:
         result = unpack_sequences(src, out, overwrite=overwrite, workers=workers, progress=progress)

@@ -37,7 +37,7 @@ def validate(
     from carlasc.inspection.validation import validate as examine
 
     if full and every is not None:
-        raise ArgumentError("--every: expected only one of --every and --full, found both")
+        raise ArgumentError("--every", expected="only one of --every and --full", found="both")
     with progress_bar("Validating", unit="steps") as progress:
         result = examine(path, every=1 if full else every, progress=progress)
     if as_json:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from carlasc.converting.protocol import FrameHandle, Recording
 from carlasc.converting.results import Steps
+from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import CarlascError
-from carlasc.geometry import invert, transform_points
-from carlasc.labels import ClassTable
 from carlasc.motion.paths import estimate_path
-from carlasc.workers import run_all
+from carlasc.running.processes import run_all
 
 _BLOCK = 16  # frames that a worker looks at in one go
 _MAX_GAP = 10  # frames that an actor may be hidden; afterwards it is followed anew

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from carlasc import sources
+from carlasc import storage
 from carlasc.converting.protocol import Exporter
 from carlasc.converting.registry import load_converter
 from carlasc.converting.results import Failure, Progress, Steps
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, StorageError
-from carlasc.files import remove_stale, write_atomic
-from carlasc.workers import count_workers, run_all
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage.files import remove_stale, write_atomic
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ExportResult:
 
 @dataclass(frozen=True)
 class _Job:
-    sequence: sources.Sequence
+    sequence: storage.Sequence
     frame: int
     exporter: Exporter
     folder: Path
@@ -89,8 +89,10 @@ def export(
     start, workers = time.perf_counter(), count_workers(workers)
     exporter = load_converter(name).exporter(**options)
     if exporter is None:
-        raise ArgumentError(f"export {name!r}: expected a data set that can be written, found one that is only read")
-    source, root = sources.open(src), Path(out)
+        raise ArgumentError(
+            f"export {name!r}", expected="a data set that can be written", found="one that is only read"
+        )
+    source, root = storage.open(src), Path(out)
     _refuse_overlap(root, source)
     chosen = _choose(source, sequences)
     folders = exporter.folders([sequence.name for sequence in chosen.values()])
@@ -123,26 +125,29 @@ def export(
     )
 
 
-def _choose(source: sources.Source, wanted: Collection[str] | None) -> dict[str, sources.Sequence]:
+def _choose(source: storage.Source, wanted: Collection[str] | None) -> dict[str, storage.Sequence]:
     """Return the sequences with scans or grids, one of each name: Cartesian ones where both coordinates are there."""
-    found: dict[str, tuple[str, sources.Sequence]] = {}
+    found: dict[str, tuple[str, storage.Sequence]] = {}
     for path, sequence in source.sequences().items():
         if sequence.name not in found or sequence.coordinates == "cartesian":
             found[sequence.name] = (path, sequence)
     if wanted is not None and (unknown := [name for name in wanted if name not in found]):
         raise MissingDataError(
-            f"{source.location}: expected the sequences {', '.join(unknown)}, found only {', '.join(found)}"
+            source.location, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(found)}"
         )
     return {path: sequence for name, (path, sequence) in found.items() if wanted is None or name in wanted}
 
 
-def _refuse_overlap(root: Path, source: sources.Source) -> None:
+def _refuse_overlap(root: Path, source: storage.Source) -> None:
     if "://" in source.location:
         return
     place, origin = root.resolve(), Path(source.location).resolve()
     if place == origin or place.is_relative_to(origin):
         raise ConflictError(
-            f"{root}: expected a place outside {source.location}, found one inside it: choose another, the source is never written to"
+            root,
+            expected=f"a place outside {source.location}",
+            found="one inside it",
+            advice="choose another, the source is never written to",
         )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import FrameContent, FrameHandle
+from carlasc.core.classes import ClassTable, Remap
 from carlasc.errors import CarlascError, FormatError, StorageError
-from carlasc.labels import ClassTable, Remap
-from carlasc.sources.base import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"  # the other data set's own voxel files, as they were: for the way back
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

@@ -20,9 +20,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import sources
-from carlasc.grids import GridSpec
-from carlasc.labels import ClassTable, Remap
+from carlasc import storage
+from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.grids import GridSpec
 
 Split = Literal["Train", "Val", "Test"]
 
@@ -134,15 +134,15 @@ class Exporter(ABC):
         """Return the folder of each sequence, by name, relative to the data set's root."""
 
     @abstractmethod
-    def documents(self, sequence: sources.Sequence) -> dict[str, bytes]:
+    def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
         """Return the files that stand once in a sequence, by their path in its folder."""
 
     @abstractmethod
-    def frame_files(self, sequence: sources.Sequence, frame: int) -> tuple[str, ...]:
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
         """Return the paths of the files that `make_frame` gives."""
 
     @abstractmethod
-    def make_frame(self, sequence: sources.Sequence, frame: int) -> dict[str, bytes | memoryview]:
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, bytes | memoryview]:
         """Return a frame's files.
 
         Raises:

@@ -34,7 +34,9 @@ def load_converter(name: str) -> type[Converter]:
         raise DependencyError(f"converter {name} ({entry.value}) does not load: {error}") from error
     if not (isinstance(found, type) and issubclass(found, Converter)):
         raise DependencyError(
-            f"converter {name} ({entry.value}): expected a class that inherits carlasc.converting.Converter, found {found!r}"
+            f"converter {name} ({entry.value})",
+            expected="a class that inherits carlasc.converting.Converter",
+            found=f"{found!r}",
         )
     return found
 

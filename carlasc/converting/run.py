@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc import layout
 from carlasc.converting.frames import MIRROR, Block, FrameJob, Target, convert_block, scan_fields, write_fields
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import load_converter
@@ -28,16 +27,17 @@ from carlasc.converting.trajectory import (
     first_line_times,
     read_poses,
 )
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.files import to_json
-from carlasc.grids import GridSpec
-from carlasc.sources.base import Metadata, SequenceWriter, Sink
-from carlasc.sources.folder import FolderSink
-from carlasc.workers import count_workers, run_all
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage import layout
+from carlasc.storage.files import to_json
+from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.protocol import Metadata, SequenceWriter, Sink
 
 if TYPE_CHECKING:
-    from carlasc.groundtruth.voting import VoteRule
-    from carlasc.groundtruth.windows import Merging
+    from carlasc.groundtruth.from_scans.windows import Merging
+    from carlasc.groundtruth.voting.ballot import VoteRule
 
 Grids = Literal["scans", "voxels", "none"]
 Flow = Literal["instances", "none"]
@@ -178,22 +178,30 @@ def _check(name: str, converter: type[Converter], **given: str) -> None:
     }
     for option, value in given.items():
         if value not in allowed[option]:
-            raise ArgumentError(f"{option}: expected one of {', '.join(allowed[option])}, found {value!r}")
+            raise ArgumentError(option, expected=f"one of {', '.join(allowed[option])}", found=f"{value!r}")
     if given["grids"] == "voxels" and converter.voxels is None:
-        raise ArgumentError(f"grids: expected scans or none, found voxels: {name} has no voxel grids of its own")
+        raise ArgumentError(
+            "grids", expected="scans or none", found="voxels", advice=f"{name} has no voxel grids of its own"
+        )
 
 
 def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
     if not isinstance(sink, FolderSink):
         if grids != "none":
             raise ArgumentError(
-                f"grids: expected none with {sink.location}, found {grids}: convert to a folder, then pack it"
+                "grids",
+                expected=f"none with {sink.location}",
+                found=f"{grids}",
+                advice="convert to a folder, then pack it",
             )
         return
     place, origin = sink.root.resolve(), source.resolve()
     if place == origin or place.is_relative_to(origin):
         raise ConflictError(
-            f"{sink.root}: expected a place outside {source}, found one inside it: choose another, the source is never written to"
+            sink.root,
+            expected=f"a place outside {source}",
+            found="one inside it",
+            advice="choose another, the source is never written to",
         )
 
 
@@ -208,7 +216,7 @@ def _choose(
     short = {recording.name.rpartition("_")[2]: recording for recording in recordings}
     if wanted is not None and (unknown := [number for number in wanted if number not in short]):
         raise MissingDataError(
-            f"{source}: expected the sequences {', '.join(unknown)}, found only {', '.join(short) or 'none'}"
+            source, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(short) or 'none'}"
         )
     chosen = [
         recording
@@ -218,9 +226,11 @@ def _choose(
     chosen = [recording for recording in chosen if recording.frames or recording.problems()]
     if not chosen:
         found = ", ".join(f"{number} ({r.split}, {len(r.frames)} scans)" for number, r in short.items())
-        raise MissingDataError(f"{source}: expected sequences with scans of the split {split}, found {found or 'none'}")
+        raise MissingDataError(
+            source, expected=f"sequences with scans of the split {split}", found=f"{found or 'none'}"
+        )
     if empty := [recording for recording in chosen if not recording.frames]:
-        raise MissingDataError(f"{empty[0].location}/velodyne: expected scans, found none: copy them")
+        raise MissingDataError(f"{empty[0].location}/velodyne", expected="scans", found="none", advice="copy them")
     return chosen
 
 
@@ -242,7 +252,7 @@ def _plan(
 
 
 def _check_grid(plan: _Plan, target: Target, converter: type[Converter]) -> None:
-    from carlasc.groundtruth.record import (
+    from carlasc.storage.resuming import (
         check_grid,  # here: workers import this file, and Numba takes longer than they
     )
 
@@ -262,7 +272,7 @@ def _write_documents(plan: _Plan, target: Target, converter: type[Converter], me
 
     Estimated poses that are there already are taken as they are: a second estimate might differ in its last digits.
     """
-    from carlasc.groundtruth.record import agree_metadata, agree_poses, agree_times
+    from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times
 
     how = "file" if plan.poses is not None else KISS_ICP
     metadata = Metadata(**{**vars(metadata), "extra": {"poses": how}})
@@ -270,7 +280,10 @@ def _write_documents(plan: _Plan, target: Target, converter: type[Converter], me
     before = None if there is None else Metadata.from_json(there, f"{plan.writer.location}/{layout.METADATA}")
     if before is not None and before.extra.get("poses") != how:
         raise ConflictError(
-            f"{plan.writer.location}/{layout.METADATA}: expected poses from {how}, found {before.extra.get('poses', 'others')}: write to another place"
+            f"{plan.writer.location}/{layout.METADATA}",
+            expected=f"poses from {how}",
+            found=f"{before.extra.get('poses', 'others')}",
+            advice="write to another place",
         )
     documents = {layout.METADATA: agree_metadata(plan.writer, metadata)}
     estimated = plan.writer.read_document(layout.POSES) if plan.poses is None else None

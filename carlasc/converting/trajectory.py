@@ -8,12 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.structure import static_structure
-from carlasc.sources.base import Metadata, Sequence
+from carlasc.storage import layout
+from carlasc.storage.protocol import Metadata, Sequence
 
 PoseSource = Literal["file", "kiss-icp", "auto"]
 FILE, KISS_ICP = "file", "kiss-icp"
@@ -30,14 +30,19 @@ def read_poses(recording: Recording, wanted: PoseSource, *, force: bool) -> NDAr
     if poses is None:
         if wanted == FILE:
             raise MissingDataError(
-                f"{recording.location}: expected poses.txt, found nothing: copy it, or estimate poses from the scans (`--poses kiss-icp`)"
+                recording.location,
+                expected="poses.txt",
+                found="nothing",
+                advice="copy it, or estimate poses from the scans (`--poses kiss-icp`)",
             )
         return None
     last = recording.frames[-1].number
     if len(poses) <= last:
         raise FormatError(
-            f"{recording.location}: expected a pose for each frame up to {last}, found {len(poses)} lines in the file of poses: copy it again, or"
-            " estimate poses from the scans (`--poses kiss-icp`)"
+            recording.location,
+            expected=f"a pose for each frame up to {last}",
+            found=f"{len(poses)} lines in the file of poses",
+            advice="copy it again, or estimate poses from the scans (`--poses kiss-icp`)",
         )
     relative: NDArray[np.float64] = np.linalg.inv(poses[0]) @ poses[: last + 1]
     return relative
@@ -48,7 +53,7 @@ def estimate_poses(recording: Recording, converter: type[Converter], step: Calla
 
     Scans that cannot be read are passed over: whoever converts them reports them.
     """
-    from carlasc import odometry
+    from carlasc.motion import odometry
 
     found: list[int] = []
 
@@ -66,7 +71,7 @@ def estimate_poses(recording: Recording, converter: type[Converter], step: Calla
     poses = odometry.estimate_poses(scans(), min_range_m=nearest, max_range_m=farthest)
     if not len(poses):
         raise MissingDataError(
-            f"{recording.location}: expected scans to estimate poses from, found none that can be read"
+            recording.location, expected="scans to estimate poses from", found="none that can be read"
         )
     lines = np.searchsorted(found, np.arange(recording.frames[-1].number + 1), side="right") - 1
     return poses[np.clip(lines, 0, None)]
@@ -122,14 +127,14 @@ class _Scans(Sequence):
             return self._handles[frame].read().points
         labels, _ = self._handles[frame].read_labels()
         if labels is None:
-            raise MissingDataError(f"{self.location}: expected labels, found none")
+            raise MissingDataError(self.location, expected="labels", found="none")
         return labels
 
     def documents(self) -> tuple[str, ...]:
         return ()
 
     def read_document(self, name: str) -> bytes:
-        raise MissingDataError(f"{self.location}/{name}: expected a file, found a recording of another data set")
+        raise MissingDataError(f"{self.location}/{name}", expected="a file", found="a recording of another data set")
 
 
 def first_line_times(recording: Recording) -> NDArray[np.float64]:
@@ -144,7 +149,10 @@ def first_line_times(recording: Recording) -> NDArray[np.float64]:
         return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
     if len(times) < frames:
         raise FormatError(
-            f"{recording.location}: expected a time for each frame up to {frames - 1}, found {len(times)} lines in times.txt: copy it again"
+            recording.location,
+            expected=f"a time for each frame up to {frames - 1}",
+            found=f"{len(times)} lines in times.txt",
+            advice="copy it again",
         )
     since: NDArray[np.float64] = times[:frames] - times[0]
     return since

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
-from carlasc.capture import RAW, Capture, Recording, find_captures
+from carlasc.captures.raw import RAW, Capture, Recording, find_captures
+from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import relative_to
+from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.geometry import relative_to
-from carlasc.grids import Grid, GridSpec
-from carlasc.groundtruth.observations import Observation
-from carlasc.groundtruth.voting import VoteRule, Votes, count_votes
-from carlasc.labels import ClassTable
-from carlasc.sources.base import Metadata
+from carlasc.groundtruth.voting.ballot import VoteRule, Votes, count_votes
+from carlasc.groundtruth.voting.observations import Observation
+from carlasc.storage import layout
+from carlasc.storage.protocol import Metadata
 
 FrameRange = tuple[int | None, int | None]
 """Half-open range of frame numbers; None leaves an end open."""
@@ -180,7 +180,9 @@ class CaptureInputs(SequenceInputs):
         numbers = [int(f) for f in capture.frames if (start is None or f >= start) and (stop is None or f < stop)]
         if not numbers:
             raise MissingDataError(
-                f"{capture.location}: expected frames in {range_text(start, stop)}, found only {capture.frames[0]} to {capture.frames[-1]}"
+                capture.location,
+                expected=f"frames in {range_text(start, stop)}",
+                found=f"only {capture.frames[0]} to {capture.frames[-1]}",
             )
         self.path, self.location, self.metadata = path, capture.location, Metadata(classes=capture.classes)
         # Frames carry a capture of their own: the one here remembers its listing, which need not be pickled each time.
@@ -239,7 +241,7 @@ def default_sink(source: str | os.PathLike[str]) -> Path:
     """
     folder = Path(source)
     if not folder.is_dir() and folder.exists():
-        raise ArgumentError(f"{source}: expected a folder to write into, found a file: say where to (`-o`)")
+        raise ArgumentError(source, expected="a folder to write into", found="a file", advice="say where to (`-o`)")
     return folder.resolve().parent if folder.resolve().name in (RAW, *layout.COORDINATES) else folder
 
 
@@ -248,13 +250,13 @@ def check_frames(frames: FrameRange | None) -> None:
     start, stop = frames or (None, None)
     if (start is not None and start < 0) or (stop is not None and stop <= (start or 0)):
         raise ArgumentError(
-            f"frames: expected a half-open range of frame numbers from 0, found {range_text(start, stop)}"
+            "frames", expected="a half-open range of frame numbers from 0", found=f"{range_text(start, stop)}"
         )
 
 
 def _present(array: NDArray[Any] | None) -> NDArray[Any]:
     if array is None:  # a recording always has labels and instances: Capture.read takes none without
-        raise FormatError("recording: expected labels and instances, found none")
+        raise FormatError("recording", expected="labels and instances", found="none")
     return array
 
 

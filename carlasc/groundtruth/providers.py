@@ -6,14 +6,14 @@ import os
 from pathlib import Path
 from typing import Literal, get_args
 
-from carlasc.capture import find_captures
+from carlasc.captures.raw import find_captures
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.grids import GridSpec
+from carlasc.groundtruth.from_grid import grid_inputs
+from carlasc.groundtruth.from_scans.inputs import scan_inputs
+from carlasc.groundtruth.from_scans.windows import Merging
 from carlasc.groundtruth.inputs import FrameRange, SequenceInputs, capture_inputs
-from carlasc.groundtruth.resample import grid_inputs
-from carlasc.groundtruth.scans import scan_inputs
-from carlasc.groundtruth.windows import Merging
-from carlasc.sources import open as open_source
+from carlasc.storage import open as open_source
 
 Observations = Literal["capture", "scans", "grid"]
 
@@ -49,14 +49,16 @@ def find_inputs(
         observations = _what_is_there(source)
     if observations not in get_args(Observations):
         raise ArgumentError(
-            f"observations: expected one of {', '.join(get_args(Observations))}, found {observations!r}"
+            "observations", expected=f"one of {', '.join(get_args(Observations))}", found=f"{observations!r}"
         )
     if (merging is not None or estimate_poses) and observations != "scans":
         raise ArgumentError(
-            f"window, stride, dynamic, ranges and poses are for scans: expected none of them, found some with {observations}"
+            "window, stride, dynamic, ranges and poses are for scans",
+            expected="none of them",
+            found=f"some with {observations}",
         )
     if from_grid is not None and observations != "grid":
-        raise ArgumentError(f"from_grid: expected a grid to resample, found {observations}")
+        raise ArgumentError("from_grid", expected="a grid to resample", found=f"{observations}")
     if observations == "capture":
         return capture_inputs(source, frames)
     if observations == "scans":
@@ -77,8 +79,13 @@ def _what_is_there(source: str | os.PathLike[str]) -> Observations:
         there.sequences()
     except MissingDataError as error:
         raise MissingDataError(
-            f"{source}: expected a capture (a folder raw/ with velodyne0/, labels0/, ...) or sequences with scans (velodyne/, poses.txt, ...),"
-            " found neither: give a sequence's folder, or a folder of sequences"
+            source,
+            expected=(
+                "a capture (a folder raw/ with velodyne0/, labels0/, ...) or sequences with scans (velodyne/, "
+                "poses.txt, ...)"
+            ),
+            found="neither",
+            advice="give a sequence's folder, or a folder of sequences",
         ) from error
     return "scans"
 

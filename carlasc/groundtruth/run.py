@@ -13,13 +13,18 @@ from typing import Any
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc import layout
+from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError, ConflictError, StorageError
-from carlasc.files import to_json
-from carlasc.grids import GridSpec
+from carlasc.groundtruth.from_scans.windows import Merging
 from carlasc.groundtruth.inputs import FrameInputs, FrameRange, Recipe, SequenceInputs, check_frames, default_sink
 from carlasc.groundtruth.providers import Observations, find_inputs
-from carlasc.groundtruth.record import (
+from carlasc.groundtruth.voting.ballot import Ballot, VoteRule
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage import layout
+from carlasc.storage.files import to_json
+from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.protocol import SequenceWriter, Sink
+from carlasc.storage.resuming import (
     RECORD,
     agree_metadata,
     agree_poses,
@@ -28,11 +33,6 @@ from carlasc.groundtruth.record import (
     check_name,
     check_scan,
 )
-from carlasc.groundtruth.voting import Ballot, VoteRule
-from carlasc.groundtruth.windows import Merging
-from carlasc.sources.base import SequenceWriter, Sink
-from carlasc.sources.folder import FolderSink
-from carlasc.workers import count_workers, run_all
 
 Outputs = dict[str, NDArray[Any]]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec
 
 _MIN_POINTS = 100
 _MAX_POINTS = 20_000

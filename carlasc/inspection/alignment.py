@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.inspection.structure import MAX_RANGE_M
 
 Poses: TypeAlias = NDArray[np.float64]

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.errors import ArgumentError, import_extra
-from carlasc.files import write_atomic
 from carlasc.inspection.statistics import KINDS, Kind, Statistics
+from carlasc.storage.files import write_atomic
 
 _SUFFIXES = (".png", ".svg", ".pdf")
 _OF: dict[Kind, str] = {"points": "points", "voxels": "known voxels"}
@@ -27,7 +27,7 @@ def draw_histograms(statistics: Statistics, path: Path) -> None:
         DependencyError: Matplotlib is not installed.
     """
     if path.suffix.lower() not in _SUFFIXES:
-        raise ArgumentError(f"{path}: expected a file ending in {', '.join(_SUFFIXES)}, found {path.suffix or 'none'}")
+        raise ArgumentError(path, expected=f"a file ending in {', '.join(_SUFFIXES)}", found=f"{path.suffix or 'none'}")
     figures = import_extra("matplotlib.figure", "plots")
     splits = statistics.by_split()
     names, colors = statistics.classes.names, statistics.classes.palette / 255

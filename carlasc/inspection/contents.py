@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
+from carlasc.core.classes import ClassTable
 from carlasc.errors import CarlascError
 from carlasc.inspection.findings import Finding, Severity
-from carlasc.labels import ClassTable
-from carlasc.sources.base import Sequence
-from carlasc.sources.folder import FolderSequence
+from carlasc.storage import layout
+from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.protocol import Sequence
 
 _FASTEST_M_S = 100.0
 _PER_POINT = ("labels", "flow", "instances")

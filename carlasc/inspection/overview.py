@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
-from carlasc.capture import Capture, find_captures
+from carlasc.captures.raw import Capture, find_captures
 from carlasc.errors import CarlascError, MissingDataError
-from carlasc.inspection.opening import open_source
-from carlasc.sources.base import Metadata, Sequence, Source
-from carlasc.sources.folder import FolderSequence
+from carlasc.storage import as_source, layout
+from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.protocol import Metadata, Sequence, Source
 
 _SIZED = 3  # files of a field whose sizes stand for those of all
 
@@ -147,7 +146,7 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
     """
     captures = _captures_in(source)
     try:
-        opened = open_source(source)
+        opened = as_source(source)
         # raw/ itself has a bev/ folder, as a sequence has
         sequences = {path: s for path, s in opened.sequences().items() if s.fields() or path not in captures}
     except MissingDataError:

@@ -12,12 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.classes import ClassTable, Remap, class_weights
+from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.inspection.opening import open_source
-from carlasc.labels import REMAPS, ClassTable, Remap, class_weights, remap_named, remaps_between, to_table
-from carlasc.layout import EVALUATION
-from carlasc.sources.base import Sequence, Source
-from carlasc.workers import count_workers, run_all
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage import as_source
+from carlasc.storage.layout import EVALUATION
+from carlasc.storage.protocol import Sequence, Source
 
 Kind = Literal["points", "voxels"]
 KINDS: tuple[Kind, ...] = ("points", "voxels")
@@ -179,12 +180,12 @@ def stats(
         MissingDataError: there is no data set, or nothing in it that has classes.
     """
     if every < 1:
-        raise ArgumentError(f"every: expected 1 or more, found {every}")
-    opened = open_source(source)
+        raise ArgumentError("every", expected="1 or more", found=f"{every}")
+    opened = as_source(source)
     sequences = opened.sequences()
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
-        raise MissingDataError(f"{opened.location}: expected labels of points or the grid {grid}, found neither")
+        raise MissingDataError(opened.location, expected=f"labels of points or the grid {grid}", found="neither")
     classes = _common_table(tasks)
     chosen = _choose_remap(remap, classes)
     total, done = sum(len(frames) for _, _, frames in tasks), 0
@@ -255,7 +256,9 @@ def _common_table(tasks: Iterable[_Task]) -> ClassTable:
     grids = [table for (_, field), table in fields.items() if field != "labels"]
     tables = {table.name: table for table in grids or fields.values()}
     if len(tables) > 1:
-        raise FormatError(f"classes: expected one table, found {', '.join(sorted(tables))}: count the sequences apart")
+        raise FormatError(
+            "classes", expected="one table", found=f"{', '.join(sorted(tables))}", advice="count the sequences apart"
+        )
     (classes,) = tables.values()
     try:
         for table in fields.values():
@@ -274,5 +277,5 @@ def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | Non
         )
     chosen = remap_named(remap) if isinstance(remap, str) else remap
     if chosen.source.name != classes.name:
-        raise FormatError(f"remap {chosen.name}: expected labels of {chosen.source.name}, found {classes.name}")
+        raise FormatError(f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=f"{classes.name}")
     return chosen

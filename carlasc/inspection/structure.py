@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.classes import ClassTable
 from carlasc.errors import CarlascError
-from carlasc.labels import ClassTable
-from carlasc.sources.base import Sequence
+from carlasc.storage.protocol import Sequence
 
 MIN_RANGE_M = 3.0
 MAX_RANGE_M = 30.0

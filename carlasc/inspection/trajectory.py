@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
+from carlasc.core.geometry import check_rigid, invert
 from carlasc.errors import CarlascError, FormatError
-from carlasc.geometry import check_rigid, invert
 from carlasc.inspection.findings import Finding
-from carlasc.sources.base import Sequence
+from carlasc.storage import layout
+from carlasc.storage.protocol import Sequence
 
 _SPEED_M_S = 70.0  # 250 km/h
 _SPEED_CHANGE_M_S = 15.0  # from one step to the next ones; a collision in CARLA takes off as much

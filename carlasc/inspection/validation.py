@@ -10,18 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
+from carlasc.core.geometry import check_rigid
 from carlasc.errors import ArgumentError, CarlascError
-from carlasc.geometry import check_rigid
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
-from carlasc.inspection.opening import open_source
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
-from carlasc.sources.base import Sequence, Source
-from carlasc.sources.folder import FolderSequence
+from carlasc.storage import as_source, layout
+from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.protocol import Sequence, Source
 
 _SAMPLES = 40  # frames of a sequence whose contents are read, if not told otherwise
 _POOR_SHARE = 0.5
@@ -52,8 +51,8 @@ def validate(
         MissingDataError: there is no data set to look at.
     """
     if every is not None and every < 1:
-        raise ArgumentError(f"every: expected 1 or more, found {every}")
-    opened = open_source(source)
+        raise ArgumentError("every", expected="1 or more", found=f"{every}")
+    opened = as_source(source)
     plans = [_plan(sequence, every) for sequence in opened.sequences().values()]
     total, done = sum(plan.steps for plan in plans), 0
     findings: list[Finding] = []

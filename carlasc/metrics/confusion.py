@@ -58,11 +58,13 @@ class ConfusionMatrix:
         """
         if num_classes < 1 or not 0 <= free < num_classes:
             raise ArgumentError(
-                f"confusion matrix: expected classes with free among them, found {num_classes} classes, free {free}"
+                "confusion matrix", expected="classes with free among them", found=f"{num_classes} classes, free {free}"
             )
         if counts is not None and np.shape(counts) != (num_classes, num_classes):
             raise ArgumentError(
-                f"confusion matrix: expected counts of shape {(num_classes, num_classes)}, found {np.shape(counts)}"
+                "confusion matrix",
+                expected=f"counts of shape {(num_classes, num_classes)}",
+                found=f"{np.shape(counts)}",
             )
         self.num_classes = num_classes
         self.free = free
@@ -99,7 +101,9 @@ class ConfusionMatrix:
     def __iadd__(self, other: ConfusionMatrix) -> Self:
         if (other.num_classes, other.free) != (self.num_classes, self.free):
             raise ArgumentError(
-                f"confusion matrices: expected {self.num_classes} classes with free {self.free}, found {other.num_classes} with {other.free}"
+                "confusion matrices",
+                expected=f"{self.num_classes} classes with free {self.free}",
+                found=f"{other.num_classes} with {other.free}",
             )
         self.counts += other.counts
         return self
@@ -171,7 +175,7 @@ class ConfusionMatrix:
             ArgumentError: `absent` is something else.
         """
         if absent not in ("zero", "skip"):
-            raise ArgumentError(f"absent classes: expected zero or skip, found {absent!r}")
+            raise ArgumentError("absent classes", expected="zero or skip", found=f"{absent!r}")
         iou = self.iou if with_free else np.delete(self.iou, self.free)
         iou = np.nan_to_num(iou) if absent == "zero" else iou[~np.isnan(iou)]
         return float(iou.mean()) if len(iou) else float("nan")
@@ -203,7 +207,7 @@ def _count(
     """Count on the CPU."""
     for name, array in (("prediction", pred), ("truth", target)):
         if array.dtype.kind not in "uib":
-            raise FormatError(f"{name}: expected integer class ids, found {array.dtype}")
+            raise FormatError(name, expected="integer class ids", found=f"{array.dtype}")
     pred, target = (np.ascontiguousarray(array).reshape(-1) for array in (pred, target))
     counted = np.ones(pred.shape, np.bool_) if mask is None else np.ascontiguousarray(mask, np.bool_).reshape(-1)
     pred, target = _in_range(pred, counted, num_classes, "prediction"), _in_range(target, counted, num_classes, "truth")
@@ -247,7 +251,7 @@ def _count_on(device: Any, pred: Labels, target: Labels, mask: Labels | None, nu
     ids = {"prediction": there(pred), "truth": there(target)}
     for name, labels in ids.items():
         if labels.is_floating_point() or labels.is_complex():
-            raise FormatError(f"{name}: expected integer class ids, found {labels.dtype}")
+            raise FormatError(name, expected="integer class ids", found=f"{labels.dtype}")
         counted = labels.long() if mask is None else labels.long()[there(mask).bool()]
         wrong = counted[(counted < 0) | (counted >= num_classes)]
         if wrong.numel():
@@ -259,8 +263,10 @@ def _count_on(device: Any, pred: Labels, target: Labels, mask: Labels | None, nu
 
 def _out_of_range(name: str, found: int, times: int, num_classes: int) -> FormatError:
     return FormatError(
-        f"{name}: expected class ids 0..{num_classes - 1}, found {found} ({times} voxels are out of range): remap the labels,"
-        " or mask these voxels"
+        name,
+        expected=f"class ids 0..{num_classes - 1}",
+        found=f"{found} ({times} voxels are out of range)",
+        advice="remap the labels, or mask these voxels",
     )
 
 

@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI, remap_named, table_named
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.grids import GridSpec
-from carlasc.labels import CARLA, REMAPS, SEMANTICKITTI, ClassTable, Remap, remap_named, table_named
 from carlasc.metrics.confusion import Absent, ConfusionMatrix
 from carlasc.metrics.masks import semantickitti
 from carlasc.metrics.pairs import Pair, Where, pair_grids
@@ -135,12 +136,12 @@ def evaluate(
         FormatError: classes that cannot be compared.
     """
     if mask not in ("known", "semantickitti", "all"):
-        raise ArgumentError(f"mask: expected known, semantickitti or all, found {mask!r}")
+        raise ArgumentError("mask", expected="known, semantickitti or all", found=f"{mask!r}")
     pairs = pair_grids(pred, truth, pred_grid, truth_grid)
     jobs = [(pair, _pick(pair.truth.frames(), frames)) for pair in pairs]
     total = sum(len(numbers) for _, numbers in jobs)
     if total == 0:
-        raise MissingDataError(f"{pairs[0].truth.location}: expected frames to score, found none in the range")
+        raise MissingDataError(pairs[0].truth.location, expected="frames to score", found="none in the range")
 
     classes: ClassTable | None = None
     sequences: dict[str, ConfusionMatrix] = {}
@@ -150,7 +151,7 @@ def evaluate(
         scorer = _Scorer(pair, remap, pred_classes, mask, region)
         if classes is not None and scorer.classes.name != classes.name:
             raise FormatError(
-                f"{pair.truth.location}: expected the classes {classes.name}, found {scorer.classes.name}"
+                pair.truth.location, expected=f"the classes {classes.name}", found=f"{scorer.classes.name}"
             )
         classes = scorer.classes
         predicted = set(pair.pred.frames().tolist())
@@ -158,7 +159,7 @@ def evaluate(
         for frame in numbers.tolist():
             try:
                 if frame not in predicted:
-                    raise MissingDataError(f"{pair.pred.location}: expected a prediction for frame {frame}, found none")
+                    raise MissingDataError(pair.pred.location, expected=f"a prediction for frame {frame}", found="none")
                 matrix += scorer.score(frame)
             except CarlascError as error:
                 failures.append((f"{pair.truth.path}:{frame}", str(error)))
@@ -184,7 +185,10 @@ class _Scorer:
         self.truth_classes = pair.truth.classes or (self.remap.source if self.remap else self.classes)
         if mask == "semantickitti" and self.truth_classes is not SEMANTICKITTI:
             raise FormatError(
-                f"{pair.truth.location}: expected SemanticKITTI's raw ids for its mask, found {self.truth_classes.name}: take the mask known"
+                pair.truth.location,
+                expected="SemanticKITTI's raw ids for its mask",
+                found=f"{self.truth_classes.name}",
+                advice="take the mask known",
             )
         self.pred_classes = pair.pred.classes or (SEMANTICKITTI if mask == "semantickitti" else self.classes)
         if pred_classes is not None:
@@ -192,18 +196,21 @@ class _Scorer:
         spec = pair.truth.spec or pair.pred.spec
         if pair.truth.spec and pair.pred.spec and pair.truth.spec != pair.pred.spec:
             raise FormatError(
-                f"{pair.pred.location}: expected the truth's grid {pair.truth.spec} {pair.truth.spec.lower} .. {pair.truth.spec.upper},"
-                f" found {pair.pred.spec} {pair.pred.spec.lower} .. {pair.pred.spec.upper}"
+                pair.pred.location,
+                expected=f"the truth's grid {pair.truth.spec} {pair.truth.spec.lower} .. {pair.truth.spec.upper}",
+                found=f"{pair.pred.spec} {pair.pred.spec.lower} .. {pair.pred.spec.upper}",
             )
         if region is not None and spec is None:
-            raise ArgumentError(f"{pair.truth.location}: expected a params.json to find the region in, found none")
+            raise ArgumentError(pair.truth.location, expected="a params.json to find the region in", found="none")
         self.region = None if region is None or spec is None else region(spec)
 
     def score(self, frame: int) -> ConfusionMatrix:
         pred, truth = self.pair.pred.labels(frame), self.pair.truth.labels(frame)
         if pred.size != truth.size:
             raise FormatError(
-                f"{self.pair.pred.location}: frame {frame}: expected the truth's shape {truth.shape}, found {pred.shape}"
+                f"{self.pair.pred.location}: frame {frame}",
+                expected=f"the truth's shape {truth.shape}",
+                found=f"{pred.shape}",
             )
         counted = self._counted(truth, frame)
         matrix = ConfusionMatrix(max(self.classes.names) + 1)
@@ -223,7 +230,10 @@ class _Scorer:
             counted = self.pair.truth.known(frame)
             if counted is None and self.mask == "known":
                 raise MissingDataError(
-                    f"{self.pair.truth.location}: frame {frame}: expected counts to tell what is known, found none: score all voxels (mask all)"
+                    f"{self.pair.truth.location}: frame {frame}",
+                    expected="counts to tell what is known",
+                    found="none",
+                    advice="score all voxels (mask all)",
                 )
         if self.mask == "semantickitti":
             scored = semantickitti(truth).reshape(-1)
@@ -251,7 +261,9 @@ def _choose_remap(remap: str | Remap | None, pair: Pair, usual: ClassTable) -> R
     for side in (pair.truth, pair.pred):
         if remap and side.classes and side.classes.name not in (remap.source.name, remap.target.name):
             raise FormatError(
-                f"{side.location}: expected classes of {remap.source.name} or {remap.target.name} (remap {remap.name}), found {side.classes.name}"
+                side.location,
+                expected=f"classes of {remap.source.name} or {remap.target.name} (remap {remap.name})",
+                found=f"{side.classes.name}",
             )
     return remap
 

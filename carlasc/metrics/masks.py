@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import remap_named
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.grids import GridSpec
-from carlasc.labels import remap_named
 
 
 def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
@@ -34,7 +34,7 @@ def semantickitti(labels: NDArray[np.integer], invalid: NDArray[Any] | None = No
     if invalid is None:
         return scored
     if invalid.shape != labels.shape:
-        raise FormatError(f"invalid voxels: expected the labels' shape {labels.shape}, found {invalid.shape}")
+        raise FormatError("invalid voxels", expected=f"the labels' shape {labels.shape}", found=f"{invalid.shape}")
     return scored & (invalid == 0)
 
 
@@ -45,7 +45,7 @@ def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) 
         ArgumentError: an empty band.
     """
     if not 0 <= near_m < far_m:
-        raise ArgumentError(f"distance band: expected 0 <= near < far, found {near_m} and {far_m} m")
+        raise ArgumentError("distance band", expected="0 <= near < far", found=f"{near_m} and {far_m} m")
     centers = spec.from_axes(spec.centers())
     distance = np.hypot(centers[..., 0], centers[..., 1])
     return np.asarray((distance >= near_m) & (distance < far_m))
@@ -69,7 +69,9 @@ def field_of_view(
     low, high = vertical_rad
     if not (0 < horizontal_rad <= 2 * math.pi and low < high):
         raise ArgumentError(
-            f"field of view: expected an angle in (0, 2 pi] and low < high, found {horizontal_rad}, {low} and {high} rad"
+            "field of view",
+            expected="an angle in (0, 2 pi] and low < high",
+            found=f"{horizontal_rad}, {low} and {high} rad",
         )
     x, y, z = np.moveaxis(spec.from_axes(spec.centers()), -1, 0)
     elevation = np.arctan2(z, np.hypot(x, y))

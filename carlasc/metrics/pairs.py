@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.grids import GridSpec
-from carlasc.labels import ClassTable
-from carlasc.sources import Sequence, Source
-from carlasc.sources import open as open_source
+from carlasc.storage import Sequence, Source, as_source, layout
 
 Where = str | os.PathLike[str] | Source
 _BITS = 8
@@ -113,7 +111,10 @@ class LabelFolder(GridFrames):
         if size % width or (self.voxels is not None and size != width * self.voxels):
             expected = "labels" if self.voxels is None else f"{self.voxels} labels"
             raise FormatError(
-                f"{path}: expected {expected} of {width} bytes ({self.dtype.name}), found {size} bytes: cut short, of another grid, or of another type"
+                path,
+                expected=f"{expected} of {width} bytes ({self.dtype.name})",
+                found=f"{size} bytes",
+                advice="cut short, of another grid, or of another type",
             )
         return np.fromfile(path, self.dtype)
 
@@ -152,7 +153,10 @@ def pair_grids(pred: Where, truth: Where, pred_grid: str | None, truth_grid: str
         for grids in preds:
             if grids.path not in truths:
                 raise MissingDataError(
-                    f"{grids.location}: expected truth for the sequence {grids.path!r}, found {_shorten(truths)}: give both sides from the same level"
+                    grids.location,
+                    expected=f"truth for the sequence {grids.path!r}",
+                    found=f"{_shorten(truths)}",
+                    advice="give both sides from the same level",
                 )
             pairs.append(Pair(grids, truths[grids.path]))
     for pair in pairs:
@@ -177,7 +181,7 @@ def _open_grids(where: Where, grid: str | None) -> Iterator[GridFrames]:
         elif folder.is_dir() and len((plain := LabelFolder(folder)).frames()):
             yield plain
             return
-    source = where if isinstance(where, Source) else open_source(where)
+    source = as_source(where)
     found = False
     for sequence in source.sequences().values():
         if name := _choose_grid(sequence, grid):
@@ -185,7 +189,7 @@ def _open_grids(where: Where, grid: str | None) -> Iterator[GridFrames]:
             yield SequenceGrid(sequence, name)
     if not found:
         raise MissingDataError(
-            f"{source.location}: expected a grid {grid or 'with labels'} in at least one sequence, found none"
+            source.location, expected=f"a grid {grid or 'with labels'} in at least one sequence", found="none"
         )
 
 
@@ -198,7 +202,10 @@ def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
         return layout.EVALUATION
     if len(names) > 1:
         raise MissingDataError(
-            f"{sequence.location}: expected the grid {layout.EVALUATION}, found {', '.join(names)}: choose one by name"
+            sequence.location,
+            expected=f"the grid {layout.EVALUATION}",
+            found=f"{', '.join(names)}",
+            advice="choose one by name",
         )
     return names[0] if names else None
 

@@ -59,7 +59,9 @@ def semantic_table(evaluations: Sequence[Evaluation]) -> Table:
     """
     classes = {evaluation.classes.name for evaluation in evaluations}
     if len(classes) != 1:
-        raise ArgumentError(f"table: expected evaluations of one set of classes, found {', '.join(classes) or 'none'}")
+        raise ArgumentError(
+            "table", expected="evaluations of one set of classes", found=f"{', '.join(classes) or 'none'}"
+        )
     header = ("Network", *evaluations[0].class_iou, "mIoU", "mIoU w/o free", "Accuracy")
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (e.name, *_percent(*e.class_iou.values(), e.miou, e.miou_without_free, e.matrix.accuracy)) for e in evaluations

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.grids import Grid
 from carlasc.errors import FormatError
-from carlasc.grids import Grid
 from carlasc.metrics.confusion import ConfusionMatrix
 
 
@@ -60,7 +60,7 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
         FormatError: the grids differ in geometry, or ids are out of range.
     """
     if grid.spec != reference.spec:
-        raise FormatError(f"grid: expected the reference's {reference.spec}, found {grid.spec} (or other bounds)")
+        raise FormatError("grid", expected=f"the reference's {reference.spec}", found=f"{grid.spec} (or other bounds)")
     looked_at = np.ones(grid.spec.size, np.bool_) if mask is None else mask
     known, known_reference = grid.known & looked_at, reference.known & looked_at
     both = known & known_reference

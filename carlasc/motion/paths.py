@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import rotation_z
+from carlasc.core.geometry import rotation_z
 from carlasc.motion.registration import best_sighting, follow, nearest_points
 from carlasc.motion.smoothing import resample, smooth
 

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
 from carlasc.motion.smoothing import smooth
 
 _FIRST_LOOK_S = 0.5  # half width of the window in which the first guess of the motion is even

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import Transform, rotate_vectors, transform_points
-from carlasc.scans import Scan
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
+from carlasc.core.scans import Scan
 
 MIN_SPEED_M_S = 0.3  # slower is standing still: an estimated flow is never exactly zero
 _CELL_M = 0.4  # moving points are joined cell by cell of this size

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, stands
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment, Standing
 from carlasc.motion.smoothing import resample

@@ -1,7 +1,23 @@
-"""Looking at sequences: a page that any browser opens, and a window on the desktop."""
+"""Looking at sequences: pictures and films, a page that any browser opens, a window on the desktop."""
 
 from carlasc.viewing.clip import Clip, FrameContent, PanelSpec, open_clip
-from carlasc.viewing.page import PageResult, make_page
-from carlasc.viewing.window import Window, show
+from carlasc.viewing.page.page import PageResult, make_page
+from carlasc.viewing.rendering import RenderResult, Viewpoint, render, render_comparison, render_grid, render_scan
+from carlasc.viewing.window.window import Window, show
 
-__all__ = ["Clip", "FrameContent", "PageResult", "PanelSpec", "Window", "make_page", "open_clip", "show"]
+__all__ = [
+    "Clip",
+    "FrameContent",
+    "PageResult",
+    "PanelSpec",
+    "RenderResult",
+    "Viewpoint",
+    "Window",
+    "make_page",
+    "open_clip",
+    "render",
+    "render_comparison",
+    "render_grid",
+    "render_scan",
+    "show",
+]

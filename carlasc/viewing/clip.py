@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.grids import Grid, GridSpec
-from carlasc.labels import ClassTable
-from carlasc.rendering import colors as palette
-from carlasc.rendering.colors import ClassColors, PaletteName
-from carlasc.rendering.inputs import Input, find_truth, frames_in, in_one_table, open_input
-from carlasc.rendering.scenes import check_same_spec
-from carlasc.scans import Scan
-from carlasc.sources import Sequence, Source
+from carlasc.storage import Sequence, Source
+from carlasc.viewing.rendering import colors as palette
+from carlasc.viewing.rendering.colors import ClassColors, PaletteName
+from carlasc.viewing.rendering.inputs import Input, find_truth, frames_in, in_one_table, open_input
+from carlasc.viewing.rendering.scenes import check_same_spec
 
 Path_ = str | os.PathLike[str]
 
@@ -185,7 +185,7 @@ def open_clip(
         FormatError: what is there is not what the format says.
     """
     if every < 1:
-        raise ArgumentError(f"every: expected 1 or more, found {every}")
+        raise ArgumentError("every", expected="1 or more", found=f"{every}")
     if palette not in ("class", "colorblind"):
         raise ArgumentError(f"palette {palette!r}: expected class or colorblind")
     data = open_input(path, sequence, path_classes)
@@ -203,7 +203,10 @@ def open_clip(
     if not chosen:
         start, stop = ("" if value is None else value for value in frames or (None, None))
         raise MissingDataError(
-            f"{data.sequence.location}: expected frames {start}:{stop}, found {_span(available)}: choose others with --frames"
+            data.sequence.location,
+            expected=f"frames {start}:{stop}",
+            found=f"{_span(available)}",
+            advice="choose others with --frames",
         )
     if frames is None and at_most is not None and len(chosen) > at_most:
         notes.append(f"{len(chosen)} frames there: took the first {at_most}; choose with --frames")
@@ -242,13 +245,14 @@ def _available(data: Input, truth: Input | None, grid: str, truth_grid: str) -> 
     frames = data.sequence.frames(field)
     if not len(frames):
         there = ", ".join(sorted(data.sequence.fields())) or "nothing"
-        raise MissingDataError(f"{data.sequence.location}: expected a grid or points, found {there}")
+        raise MissingDataError(data.sequence.location, expected="a grid or points", found=f"{there}")
     if truth is not None:
         common = np.intersect1d(frames, truth.sequence.frames(f"{truth_grid}/labels"))
         if not len(common):
             raise MissingDataError(
-                f"{truth.sequence.location}: expected frames of the prediction ({_span(frames)}), found"
-                f" {_span(truth.sequence.frames(f'{truth_grid}/labels'))}"
+                truth.sequence.location,
+                expected=f"frames of the prediction ({_span(frames)})",
+                found=f"{_span(truth.sequence.frames(f'{truth_grid}/labels'))}",
             )
         return common
     return frames

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
 from carlasc.converting import Converter, Exporter, FrameContent, FrameHandle, Recording, Split, VoxelContent
+from carlasc.core.geometry import Transform, check_rigid
+from carlasc.core.tables import REMAPS, SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.geometry import Transform, check_rigid
-from carlasc.labels import REMAPS, SEMANTICKITTI
+from carlasc.storage import layout
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
 _MOVING_TO_BASE = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
@@ -134,11 +134,14 @@ class KittiFrame(FrameHandle):
         """Read points, classes and instances."""
         points = _read_array(self.location, np.dtype("<f4"), 4)
         if not len(points):
-            raise FormatError(f"{self.location}: expected points, found an empty file: copy it again")
+            raise FormatError(self.location, expected="points", found="an empty file", advice="copy it again")
         labels, instances = self.read_labels()
         if labels is not None and len(labels) != len(points):
             raise FormatError(
-                f"{self._label_file}: expected a label for each of {len(points)} points, found {len(labels)}: of another scan, or cut short"
+                self._label_file,
+                expected=f"a label for each of {len(points)} points",
+                found=f"{len(labels)}",
+                advice="of another scan, or cut short",
             )
         return FrameContent(points, labels, instances)
 
@@ -165,7 +168,7 @@ def find_sequences(root: Path) -> list[Path]:
     """
     if not root.is_dir():
         raise MissingDataError(
-            f"{root}: expected a folder, found {'a file' if root.exists() else 'nothing'}: check the path"
+            root, expected="a folder", found=f"{'a file' if root.exists() else 'nothing'}", advice="check the path"
         )
     if (root / "velodyne").is_dir():
         return [root.resolve()]
@@ -173,7 +176,10 @@ def find_sequences(root: Path) -> list[Path]:
         if folder.is_dir() and (found := sorted(path for path in folder.iterdir() if (path / "velodyne").is_dir())):
             return found
     raise MissingDataError(
-        f"{root}: expected sequences/00/velodyne/ and so on, or a folder with velodyne/ in it, found none: give the folder that holds sequences/"
+        root,
+        expected="sequences/00/velodyne/ and so on, or a folder with velodyne/ in it",
+        found="none",
+        advice="give the folder that holds sequences/",
     )
 
 
@@ -197,7 +203,9 @@ def read_calibration(path: Path) -> dict[str, Transform]:
     try:
         lines = path.read_text().splitlines()
     except UnicodeDecodeError as error:
-        raise FormatError(f"{path}: expected NAME: and 12 numbers a line, found something else: {error}") from error
+        raise FormatError(
+            path, expected="NAME: and 12 numbers a line", found="something else", advice=f"{error}"
+        ) from error
     found = {}
     for line in lines:
         name, colon, values = line.partition(":")
@@ -208,7 +216,7 @@ def read_calibration(path: Path) -> dict[str, Transform]:
         if colon and len(numbers) == 12:
             found[name.strip()] = np.vstack([np.reshape(numbers, (3, 4)), (0.0, 0.0, 0.0, 1.0)])
         elif name.strip() == "Tr":
-            raise FormatError(f"{path}: expected 12 numbers after Tr:, found {values.strip()!r}")
+            raise FormatError(path, expected="12 numbers after Tr:", found=f"{values.strip()!r}")
     return found
 
 
@@ -222,10 +230,10 @@ def _read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
     try:
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
-        raise MissingDataError(f"{path}: expected a file, found nothing: copy it again") from None
+        raise MissingDataError(path, expected="a file", found="nothing", advice="copy it again") from None
     row = dtype.itemsize * columns
     if len(data) % row:
-        raise FormatError(f"{path}: expected a multiple of {row} bytes, found {len(data)}: cut short?")
+        raise FormatError(path, expected=f"a multiple of {row} bytes", found=f"{len(data)}", advice="cut short?")
     return data.view(dtype).reshape(-1, columns)
 
 

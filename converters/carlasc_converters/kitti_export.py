@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout, sources
+from carlasc import storage
 from carlasc.converting import Exporter
 from carlasc.converting.frames import MIRROR, VOXEL_FILES
+from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import REMAPS, SEMANTICKITTI
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.geometry import Transform
-from carlasc.grids import GridSpec
-from carlasc.labels import REMAPS, SEMANTICKITTI, ClassTable
+from carlasc.storage import layout
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 from carlasc_converters.occlusion import occluded_voxels
 
@@ -46,7 +48,7 @@ class KittiExporter(Exporter):
         free = (f"{number:02d}" for number in range(10_000) if f"{number:02d}" not in numbers.values())
         return {name: f"sequences/{numbers.get(name) or next(free)}" for name in names}
 
-    def documents(self, sequence: sources.Sequence) -> dict[str, bytes]:
+    def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
         """Return poses of the LiDAR, which an identity Tr makes those of the camera too, and times."""
         if self.predictions:
             self._grid_of(sequence)
@@ -59,7 +61,7 @@ class KittiExporter(Exporter):
             documents["times.txt"] = layout.encode_times(sequence.times)
         return documents
 
-    def frame_files(self, sequence: sources.Sequence, frame: int) -> tuple[str, ...]:
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
         """Return what a frame has: a scan, labels, voxels or predictions."""
         if self.predictions:
             has = frame in sequence.frames(f"{self._grid_of(sequence)}/labels")
@@ -70,7 +72,7 @@ class KittiExporter(Exporter):
             names += [f"voxels/{frame:06d}{suffix}" for suffix in (".label", *MASKS)]
         return tuple(names)
 
-    def make_frame(self, sequence: sources.Sequence, frame: int) -> dict[str, bytes | memoryview]:
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, bytes | memoryview]:
         """Return the frame's files."""
         made: dict[str, bytes | memoryview] = {}
         wanted = self.frame_files(sequence, frame)
@@ -87,7 +89,7 @@ class KittiExporter(Exporter):
             made |= self._voxels(sequence, frame)
         return made
 
-    def _voxels(self, sequence: sources.Sequence, frame: int) -> Mapping[str, bytes]:
+    def _voxels(self, sequence: storage.Sequence, frame: int) -> Mapping[str, bytes]:
         """Return the original voxel files where they were kept, else files made from the grid."""
         kept = _kept_files(sequence, frame) if self.grid is None else {}
         if kept:
@@ -104,22 +106,25 @@ class KittiExporter(Exporter):
         }
         return {f"voxels/{frame:06d}{suffix}": data for suffix, data in files.items()}
 
-    def _labels(self, sequence: sources.Sequence, frame: int) -> NDArray[np.unsignedinteger]:
+    def _labels(self, sequence: storage.Sequence, frame: int) -> NDArray[np.unsignedinteger]:
         """Return (X, Y, Z) raw ids, right-handed."""
         name = self._grid_of(sequence)
         where = f"{sequence.location}: {name} of frame {frame}"
         labels = _raw_ids(sequence.classes_of(name), sequence.read(f"{name}/labels", frame), where)
         return _flipped(sequence, labels)
 
-    def _counts(self, sequence: sources.Sequence, frame: int) -> NDArray[np.floating]:
+    def _counts(self, sequence: storage.Sequence, frame: int) -> NDArray[np.floating]:
         name = self._grid_of(sequence)
         if frame not in sequence.frames(f"{name}/counts"):
             raise MissingDataError(
-                f"{sequence.location}/{name}: expected counts of frame {frame}, which tell what is known, found none: a prediction? Then --predictions"
+                f"{sequence.location}/{name}",
+                expected=f"counts of frame {frame}, which tell what is known",
+                found="none",
+                advice="a prediction? Then --predictions",
             )
         return _flipped(sequence, np.asarray(sequence.read(f"{name}/counts", frame)))
 
-    def _occupancy(self, sequence: sources.Sequence, frame: int, spec: GridSpec) -> NDArray[np.bool_]:
+    def _occupancy(self, sequence: storage.Sequence, frame: int, spec: GridSpec) -> NDArray[np.bool_]:
         """Return which voxels the frame's own scan has points in."""
         occupancy = np.zeros(spec.num_voxels, np.bool_)
         if frame in sequence.frames("points"):
@@ -130,7 +135,7 @@ class KittiExporter(Exporter):
             occupancy[index[index >= 0]] = True
         return occupancy.reshape(spec.size)
 
-    def _grid_of(self, sequence: sources.Sequence) -> str:
+    def _grid_of(self, sequence: storage.Sequence) -> str:
         """Return the grid to export.
 
         Raises:
@@ -140,14 +145,14 @@ class KittiExporter(Exporter):
         grids = sequence.grids
         if not grids or (self.grid is not None and self.grid not in grids):
             wanted = self.grid or "a grid"
-            raise MissingDataError(f"{sequence.location}: expected {wanted}, found {', '.join(grids) or 'none'}")
+            raise MissingDataError(sequence.location, expected=f"{wanted}", found=f"{', '.join(grids) or 'none'}")
         name = self.grid or max(grids, key=lambda grid: grids[grid].num_voxels)
         if grids[name].coordinates != "cartesian":
-            raise ArgumentError(f"{sequence.location}/{name}: expected a Cartesian grid, found a cylindrical one")
+            raise ArgumentError(f"{sequence.location}/{name}", expected="a Cartesian grid", found="a cylindrical one")
         return name
 
 
-def right_handed_grid(sequence: sources.Sequence, spec: GridSpec) -> GridSpec:
+def right_handed_grid(sequence: storage.Sequence, spec: GridSpec) -> GridSpec:
     """Return a grid's geometry in SemanticKITTI's frame: y's bounds change places where the sequence is mirrored."""
     if sequence.metadata.frame == "kitti":
         return spec
@@ -155,7 +160,7 @@ def right_handed_grid(sequence: sources.Sequence, spec: GridSpec) -> GridSpec:
     return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
 
 
-def _kept_files(sequence: sources.Sequence, frame: int) -> dict[str, bytes]:
+def _kept_files(sequence: storage.Sequence, frame: int) -> dict[str, bytes]:
     """Return the files that convert kept beside the grid."""
     kept = {}
     for suffix in (".label", *MASKS):
@@ -179,19 +184,22 @@ def _raw_ids(classes: ClassTable, labels: NDArray[np.integer], where: str) -> ND
         return REMAPS["carla_to_semantickitti"](labels, where)
     if classes.name not in _PREDICTED:
         raise FormatError(
-            f"{where}: expected classes carla, semantickitti, {' or '.join(_PREDICTED)}, found {classes.name}: they have no counterpart in SemanticKITTI"
+            where,
+            expected=f"classes carla, semantickitti, {' or '.join(_PREDICTED)}",
+            found=f"{classes.name}",
+            advice="they have no counterpart in SemanticKITTI",
         )
     classes.check(labels, where)
     return np.array(_PREDICTED[classes.name], np.uint16)[labels]
 
 
-def _right_handed(sequence: sources.Sequence, poses: NDArray[np.float64]) -> Transform:
+def _right_handed(sequence: storage.Sequence, poses: NDArray[np.float64]) -> Transform:
     return poses if sequence.metadata.frame == "kitti" else MIRROR @ poses @ MIRROR
 
 
-def _mirror_row(sequence: sources.Sequence) -> NDArray[np.float32]:
+def _mirror_row(sequence: storage.Sequence) -> NDArray[np.float32]:
     return np.array([1, 1 if sequence.metadata.frame == "kitti" else -1, 1, 1], np.float32)
 
 
-def _flipped(sequence: sources.Sequence, grid: NDArray[Any]) -> NDArray[Any]:
+def _flipped(sequence: storage.Sequence, grid: NDArray[Any]) -> NDArray[Any]:
     return grid if sequence.metadata.frame == "kitti" else grid[:, ::-1]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import VoxelContent
+from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.grids import GridSpec
 
 GRID = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
 MASKS = (".bin", ".invalid", ".occluded")
@@ -29,7 +29,9 @@ def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> NDArray[
     """
     voxels = int(np.prod(size))
     if len(data) != -(-voxels // 8):
-        raise FormatError(f"{where}: expected {-(-voxels // 8)} bytes of packed bits, found {len(data)}: cut short?")
+        raise FormatError(
+            where, expected=f"{-(-voxels // 8)} bytes of packed bits", found=f"{len(data)}", advice="cut short?"
+        )
     return np.unpackbits(np.frombuffer(data, np.uint8), count=voxels).reshape(size).astype(np.bool_)
 
 
@@ -52,7 +54,10 @@ def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
     voxels = int(np.prod(GRID.size))
     if len(data) != 2 * voxels:
         raise FormatError(
-            f"{folder / f'{frame:06d}.label'}: expected {2 * voxels} bytes (256 x 256 x 32 uint16), found {len(data)}: cut short?"
+            f"{folder / f'{frame:06d}.label'}",
+            expected=f"{2 * voxels} bytes (256 x 256 x 32 uint16)",
+            found=f"{len(data)}",
+            advice="cut short?",
         )
     labels = np.frombuffer(data, "<u2").reshape(GRID.size)
     known = np.ones(GRID.size, np.bool_)

@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from carlasc.converting import Converter, Recording
-from carlasc.geometry import Transform
-from carlasc.labels import REMAPS, SEMANTICPOSS
+from carlasc.core.geometry import Transform
+from carlasc.core.tables import REMAPS, SEMANTICPOSS
 from carlasc_converters.kitti import KittiRecording, find_sequences
 
 _VALIDATION = "02"  # of 00..05: the part that papers about it test on

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import carlasc
+from carlasc.captures.town import Drive
 from carlasc.converting import convert
-from carlasc.labels import CARLA
-from carlasc.simulation import Drive
+from carlasc.core.tables import CARLA
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.kitti import write_kitti

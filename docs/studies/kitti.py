@@ -17,14 +17,14 @@ from PIL import Image
 
 import carlasc
 from carlasc import Grid, GridSpec
+from carlasc.captures.town import Drive
 from carlasc.converting import convert
-from carlasc.geometry import invert
+from carlasc.core.geometry import invert
+from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes, regrid
-from carlasc.groundtruth.windows import Merging
-from carlasc.labels import CARLA
+from carlasc.groundtruth.from_scans.windows import Merging
 from carlasc.metrics import TruthScore, score_truth
-from carlasc.rendering import ClassColors, Panel, draw_panels, grid_scene
-from carlasc.simulation import Drive
+from carlasc.viewing.rendering import ClassColors, Panel, draw_panels, grid_scene
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.kitti import write_kitti

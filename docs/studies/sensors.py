@@ -14,12 +14,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from carlasc import Grid, GridSpec
-from carlasc.capture import Recording
-from carlasc.geometry import invert
+from carlasc.captures.raw import Recording
+from carlasc.captures.town import Drive
+from carlasc.core.geometry import invert
+from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.labels import CARLA
 from carlasc.metrics import TruthScore, score_truth
-from carlasc.simulation import Drive
 
 SENSORS = (1, 5, 10, 20, 40)
 SCENES = [(seed, 60) for seed in range(101, 106)]

@@ -17,18 +17,18 @@ import numpy as np
 from PIL import Image
 
 import carlasc
-from carlasc import Grid, GridSpec, layout
-from carlasc.geometry import invert, relative_to
+from carlasc import Grid, GridSpec
+from carlasc.captures.town import Drive
+from carlasc.core.geometry import invert, relative_to
+from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
+from carlasc.groundtruth.from_scans.inputs import ScanFrame
+from carlasc.groundtruth.from_scans.windows import Merging, ScanFeed
 from carlasc.groundtruth.inputs import Recipe
-from carlasc.groundtruth.scans import ScanFrame
-from carlasc.groundtruth.voting import VoteRule
-from carlasc.groundtruth.windows import Merging, ScanFeed
-from carlasc.labels import CARLA
+from carlasc.groundtruth.voting.ballot import VoteRule
 from carlasc.metrics import TruthScore, score_truth
-from carlasc.rendering import ClassColors, Panel, draw_panels, grid_scene
-from carlasc.simulation import Drive
-from carlasc.sources import FolderSink
+from carlasc.storage import FolderSink, layout
+from carlasc.viewing.rendering import ClassColors, Panel, draw_panels, grid_scene
 
 FRAMES = 101
 JUDGED = [int(frame) for frame in np.linspace(0, FRAMES - 1, 10)]

@@ -46,4 +46,4 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
             return int(first) if first else None, int(stop) if stop else None
     except ValueError:
         pass
-    raise ArgumentError(f"--frames: expected A:B, A: or :B, found {text!r}")
+    raise ArgumentError("--frames", expected="A:B, A: or :B", found=f"{text!r}")

@@ -72,16 +72,16 @@ class Config:
             if kind is float and isinstance(value, int) and not isinstance(value, bool):
                 object.__setattr__(self, name, float(value))
             elif not _fits(value, kind):
-                raise ArgumentError(f"{name}: expected {_describe(kind)}, found {value!r}")
+                raise ArgumentError(name, expected=f"{_describe(kind)}", found=f"{value!r}")
         for name in ("history", "epochs", "batch_size"):
             if getattr(self, name) < 1:
-                raise ArgumentError(f"{name}: expected 1 or more, found {getattr(self, name)}")
+                raise ArgumentError(name, expected="1 or more", found=f"{getattr(self, name)}")
         if self.history > 1 and self.network != "motionsc":
             raise ArgumentError(
-                f"history: expected 1 for {self.network}, found {self.history}: only motionsc takes more"
+                "history", expected=f"1 for {self.network}", found=f"{self.history}", advice="only motionsc takes more"
             )
         if not set(self.flips) <= {"x", "y"}:
-            raise ArgumentError(f"flips: expected x, y, xy or nothing, found {self.flips!r}")
+            raise ArgumentError("flips", expected="x, y, xy or nothing", found=f"{self.flips!r}")
 
     @classmethod
     def read(cls, path: Path, overrides: Iterable[str] = ()) -> Config:
@@ -99,18 +99,18 @@ class Config:
                 f"{path}: expected a YAML file of settings, found something else: {error}".replace("\n", " ")
             ) from error
         if not isinstance(values, Mapping):
-            raise FormatError(f"{path}: expected settings as `key: value` lines, found {type(values).__name__}")
+            raise FormatError(path, expected="settings as `key: value` lines", found=f"{type(values).__name__}")
         settings: dict[str, Any] = dict(values)
         for text in overrides:
             key, equals, value = text.partition("=")
             if not equals:
-                raise ArgumentError(f"--set: expected key=value, found {text!r}")
+                raise ArgumentError("--set", expected="key=value", found=f"{text!r}")
             settings[key] = yaml.safe_load(value)
         names = [field.name for field in dataclasses.fields(cls)]
         if unknown := set(settings) - set(names):
-            raise ArgumentError(f"{path}: expected some of {', '.join(names)}, found {', '.join(sorted(unknown))}")
+            raise ArgumentError(path, expected=f"some of {', '.join(names)}", found=f"{', '.join(sorted(unknown))}")
         if "network" not in settings:
-            raise FormatError(f"{path}: expected the key network, found none")
+            raise FormatError(path, expected="the key network", found="none")
         return cls(**settings)
 
     def write(self, path: Path) -> None:

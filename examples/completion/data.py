@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler, Subset
 
 from carlasc import Dataset, Flip
+from carlasc.core.classes import class_weights as weights_of
+from carlasc.core.tables import REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.labels import REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
-from carlasc.labels import class_weights as weights_of
 from carlasc.metrics import semantickitti
 from completion.config import Config
 from completion.losses import IGNORE
@@ -85,13 +85,18 @@ def open_split(root: str | Path, split: str | list[str], config: Config, *, trai
     longest = max(frames, key=lambda location: frames[location])
     if config.history > frames[longest]:
         raise ArgumentError(
-            f"history: expected at most the {frames[longest]} frames of {longest} (the longest sequence), found {config.history}"
+            "history",
+            expected=f"at most the {frames[longest]} frames of {longest} (the longest sequence)",
+            found=f"{config.history}",
         )
     transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history else []
     if kitti:
         if data.classes is not SEMANTICKITTI:
             raise ArgumentError(
-                f"remap semantickitti19: expected SemanticKITTI's ids, found {data.classes.name}: take carlasc11"
+                "remap semantickitti19",
+                expected="SemanticKITTI's ids",
+                found=f"{data.classes.name}",
+                advice="take carlasc11",
             )
         data.classes = SEMANTICKITTI19
         transforms.append(SemanticKittiRule())
@@ -113,10 +118,12 @@ class TrainLoader:
 
     def __init__(self, data: Dataset, config: Config, rank: int = 0, world: int = 1) -> None:
         if config.batch_size % world:
-            raise ArgumentError(f"batch_size: expected a multiple of the {world} processes, found {config.batch_size}")
+            raise ArgumentError(
+                "batch_size", expected=f"a multiple of the {world} processes", found=f"{config.batch_size}"
+            )
         if len(data) < world:
             raise ArgumentError(
-                f"training split: expected a sample for each of the {world} processes, found {len(data)}"
+                "training split", expected=f"a sample for each of the {world} processes", found=f"{len(data)}"
             )
         self.data = data
         self.sampler: DistributedSampler[Sample] = DistributedSampler(data, world, rank, shuffle=True, seed=config.seed)
@@ -177,7 +184,7 @@ def class_weights(root: str | Path, data: Dataset, config: Config) -> NDArray[np
     else:
         weights = _read_weights(Path(config.class_weights), data)
     if len(weights) != num_classes:
-        raise FormatError(f"class weights: expected {num_classes} of them, found {len(weights)}")
+        raise FormatError("class weights", expected=f"{num_classes} of them", found=f"{len(weights)}")
     return weights.astype(np.float32)
 
 
@@ -200,6 +207,9 @@ def _read_weights(path: Path, data: Dataset) -> NDArray[np.float64]:
             weights[index] = named[name]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError(
-            f"{path}: expected what `carlasc stats --json` prints, with a weight for each class of {data.classes.name}, found something else: {error}"
+            path,
+            expected=f"what `carlasc stats --json` prints, with a weight for each class of {data.classes.name}",
+            found="something else",
+            advice=f"{error}",
         ) from error
     return weights

@@ -78,7 +78,7 @@ def prepare(
         ArgumentError: there is no such mode.
     """
     if mode not in ("eager", "compile"):
-        raise ArgumentError(f"mode: expected eager or compile, found {mode!r}")
+        raise ArgumentError("mode", expected="eager or compile", found=f"{mode!r}")
     if bf16 is None:
         bf16 = mode == "compile" and device.type == "cuda"
     dtype = torch.bfloat16 if bf16 else torch.float32

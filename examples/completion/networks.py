@@ -35,9 +35,9 @@ def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1)
         ArgumentError: there is no such network, or the grid's cells do not divide as it needs.
     """
     if name not in _BUILDERS:
-        raise ArgumentError(f"network: expected one of {', '.join(_BUILDERS)}, found {name!r}")
+        raise ArgumentError("network", expected=f"one of {', '.join(_BUILDERS)}", found=f"{name!r}")
     if history > 1 and name != "motionsc":
-        raise ArgumentError(f"history: expected 1 for {name}, found {history}: only motionsc takes more")
+        raise ArgumentError("history", expected=f"1 for {name}", found=f"{history}", advice="only motionsc takes more")
     network = _BUILDERS[name](num_classes, spec.size[2], history)
     check_size(network, name, spec.size)
     return network
@@ -48,5 +48,7 @@ def check_size(network: nn.Module, name: str, size: tuple[int, int, int]) -> Non
     divisors: Any = network.divisors
     if any(cells % divisor for cells, divisor in zip(size, divisors, strict=True)):
         raise ArgumentError(
-            f"{name}: expected a grid of multiples of {' x '.join(map(str, divisors))} cells, found {' x '.join(map(str, size))}"
+            name,
+            expected=f"a grid of multiples of {' x '.join(map(str, divisors))} cells",
+            found=f"{' x '.join(map(str, size))}",
         )

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from carlasc import ClassTable, Dataset, GridSpec, layout
+from carlasc import ClassTable, Dataset, GridSpec
+from carlasc.core.tables import CARLASC11, SEMANTICKITTI19
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
-from carlasc.labels import CARLASC11, SEMANTICKITTI19
-from carlasc.sources import FolderSink, Metadata
-from carlasc.sources.folder import FolderWriter
+from carlasc.storage import FolderSink, Metadata, layout
+from carlasc.storage.folders.folder import FolderWriter
 from completion.config import Config
 from completion.inference import Mode, prepare
 from completion.networks import build_network
@@ -56,7 +56,7 @@ class Model:
         name, num_classes = identify(state, str(path))
         if num_classes not in _TABLES:
             raise FormatError(
-                f"{path}: expected weights for 11 classes (CarlaSC) or 20 (SemanticKITTI), found {num_classes}"
+                path, expected="weights for 11 classes (CarlaSC) or 20 (SemanticKITTI)", found=f"{num_classes}"
             )
         if history is None:
             settings = path.parent / "config.yaml"
@@ -116,7 +116,9 @@ def predict_dataset(
     """
     data = Dataset(root, split, history=model.history, grid=grid, fields=("occupancy",), remap=None)
     if out is None and not Path(root).is_dir():
-        raise ArgumentError(f"{root}: expected a folder to write beside the data, found none: say where to write")
+        raise ArgumentError(
+            root, expected="a folder to write beside the data", found="none", advice="say where to write"
+        )
     first, stop = frames or (None, None)
     jobs = [
         (sequence, frame)
@@ -175,11 +177,14 @@ def predict_scans(
     """
     if model.history > 1:
         raise ArgumentError(
-            f"history: expected 1 for scans without poses, found {model.history}: give a data set of the layout"
+            "history",
+            expected="1 for scans without poses",
+            found=f"{model.history}",
+            advice="give a data set of the layout",
         )
     files = sorted(folder.glob("*.bin"))
     if not files:
-        raise MissingDataError(f"{folder}: expected .bin scans, found none")
+        raise MissingDataError(folder, expected=".bin scans", found="none")
     numbers = [layout.frame_of(file.name, ".bin") for file in files]
     complete = model.complete_on(spec, device, mode)
     writer = _begin(out, "cartesian", layout.EVALUATION, spec, model, beside=False)
@@ -205,7 +210,10 @@ def _begin(out: Path, path: str, grid: str, spec: GridSpec, model: Model, *, bes
     there = writer.read_document(layout.params_file(grid))
     if there is not None and json.loads(there) != params:
         raise ConflictError(
-            f"{writer.location}/{layout.params_file(grid)}: expected predictions of {model.network} on this grid, found another grid: choose another folder or name"
+            f"{writer.location}/{layout.params_file(grid)}",
+            expected=f"predictions of {model.network} on this grid",
+            found="another grid",
+            advice="choose another folder or name",
         )
     writer.write_document(layout.params_file(grid), json.dumps(params).encode())
     if not beside:

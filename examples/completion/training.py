@@ -116,7 +116,10 @@ def train(root: str | Path, config: Config, out: Path, processes: Processes, *, 
 def _begin(out: Path, config: Config, processes: Processes) -> Progress:
     if (out / LAST).exists():
         raise ConflictError(
-            f"{out / LAST}: expected no earlier run, found one: go on with it (--resume), or choose another folder"
+            out / LAST,
+            expected="no earlier run",
+            found="one",
+            advice="go on with it (--resume), or choose another folder",
         )
     processes.wait()
     if processes.first:
@@ -130,7 +133,10 @@ def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
     changed = [f.name for f in dataclasses.fields(Config) if getattr(before, f.name) != getattr(config, f.name)]
     if changed := [name for name in changed if name not in ("epochs", "patience", "workers")]:
         raise ConflictError(
-            f"{out / CONFIG}: expected the settings of the run to go on with, found others: {', '.join(changed)}"
+            out / CONFIG,
+            expected="the settings of the run to go on with",
+            found="others",
+            advice=f"{', '.join(changed)}",
         )
     read_weights(out / LAST)  # says so if there is none
     state = read_checkpoint(out / LAST)

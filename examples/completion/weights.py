@@ -32,18 +32,18 @@ def read_weights(path: Path) -> StateDict:
         FormatError: it is no state dict; a pickle that would run code is refused.
     """
     if not path.is_file():
-        raise MissingDataError(f"{path}: expected weights, found nothing")
+        raise MissingDataError(path, expected="weights", found="nothing")
     if path.suffix == ".safetensors":
         safetensors = import_extra("safetensors.torch", "torch")
         try:
             return safetensors.load_file(path, device="cpu")
         except Exception as error:
-            raise FormatError(f"{path}: expected safetensors, found something else: {error}") from error
+            raise FormatError(path, expected="safetensors", found="something else", advice=f"{error}") from error
     state = read_checkpoint(path)
     if "network" in state and "epoch" in state:  # a checkpoint of ours
         state = state["network"]
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
-        raise FormatError(f"{path}: expected a state dict (names to tensors), found {_describe(state)}")
+        raise FormatError(path, expected="a state dict (names to tensors)", found=f"{_describe(state)}")
     return state
 
 
@@ -58,10 +58,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FormatError(
-            f"{path}: expected a state dict, found something else, which was not run: {reason}"
+            path, expected="a state dict", found="something else, which was not run", advice=f"{reason}"
         ) from error
     if not isinstance(state, Mapping):
-        raise FormatError(f"{path}: expected a state dict (names to tensors), found {type(state).__name__}")
+        raise FormatError(path, expected="a state dict (names to tensors)", found=f"{type(state).__name__}")
     return dict(state)
 
 
@@ -93,15 +93,21 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
     for name, value in own.items():
         if name not in state:
             raise FormatError(
-                f"{where}: expected the layer {name} {_shape(value)}, found none: weights of another network?"
+                where, expected=f"the layer {name} {_shape(value)}", found="none", advice="weights of another network?"
             )
         if state[name].shape != value.shape:
             raise FormatError(
-                f"{where}: layer {name}: expected {_shape(value)}, found {_shape(state[name])}: {_advice(name)}"
+                f"{where}: layer {name}",
+                expected=f"{_shape(value)}",
+                found=f"{_shape(state[name])}",
+                advice=f"{_advice(name)}",
             )
     if unknown := [name for name in state if name not in own]:
         raise FormatError(
-            f"{where}: expected no layer {unknown[0]}, found {_shape(state[unknown[0]])}: weights of another network?"
+            where,
+            expected=f"no layer {unknown[0]}",
+            found=f"{_shape(state[unknown[0]])}",
+            advice="weights of another network?",
         )
     network.load_state_dict(dict(state), strict=True)
 
@@ -115,7 +121,7 @@ def identify(state: Mapping[str, Tensor], where: str) -> tuple[str, int]:
     name = next((name for name, mark in _MARKS.items() if mark in state), None)
     if name is None:
         raise FormatError(
-            f"{where}: expected weights of {', '.join(_MARKS)}, found a first layer named {next(iter(state))}"
+            where, expected=f"weights of {', '.join(_MARKS)}", found=f"a first layer named {next(iter(state))}"
         )
     last = {
         "motionsc": "segmentation_head.conv_classes.bias",

@@ -23,7 +23,7 @@ from helpers.drives import write_drive
 from helpers.lidar_frames import street_frame
 from helpers.plain_loader import PlainLoader
 
-from carlasc.dataset import Dataset
+from carlasc.dataset.samples import Dataset
 
 FRAMES = 40
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.grids import Grid, GridSpec
-from carlasc.rendering import render_grid, render_scan
-from carlasc.scans import Scan
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
+from carlasc.viewing.rendering import render_grid, render_scan
 
 
 def street(spec):

@@ -19,8 +19,8 @@ from helpers.drives import write_drive
 from helpers.lidar_frames import street_frame
 
 import carlasc
-from carlasc.dataset import Dataset
-from carlasc.packing import pack
+from carlasc.dataset.samples import Dataset
+from carlasc.storage.packing import pack
 
 FRAMES, HISTORY = 40, 16
 PATH = "Train/Town01_Light/cartesian"

@@ -10,9 +10,9 @@ import pytest
 from helpers.lidar_frames import street_frame
 from helpers.plain_voting import plain_grid, plain_votes
 
-from carlasc.grids import Grid, GridSpec
-from carlasc.groundtruth.observations import Observation
-from carlasc.groundtruth.voting import count_votes
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.groundtruth.voting.ballot import count_votes
+from carlasc.groundtruth.voting.observations import Observation
 
 FINEST = GridSpec.published().with_resolution(0.1)
 CASES = {

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from carlasc import GridSpec, layout
+from carlasc import GridSpec
 from carlasc.cli import app
-from carlasc.sources import FolderSink
+from carlasc.storage import FolderSink, layout
 
 SPEC = GridSpec("cartesian", (4, 4, 2), (-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))
 PATH = "Test/Town10_Heavy/cartesian"

@@ -10,8 +10,8 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from carlasc import layout
 from carlasc.cli import app
+from carlasc.storage import layout
 
 
 def run(*arguments: object) -> Result:

@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 from carlasc.cli import app
 from carlasc.cli.grid_options import Coordinates, Preset, parse_grid
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.grids import GridSpec
 
 
 @pytest.fixture

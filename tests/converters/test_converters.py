@@ -13,15 +13,16 @@ from helpers.tiny_kitti import write_labels, write_tiny_kitti
 import carlasc
 from carlasc.converting import convert, converter_names, load_converter
 from carlasc.errors import ArgumentError, DependencyError
-from carlasc.sources import Sink
-from carlasc.sources.base import SequenceWriter
+from carlasc.storage import Sink
+from carlasc.storage.protocol import SequenceWriter
 
 PLAIN = {"grids": "none", "flow": "none", "workers": 1}
 
 THIRD_PARTY = """
 import numpy as np
 from carlasc.converting import Converter, FrameContent, FrameHandle, Recording
-from carlasc.labels import CARLA, Remap
+from carlasc.core.classes import Remap
+from carlasc.core.tables import CARLA
 
 class Handle(FrameHandle):
     def __init__(self, number):

@@ -9,8 +9,8 @@ from helpers.tiny_kitti import write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert
+from carlasc.core.tables import REMAPS
 from carlasc.inspection.validation import validate
-from carlasc.labels import REMAPS
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -103,7 +103,7 @@ def test_validate_points_out_a_faulty_copy(simulated, converted, tmp_path, fault
     result = convert("kitti", simulated[0], tmp_path / "out", **PLAIN)
     assert not result.failures
     folder = tmp_path / "out" / SEQUENCE
-    poses = carlasc.layout.decode_poses((folder / "poses.txt").read_bytes(), "poses")
+    poses = carlasc.storage.layout.decode_poses((folder / "poses.txt").read_bytes(), "poses")
     if fault == "mirrored":
         poses = MIRROR @ poses @ MIRROR
     elif fault == "camera":
@@ -111,7 +111,7 @@ def test_validate_points_out_a_faulty_copy(simulated, converted, tmp_path, fault
         poses = camera @ poses @ np.linalg.inv(camera)
     else:
         poses[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    (folder / "poses.txt").write_bytes(carlasc.layout.encode_poses(poses))
+    (folder / "poses.txt").write_bytes(carlasc.storage.layout.encode_poses(poses))
     errors = [finding for finding in validate(tmp_path / "out").findings if finding.severity == "error"]
     assert errors
     word = {"mirrored": "mirrored", "camera": "camera", "transposed": "transposed"}[fault]
@@ -172,7 +172,7 @@ def test_grids_are_made_from_scans_where_unlabelled_points_cast_no_vote(simulate
 
 
 def test_cylindrical_grids_stand_beside(tmp_path):
-    from carlasc.grids import GridSpec
+    from carlasc.core.grids import GridSpec
 
     write_tiny_kitti(tmp_path / "in", points=500)
     result = convert("kitti", tmp_path / "in", tmp_path / "out", spec=GridSpec.published("cylindrical"), workers=1)

@@ -11,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
 import carlasc
-from carlasc import layout
 from carlasc.converting import convert, export
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import REMAPS
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.files import to_json
-from carlasc.grids import GridSpec
-from carlasc.labels import REMAPS
-from carlasc.sources import FolderSink
+from carlasc.storage import FolderSink, layout
+from carlasc.storage.files import to_json
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 SPEC = GridSpec("cartesian", (10, 8, 5), (-2.0, -4.0, -2.0), (8.0, 4.0, 0.5))

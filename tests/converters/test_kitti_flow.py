@@ -5,8 +5,8 @@ import pytest
 from helpers.kitti import write_kitti
 
 import carlasc
+from carlasc.captures.town import Drive
 from carlasc.converting import convert
-from carlasc.simulation import Drive
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 MIRROR = np.array([1, -1, 1], np.float32)
@@ -37,7 +37,7 @@ def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
     from helpers.kitti import write_poses
     from helpers.tiny_kitti import write_labels, write_tiny_kitti
 
-    from carlasc.geometry import invert, rotation_z, transform_points, translation
+    from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 
     folder = write_tiny_kitti(tmp_path / "in", frames=30, points=300)
     rng = np.random.default_rng(0)

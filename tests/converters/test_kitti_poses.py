@@ -8,10 +8,10 @@ from helpers.kitti import write_kitti
 from helpers.tiny_kitti import write_tiny_kitti
 
 import carlasc
-from carlasc import layout
+from carlasc.captures.town import Drive
+from carlasc.captures.town.lidar import Lidar
 from carlasc.converting import convert
-from carlasc.simulation import Drive
-from carlasc.simulation.lidar import Lidar
+from carlasc.storage import layout
 
 pytest.importorskip("kiss_icp")
 SEQUENCE = "Train/KITTI_00/cartesian"

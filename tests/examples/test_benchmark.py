@@ -9,7 +9,7 @@ import published
 import pytest
 
 from carlasc import open as open_source
-from carlasc.labels import CARLASC11
+from carlasc.core.tables import CARLASC11
 from carlasc.metrics import ConfusionMatrix, Evaluation
 
 pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")

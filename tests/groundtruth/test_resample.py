@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
-from carlasc.grids import Grid, GridSpec
-from carlasc.groundtruth.resample import resample
-from carlasc.labels import CARLA
+from carlasc.groundtruth.from_grid import resample
 
 
 def random_grid(seed, size=(8, 8, 4)):

@@ -7,14 +7,13 @@ import pytest
 from helpers.captures import make_recording, read_tree, write_capture
 
 import carlasc
-from carlasc import layout
-from carlasc.capture import Capture, CaptureWriter
+from carlasc.captures.raw import Capture, CaptureWriter
+from carlasc.core.geometry import invert, rotation_z, transform_points, translation
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.geometry import invert, rotation_z, transform_points, translation
-from carlasc.grids import GridSpec
 from carlasc.groundtruth import Observation, count_votes, regrid
-from carlasc.sources import FolderSource, Sink
-from carlasc.sources.base import SequenceWriter
+from carlasc.storage import FolderSource, Sink, layout
+from carlasc.storage.protocol import SequenceWriter
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
 KEYS = ("grid_size", "min_bound", "max_bound", "num_channels", "coordinates")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers.captures import read_tree, write_capture
 
+from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.grids import GridSpec
 from carlasc.groundtruth import regrid
-from carlasc.sources import FolderSource
+from carlasc.storage import FolderSource
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
 GRID = "evaluation_32x32x4"

@@ -12,7 +12,7 @@ import pytest
 from helpers import interrupted
 from helpers.captures import read_tree, write_capture
 
-from carlasc.grids import GridSpec
+from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 
 SPEC = GridSpec.published()

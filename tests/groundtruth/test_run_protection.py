@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.captures import make_recording, read_tree, write_capture
 
-from carlasc.capture import CaptureWriter
+from carlasc.captures.raw import CaptureWriter
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError
-from carlasc.grids import GridSpec
 from carlasc.groundtruth import regrid
 
 SMALL = GridSpec.published().with_size((32, 32, 4))

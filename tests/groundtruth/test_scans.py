@@ -13,13 +13,13 @@ from helpers.scenes import drive, write_drive
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc import GridSpec, layout
+from carlasc import GridSpec
 from carlasc.cli import app
+from carlasc.core.geometry import translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
-from carlasc.geometry import translation
-from carlasc.groundtruth.merging import PreparedScan
-from carlasc.groundtruth.windows import Merging, ScanFeed
-from carlasc.sources import FolderSink
+from carlasc.groundtruth.from_scans.merging import PreparedScan
+from carlasc.groundtruth.from_scans.windows import Merging, ScanFeed
+from carlasc.storage import FolderSink, layout
 
 VEHICLE = 10
 FRAME = 20

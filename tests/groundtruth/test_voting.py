@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from carlasc.geometry import translation
-from carlasc.grids import GridSpec
-from carlasc.groundtruth.observations import Observation
-from carlasc.groundtruth.rays import azimuth
-from carlasc.groundtruth.voting import Ballot, Votes, count_votes
-from carlasc.labels import CARLA, SEMANTICKITTI
+from carlasc.core.geometry import translation
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA, SEMANTICKITTI
+from carlasc.groundtruth.voting.ballot import Ballot, Votes, count_votes
+from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.rays import azimuth
 
 _PI32 = float(np.float32(np.pi))
 SPECS = {

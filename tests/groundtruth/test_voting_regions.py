@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.grids import GridSpec
-from carlasc.groundtruth.observations import Observation
-from carlasc.groundtruth.voting import Ballot, count_votes
+from carlasc.groundtruth.voting.ballot import Ballot, count_votes
+from carlasc.groundtruth.voting.observations import Observation
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from helpers.lidar_frames import street_frame
 
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.grids import GridSpec
-from carlasc.groundtruth.observations import Observation
-from carlasc.groundtruth.voting import OCCUPIED_DTYPE, Ballot, Votes, count_votes
-from carlasc.labels import CARLA
-from carlasc.layout import VOTES_DTYPE
+from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE, Ballot, Votes, count_votes
+from carlasc.groundtruth.voting.observations import Observation
+from carlasc.storage.layout import VOTES_DTYPE
 
 POINTS, LABELS, POSE = np.ones((4, 3), np.float32), np.full(4, 7, np.uint8), np.eye(4)
 

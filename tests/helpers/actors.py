@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from carlasc.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
-from carlasc.scans import Scan
+from carlasc.core.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
+from carlasc.core.scans import Scan
 
 PERIOD_S = 0.1
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from helpers.pixels import BLUE, RED, grid_with
 
-from carlasc import layout
-from carlasc.files import to_json
-from carlasc.grids import GridSpec
-from carlasc.sources.folder import FolderSink
+from carlasc.core.grids import GridSpec
+from carlasc.storage import layout
+from carlasc.storage.files import to_json
+from carlasc.storage.folders.folder import FolderSink
 
 ROAD = 7
 

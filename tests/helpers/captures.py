@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.capture import Capture, CaptureWriter, Recording
-from carlasc.geometry import rotation_z, translation
-from carlasc.scans import Scan
+from carlasc.captures.raw import Capture, CaptureWriter, Recording
+from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.scans import Scan
 
 
 def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> Recording:

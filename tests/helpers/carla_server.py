@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import carla
 import numpy as np
 
-from carlasc.recording.server import DETECTION
+from carlasc.captures.carla.server import DETECTION
 
 SPEED_M_S = 5.0
 ROAD, VEHICLE, PEDESTRIAN = "road", "vehicle", "pedestrian"

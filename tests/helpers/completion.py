@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc import GridSpec, layout
-from carlasc.sources import FolderSink
+from carlasc import GridSpec
+from carlasc.storage import FolderSink, layout
 
 SPEC = GridSpec("cartesian", (16, 16, 8), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 CLASSES = (1, 7, 8, 10)  # CARLA: building, road, sidewalk, vehicle

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
-from carlasc.files import to_json
-from carlasc.geometry import relative_to, rotation_z, translation
-from carlasc.grids import GridSpec
-from carlasc.sources.folder import FolderSink
+from carlasc.core.geometry import relative_to, rotation_z, translation
+from carlasc.core.grids import GridSpec
+from carlasc.storage import layout
+from carlasc.storage.files import to_json
+from carlasc.storage.folders.folder import FolderSink
 
 
 def bend(frames: int, step_m: float = 0.8, yaw_rad: float = 0.02) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Functions that a worker process can import: work for the tests of `carlasc.workers`."""
+"""Functions that a worker process can import: work for the tests of `carlasc.running.processes`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from carlasc.files import write_atomic
+from carlasc.storage.files import write_atomic
 
 
 def square(number: int) -> int:

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import rotation_z, translation
-from carlasc.labels import REMAPS
-from carlasc.simulation import Drive
-from carlasc.simulation.lidar import Lidar
+from carlasc.captures.town import Drive
+from carlasc.captures.town.lidar import Lidar
+from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.tables import REMAPS
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SMALL_LIDAR = Lidar(channels=32, points=16_000)

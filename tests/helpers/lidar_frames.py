@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.geometry import translation
-from carlasc.groundtruth.observations import Observation
+from carlasc.core.geometry import translation
+from carlasc.groundtruth.voting.observations import Observation
 
 GROUND_Z = -1.8  # below the ego sensor
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from helpers.scenes import BUILDING, POLE, SENSOR_HEIGHT_M, VEHICLE, Street
 
-from carlasc import Grid, GridSpec, layout
-from carlasc.geometry import invert, relative_to, rotate_vectors, transform_points, translation
+from carlasc import Grid, GridSpec
+from carlasc.core.geometry import invert, relative_to, rotate_vectors, transform_points, translation
+from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.labels import CARLA
-from carlasc.sources import FolderSink
+from carlasc.storage import FolderSink, layout
 
 FRAMES = 41
 SPEED_M_S = 10.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from carlasc.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec
 
 RED, BLUE, WHITE = 4, 10, 0  # Pedestrian and Vehicle: the reddest and the bluest of CARLA's classes
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.labels import REMAPS
+from carlasc.core.tables import REMAPS
 
 
 class PlainLoader:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.grids import GridSpec
-from carlasc.groundtruth.observations import Observation
+from carlasc.core.grids import GridSpec
+from carlasc.groundtruth.voting.observations import Observation
 
 
 def plain_votes(

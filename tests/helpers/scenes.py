@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
-from carlasc.files import write_json
-from carlasc.geometry import invert, relative_to, transform_points
-from carlasc.grids import GridSpec
-from carlasc.sources.base import Metadata
-from carlasc.sources.folder import FolderSink
+from carlasc.core.geometry import invert, relative_to, transform_points
+from carlasc.core.grids import GridSpec
+from carlasc.storage import layout
+from carlasc.storage.files import write_json
+from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.protocol import Metadata
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SENSOR_HEIGHT_M = 1.8

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import layout
-from carlasc.sources.folder import FolderSink
+from carlasc.storage import layout
+from carlasc.storage.folders.folder import FolderSink
 
 FRAMES = (0, 1, 2, 5)
 SIZE, SECOND = (4, 6, 2), (8, 4, 3)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from carlasc import layout
+from carlasc.core.grids import GridSpec
 from carlasc.errors import MissingDataError
-from carlasc.grids import GridSpec
 from carlasc.inspection.overview import info
-from carlasc.sources.published import PublishedSequence
+from carlasc.storage import layout
+from carlasc.storage.folders.published import PublishedSequence
 
 
 @pytest.fixture

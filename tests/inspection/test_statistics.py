@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlasc import layout
+from carlasc.core.classes import class_weights
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.files import to_json
-from carlasc.grids import GridSpec
 from carlasc.inspection.charts import draw_histograms
 from carlasc.inspection.statistics import Statistics, stats
-from carlasc.labels import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, class_weights
-from carlasc.sources import FolderSink, Metadata
+from carlasc.storage import FolderSink, Metadata, layout
+from carlasc.storage.files import to_json
 
 SPEC = GridSpec("cartesian", (8, 8, 4), (-4.0, -4.0, -2.0), (4.0, 4.0, 2.0))
 

@@ -12,13 +12,12 @@ import pytest
 from helpers.scenes import MIRROR, camera_poses, drive, write_drive
 
 import carlasc
-from carlasc import layout
+from carlasc.core.geometry import invert
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.geometry import invert
-from carlasc.grids import GridSpec
 from carlasc.inspection.findings import ValidationResult
 from carlasc.inspection.validation import validate
-from carlasc.sources import FolderSource
+from carlasc.storage import FolderSource, layout
 
 COARSE = GridSpec.published()
 KITTI = GridSpec("cartesian", (128, 128, 16), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from carlasc import GridSpec, layout
+from carlasc import GridSpec
+from carlasc.core.tables import CARLASC11, REMAPS
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.labels import CARLASC11, REMAPS
 from carlasc.metrics import ConfusionMatrix, distance_band, evaluate, geometric_table, semantic_table
-from carlasc.sources import FolderSink
+from carlasc.storage import FolderSink, layout
 
 SPEC = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -2.0), (4.0, 4.0, 1.0))
 SHAPE = SPEC.size

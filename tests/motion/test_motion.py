@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.actors import PERIOD_S, MovingBox, scan_of
 
-from carlasc.geometry import invert, rotation_z, transform_points, translation
+from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.motion import link_segments, segment_by_flow, segment_by_instances, standing_points
 
 FRAMES = range(30)

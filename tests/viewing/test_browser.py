@@ -6,7 +6,7 @@ from helpers.blocks import write_blocks
 from helpers.browser import Page
 from helpers.pixels import blue_pixels, middle_of, red_pixels
 
-from carlasc.grids import GridSpec
+from carlasc.core.grids import GridSpec
 from carlasc.viewing import make_page
 
 
@@ -183,7 +183,7 @@ def test_wedges_of_a_cylindrical_grid_lie_where_they_should(browser, tmp_path):
 
 
 def test_points_alone_are_drawn(browser, tmp_path):
-    from carlasc.sources.folder import FolderSink
+    from carlasc.storage.folders.folder import FolderSink
 
     writer = FolderSink(tmp_path).sequence("scan")
     cloud = np.random.default_rng(0).normal(0, (9, 9, 1, 0), (5000, 4)).astype(np.float32)

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from carlasc.grids import Grid, GridSpec
-from carlasc.scans import Scan
-from carlasc.viewing.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays, unpack_arrays
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
+from carlasc.viewing.page.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays, unpack_arrays
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),

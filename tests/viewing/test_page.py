@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from helpers.blocks import write_blocks
 
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import REMAPS
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.grids import Grid, GridSpec
-from carlasc.labels import REMAPS
-from carlasc.sources import open as open_source
+from carlasc.storage import open as open_source
 from carlasc.viewing import make_page, open_clip
 from carlasc.viewing.clip import INVENTED, MISSED, RIGHT, WRONG, compare
-from carlasc.viewing.coding import unpack_arrays
+from carlasc.viewing.page.coding import unpack_arrays
 
 
 def read_page(path):
@@ -120,8 +120,8 @@ def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     """A frame as full as a real one: 130,000 points, a coarse grid of 20,000 voxels; its bytes times 60."""
     from helpers.scenes import Street
 
-    from carlasc.geometry import translation
-    from carlasc.sources.folder import FolderSink
+    from carlasc.core.geometry import translation
+    from carlasc.storage.folders.folder import FolderSink
 
     rng = np.random.default_rng(0)
     points, labels = Street.random().scan(translation((0, 0, 1.8)), rng, channels=64, columns=2031)

@@ -10,11 +10,11 @@ from helpers.pixels import color_is_there
 from helpers.screens import virtual_screen
 
 from carlasc import regrid, simulate
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError
-from carlasc.grids import GridSpec
-from carlasc.labels import CARLA
 from carlasc.viewing import make_page
-from carlasc.viewing.libraries import import_open3d
+from carlasc.viewing.window.libraries import import_open3d
 
 pytestmark = pytest.mark.slow
 

@@ -12,13 +12,13 @@ from helpers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.screens import virtual_screen
 
 from carlasc.errors import CarlascError
-from carlasc.viewing.libraries import import_open3d
+from carlasc.viewing.window.libraries import import_open3d
 
 STEPS = """
 import json, sys
 import numpy as np
 from carlasc.viewing import open_clip
-from carlasc.viewing.window import Window
+from carlasc.viewing.window.window import Window
 
 data, out, actions = sys.argv[1], sys.argv[2], json.loads(sys.argv[3])
 truth = sys.argv[4] if len(sys.argv) > 4 else None
@@ -104,7 +104,7 @@ def test_prediction_truth_and_errors_follow_each_other(blocks, tmp_path):
 
 def test_keys_are_bound_to_what_they_say(blocks, tmp_path):
     from carlasc.viewing.clip import open_clip
-    from carlasc.viewing.window import Look, Window
+    from carlasc.viewing.window.window import Look, Window
 
     class Recorder:
         """Takes the place of Open3D's window: remembers which keys are bound."""

@@ -1,0 +1,211 @@
+"""Street furniture. Each piece stands at the origin; x runs along the street, and y points away from it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from carlasc.captures.town.meshes import Mesh, MeshBuilder
+from carlasc.core.tables import CARLA
+
+FENCE, OTHER, POLE, WALL = (CARLA.id_of(name) for name in ("Fence", "Other", "Pole", "Wall"))
+TRAFFIC_SIGN, TRAFFIC_LIGHT = CARLA.id_of("TrafficSign"), CARLA.id_of("TrafficLight")
+GUARD_RAIL, STATIC, DYNAMIC = (CARLA.id_of(name) for name in ("GuardRail", "Static", "Dynamic"))
+BRIDGE, RAIL_TRACK, GROUND = CARLA.id_of("Bridge"), CARLA.id_of("RailTrack"), CARLA.id_of("Ground")
+POST_DEPTH_M = 0.3  # how deep posts go into the ground, which is not level
+
+
+def street_lamp() -> Mesh:
+    """Return a lamp post whose arm reaches over the street."""
+    builder = MeshBuilder()
+    builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.15, 1.0 + POST_DEPTH_M, 10, top=0.8)
+    builder.cylinder(POLE, (0, 0, 0.7), 0.1, 6.6, 8, top=0.6)
+    builder.rod(POLE, (0, 0, 7.2), (0, -1.9, 7.6), 0.05)
+    builder.boxes(POLE, (0, -2.1, 7.5), (0.25, 0.6, 0.14))
+    return builder.build()
+
+
+def utility_pole() -> Mesh:
+    """Return a wooden pole with a crossbar."""
+    builder = MeshBuilder()
+    builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.16, 8.5, 8, top=0.7)
+    builder.boxes(POLE, (0, 0, 7.3), (0.12, 1.8, 0.12))
+    return builder.build()
+
+
+def bollard() -> Mesh:
+    """Return a bollard."""
+    builder = MeshBuilder()
+    builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.09, 0.95 + POST_DEPTH_M, 8)
+    return builder.build()
+
+
+def sign(rng: np.random.Generator) -> Mesh:
+    """Return a traffic sign that faces those who drive along +x."""
+    builder = MeshBuilder()
+    height = float(rng.uniform(2.0, 2.4))
+    builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.045, height + 0.7 + POST_DEPTH_M, 7)
+    shape = int(rng.integers(3))
+    if shape == 0:
+        builder.rod(TRAFFIC_SIGN, (-0.07, 0, height + 0.35), (-0.04, 0, height + 0.35), 0.36, sections=14)
+    elif shape == 1:
+        builder.boxes(TRAFFIC_SIGN, (-0.055, 0, height), (0.03, 0.65, 0.65))
+    else:
+        builder.boxes(TRAFFIC_SIGN, (-0.055, 0, height - 0.1), (0.03, 0.6, 0.85))
+    return builder.build()
+
+
+def gantry_sign() -> Mesh:
+    """Return a large direction sign on two posts."""
+    builder = MeshBuilder()
+    for y in (-0.9, 0.9):
+        builder.cylinder(POLE, (0, y, -POST_DEPTH_M), 0.07, 3.4 + POST_DEPTH_M, 8)
+    builder.boxes(TRAFFIC_SIGN, (-0.1, 0, 2.0), (0.05, 2.4, 1.3))
+    return builder.build()
+
+
+def traffic_light(reach_m: float) -> Mesh:
+    """Return a traffic light for those who drive along +x: one on the post, one on an arm over the lane."""
+    builder = MeshBuilder()
+    builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.11, 5.9 + POST_DEPTH_M, 8, top=0.8)
+    builder.rod(POLE, (0, 0, 5.6), (0, -reach_m, 5.8), 0.06)
+    for y, z in ((0.0, 2.4), (-reach_m, 5.05)):
+        builder.boxes(TRAFFIC_LIGHT, (-0.22, y, z), (0.26, 0.36, 1.0))
+        for lamp in range(3):
+            builder.boxes(TRAFFIC_LIGHT, (-0.42, y, z + 0.25 + 0.3 * lamp), (0.18, 0.24, 0.03))
+    return builder.build()
+
+
+def bench() -> Mesh:
+    """Return a bench that faces the street."""
+    builder = MeshBuilder()
+    builder.boxes(STATIC, (0, 0, 0.4), (1.6, 0.45, 0.06))
+    builder.boxes(STATIC, (0, 0.22, 0.5), (1.6, 0.06, 0.4))
+    for x in (-0.65, 0.65):
+        builder.boxes(STATIC, (x, 0, 0), (0.08, 0.42, 0.4))
+    return builder.build()
+
+
+def bin_() -> Mesh:
+    """Return a litter bin."""
+    builder = MeshBuilder()
+    builder.cylinder(STATIC, (0, 0, 0), 0.27, 0.95, 10, top=1.1)
+    return builder.build()
+
+
+def planter(rng: np.random.Generator) -> Mesh:
+    """Return a concrete planter."""
+    builder = MeshBuilder()
+    builder.boxes(STATIC, (0, 0, -0.1), (float(rng.uniform(1.0, 2.0)), 0.8, 0.65))
+    return builder.build()
+
+
+def hydrant() -> Mesh:
+    """Return a fire hydrant."""
+    builder = MeshBuilder()
+    builder.cylinder(STATIC, (0, 0, 0), 0.14, 0.65, 8)
+    builder.rod(STATIC, (0, -0.2, 0.45), (0, 0.2, 0.45), 0.06)
+    return builder.build()
+
+
+def trash(rng: np.random.Generator) -> Mesh:
+    """Return a heap of trash bags and boxes: movable things, CARLA's Dynamic."""
+    builder = MeshBuilder()
+    for _ in range(int(rng.integers(2, 5))):
+        place, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.3, 0.65, 3)
+        if rng.random() < 0.5:
+            builder.cylinder(DYNAMIC, (*place, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5)
+        else:
+            builder.boxes(DYNAMIC, (*place, 0), size, float(rng.uniform(0, np.pi)))
+    return builder.build()
+
+
+def barrier() -> Mesh:
+    """Return a street barrier with a chair's worth of clutter: Dynamic."""
+    builder = MeshBuilder()
+    builder.boxes(DYNAMIC, (0, 0, 0.35), (1.3, 0.06, 0.6))
+    for x in (-0.5, 0.5):
+        builder.boxes(DYNAMIC, (x, 0, 0), (0.06, 0.5, 0.4))
+    return builder.build()
+
+
+def kiosk() -> Mesh:
+    """Return a news stand: CARLA has no class for it but Other."""
+    builder = MeshBuilder()
+    builder.boxes(OTHER, (0, 0, -0.2), (2.4, 1.8, 2.6))
+    builder.boxes(OTHER, (0, -0.3, 2.4), (3.0, 2.6, 0.12))
+    return builder.build()
+
+
+def bus_shelter() -> Mesh:
+    """Return a bus shelter, open to the street."""
+    builder = MeshBuilder()
+    builder.boxes(STATIC, (0, 0.55, 0), (3.6, 0.06, 2.3))
+    for x in (-1.8, 1.8):
+        builder.boxes(STATIC, (x, 0.1, 0), (0.06, 0.95, 2.3))
+    builder.boxes(STATIC, (0, 0, 2.3), (3.9, 1.4, 0.1))
+    builder.boxes(STATIC, (0, 0.3, 0.42), (2.4, 0.35, 0.05))
+    return builder.build()
+
+
+def fence(length_m: float, height_m: float = 1.3) -> Mesh:
+    """Return a fence along x, centred: posts, rails, and slats that a LiDAR partly sees through."""
+    builder = MeshBuilder()
+    posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.2), 1) + 1)
+    builder.boxes(
+        FENCE, np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]), (0.1, 0.1, height_m + POST_DEPTH_M)
+    )
+    slats = np.arange(-length_m / 2 + 0.1, length_m / 2, 0.17)
+    builder.boxes(FENCE, np.column_stack([slats, 0 * slats, 0 * slats]), (0.1, 0.025, height_m - 0.08))
+    for z in (0.25, height_m - 0.3):
+        builder.boxes(FENCE, (0, 0.03, z), (length_m, 0.04, 0.09))
+    return builder.build()
+
+
+def wall(length_m: float, height_m: float) -> Mesh:
+    """Return a free-standing wall along x, centred, with a coping and pillars."""
+    builder = MeshBuilder()
+    builder.boxes(WALL, (0, 0, -0.5), (length_m, 0.24, height_m + 0.5))
+    builder.boxes(WALL, (0, 0, height_m), (length_m + 0.1, 0.34, 0.09))
+    pillars = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 4), 1) + 1)
+    builder.boxes(WALL, np.column_stack([pillars, 0 * pillars, 0 * pillars - 0.5]), (0.4, 0.4, height_m + 0.65))
+    return builder.build()
+
+
+def guard_rail(length_m: float) -> Mesh:
+    """Return a crash barrier along x, centred, its beam towards the street."""
+    builder = MeshBuilder()
+    posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.0), 1) + 1)
+    builder.boxes(
+        GUARD_RAIL, np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]), (0.1, 0.14, 0.72 + POST_DEPTH_M)
+    )
+    for z, y in ((0.48, -0.12), (0.6, -0.16), (0.7, -0.12)):
+        builder.boxes(GUARD_RAIL, (0, y, z), (length_m, 0.05, 0.12))
+    return builder.build()
+
+
+def footbridge(span_m: float) -> Mesh:
+    """Return a footbridge along y across a street, its middle at the origin, with stairs at both ends."""
+    builder = MeshBuilder()
+    half, deck = span_m / 2, 5.3
+    builder.boxes(BRIDGE, (0, 0, deck), (2.4, span_m, 0.35))
+    for x in (-1.15, 1.15):
+        builder.boxes(BRIDGE, (x, 0, deck + 0.35), (0.08, span_m, 1.1))
+    for side in (-1.0, 1.0):
+        for x in (-0.9, 0.9):
+            builder.boxes(BRIDGE, (x, side * (half - 0.4), -0.3), (0.45, 0.45, deck + 0.3))
+        steps = np.arange(16)
+        rise = deck * (1 - (steps + 1) / 17)
+        place = np.column_stack([1.4 + 0.3 * steps, np.full(16, side * (half - 0.7)), rise])
+        builder.boxes(BRIDGE, place, (0.32, 1.3, 0.34))
+    return builder.build()
+
+
+def rail_track(length_m: float) -> Mesh:
+    """Return a railway track along x: ballast is Ground, sleepers and rails RailTrack."""
+    builder = MeshBuilder()
+    builder.boxes(GROUND, (0, 0, -0.6), (length_m, 3.6, 0.78))
+    sleepers = np.arange(-length_m / 2, length_m / 2, 0.65)
+    builder.boxes(RAIL_TRACK, np.column_stack([sleepers, 0 * sleepers, 0 * sleepers + 0.1]), (0.26, 2.5, 0.16))
+    for y in (-0.72, 0.72):
+        builder.boxes(RAIL_TRACK, (0, y, 0.2), (length_m, 0.08, 0.2))
+    return builder.build()

@@ -1,0 +1,63 @@
+"""Values that know nothing of files: transforms, cells and grids, scans, class tables and the remaps between them."""
+
+from carlasc.core.classes import ClassTable, Color, Remap, class_weights
+from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.geometry import (
+    Transform,
+    check_rigid,
+    invert,
+    relative_to,
+    rotate_vectors,
+    rotation_z,
+    transform_points,
+    translation,
+)
+from carlasc.core.grids import Coordinates, Grid, GridSpec
+from carlasc.core.scans import Scan
+from carlasc.core.tables import (
+    CARLA,
+    CARLASC11,
+    REMAPS,
+    SEMANTICKITTI,
+    SEMANTICKITTI19,
+    SEMANTICPOSS,
+    TABLES,
+    TRAIN_VOXEL_COUNTS,
+    remap_named,
+    remaps_between,
+    table_named,
+    to_table,
+)
+
+__all__ = [
+    "CARLA",
+    "CARLASC11",
+    "REMAPS",
+    "SEMANTICKITTI",
+    "SEMANTICKITTI19",
+    "SEMANTICPOSS",
+    "TABLES",
+    "TRAIN_VOXEL_COUNTS",
+    "ClassTable",
+    "Color",
+    "Coordinates",
+    "FrameRange",
+    "Frames",
+    "Grid",
+    "GridSpec",
+    "Remap",
+    "Scan",
+    "Transform",
+    "check_rigid",
+    "class_weights",
+    "invert",
+    "relative_to",
+    "remap_named",
+    "remaps_between",
+    "rotate_vectors",
+    "rotation_z",
+    "table_named",
+    "to_table",
+    "transform_points",
+    "translation",
+]

@@ -1,0 +1,84 @@
+"""Which frames: a half-open range of frame numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """A half-open range of frame numbers, `start <= frame < stop`.
+
+    Attributes:
+        start: first frame; None leaves this end open.
+        stop: the frame after the last one; None leaves this end open.
+
+    Raises:
+        ArgumentError: a bound that is not a whole number, or a range that holds no frame.
+    """
+
+    start: int | None = None
+    stop: int | None = None
+
+    def __post_init__(self) -> None:
+        for bound in (self.start, self.stop):
+            if bound is not None and (isinstance(bound, bool) or not isinstance(bound, int | np.integer)):
+                raise ArgumentError("frames", expected="whole numbers or None", found=repr(bound))
+        if self.start is not None and self.stop is not None and self.start >= self.stop:
+            raise ArgumentError("frames", expected="a range that holds a frame", found=str(self))
+
+    @classmethod
+    def of(cls, frames: FrameRange | tuple[int | None, int | None] | None) -> FrameRange:
+        """Return what a `frames` argument means: a FrameRange, a tuple of its bounds, or None for all frames.
+
+        Raises:
+            ArgumentError: it is none of these.
+        """
+        if frames is None:
+            return cls()
+        if isinstance(frames, FrameRange):
+            return frames
+        if not isinstance(frames, tuple) or len(frames) != 2:
+            raise ArgumentError("frames", expected="(start, stop), a FrameRange or None", found=repr(frames))
+        return cls(*frames)
+
+    @classmethod
+    def parse(cls, text: str) -> FrameRange:
+        """Read "A:B", "A:", ":B", or one frame "A".
+
+        Raises:
+            ArgumentError: it is no range.
+        """
+        first, colon, last = text.partition(":")
+        try:
+            start, stop = int(first) if first else None, int(last) if last else None
+        except ValueError:
+            raise ArgumentError("frames", expected="A:B, A:, :B or a frame number", found=repr(text)) from None
+        if not colon:
+            return cls(start, None if start is None else start + 1)
+        return cls(start, stop)
+
+    def __contains__(self, frame: int) -> bool:
+        return (self.start is None or frame >= self.start) and (self.stop is None or frame < self.stop)
+
+    def select(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return those of an array of frame numbers that are in the range, in their order."""
+        chosen = np.ones(len(frames), np.bool_)
+        if self.start is not None:
+            chosen &= frames >= self.start
+        if self.stop is not None:
+            chosen &= frames < self.stop
+        return frames[chosen]
+
+    def __str__(self) -> str:
+        return ":".join("" if bound is None else str(bound) for bound in (self.start, self.stop))
+
+
+Frames = FrameRange | tuple[int | None, int | None] | None
+"""What a `frames` argument takes: a FrameRange, a tuple of its bounds, or None for all frames."""

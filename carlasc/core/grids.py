@@ -1,0 +1,286 @@
+"""Voxel grids: where their cells lie (GridSpec) and what is in them (Grid).
+
+Axes are x, y, z in a Cartesian grid and radius, azimuth = atan2(y, x), z in a cylindrical one; points are Cartesian in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError, FormatError
+
+Coordinates = Literal["cartesian", "cylindrical"]
+Triple = tuple[float, float, float]
+
+_PI32 = float(np.float32(np.pi))  # a hair above pi: an azimuth of exactly pi is inside the published bounds
+_SIDE = float(np.float32(25.6))
+_PROPORTION = 128 * 0.234375  # azimuth cells times radial cell of the published cylindrical grid
+
+
+@dataclass(frozen=True)
+class GridSpec:
+    """The geometry of a voxel grid. Cells are half-open: `lower <= p < upper`.
+
+    Attributes:
+        coordinates: "cartesian" (x, y, z) or "cylindrical" (radius, azimuth, z).
+        size: number of cells an axis.
+        lower: lower bound an axis; metres, radians for azimuth.
+        upper: upper bound an axis.
+
+    Raises:
+        ArgumentError: sizes or bounds that make no grid.
+    """
+
+    coordinates: Coordinates
+    size: tuple[int, int, int]
+    lower: Triple
+    upper: Triple
+
+    def __post_init__(self) -> None:
+        if self.coordinates not in ("cartesian", "cylindrical"):
+            raise ArgumentError("coordinates", expected="cartesian or cylindrical", found=f"{self.coordinates!r}")
+        for name, kind in (("size", int), ("lower", float), ("upper", float)):
+            values = tuple(kind(v) for v in getattr(self, name))
+            if len(values) != 3 or not all(math.isfinite(v) for v in values):
+                raise ArgumentError(f"grid {name}", expected="three finite numbers", found=f"{getattr(self, name)}")
+            object.__setattr__(self, name, values)
+        if min(self.size) < 1:
+            raise ArgumentError("grid size", expected="at least one cell an axis", found=f"{self.size}")
+        if math.prod(self.size) >= 2**31:
+            raise ArgumentError(
+                "grid size",
+                expected="fewer than 2^31 cells",
+                found=f"{' x '.join(map(str, self.size))}",
+                advice="take a coarser resolution",
+            )
+        if any(low >= up for low, up in zip(self.lower, self.upper, strict=True)):
+            raise ArgumentError(
+                "grid bounds", expected="lower < upper on every axis", found=f"{self.lower} and {self.upper}"
+            )
+        if self.coordinates == "cylindrical":
+            if self.lower[0] < 0:
+                raise ArgumentError("grid bounds", expected="a radius of 0 or more", found=f"{self.lower[0]}")
+            if self.upper[1] - self.lower[1] > 2 * _PI32:
+                raise ArgumentError(
+                    "grid bounds",
+                    expected="an azimuth range of at most 2 pi",
+                    found=f"{self.upper[1] - self.lower[1]} rad",
+                )
+
+    @classmethod
+    def published(cls, name: str = "cartesian") -> GridSpec:
+        """Return a grid of the data set: "cartesian", "cartesian_fine" or "cylindrical" (FORMAT section 1)."""
+        presets = {
+            "cartesian": cls("cartesian", (128, 128, 8), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
+            "cartesian_fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
+            "cylindrical": cls("cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)),
+        }
+        if name not in presets:
+            raise ArgumentError(f"published grid {name!r}: expected one of {', '.join(presets)}")
+        return presets[name]
+
+    @classmethod
+    def from_params(cls, params: Mapping[str, Any], where: str = "params.json") -> GridSpec:
+        """Read the keys of a params.json, numbers as they stand; `where` is the file named in errors.
+
+        Raises:
+            FormatError: a key is missing or makes no grid.
+        """
+        try:
+            size = [float(v) for v in params["grid_size"]]
+            if any(v != int(v) for v in size):
+                raise FormatError(where, expected="whole numbers in grid_size", found=f"{size}")
+            lower, upper = tuple(params["min_bound"]), tuple(params["max_bound"])
+            return cls(
+                params["coordinates"],
+                cast(tuple[int, int, int], tuple(int(v) for v in size)),
+                cast(Triple, lower),
+                cast(Triple, upper),
+            )
+        except KeyError as error:
+            raise FormatError(where, expected=f"the key {error}", found=f"{', '.join(params) or 'none'}") from error
+        except (ArgumentError, TypeError, ValueError, OverflowError) as error:
+            raise FormatError(f"{where}: {error}") from error
+
+    def to_params(self, num_channels: int = 25) -> dict[str, Any]:
+        """Return the five published keys of params.json; sizes are written as floats, as there."""
+        return {
+            "grid_size": [float(n) for n in self.size],
+            "min_bound": list(self.lower),
+            "max_bound": list(self.upper),
+            "num_channels": num_channels,
+            "coordinates": self.coordinates,
+        }
+
+    def with_size(self, size: Sequence[int]) -> GridSpec:
+        """Return a grid of `size` cells over exactly these bounds."""
+        return replace(self, size=cast(tuple[int, int, int], tuple(size)))
+
+    def with_bounds(self, lower: Sequence[float], upper: Sequence[float]) -> GridSpec:
+        """Return the grid with other bounds, rounded to float32 as the published ones are."""
+        return replace(
+            self,
+            lower=cast(Triple, tuple(_float32(v) for v in lower)),
+            upper=cast(Triple, tuple(_float32(v) for v in upper)),
+        )
+
+    def with_resolution(self, resolution: float | Sequence[float]) -> GridSpec:
+        """Return a grid of cells of the given size that covers these bounds (DESIGN: the `--res` rule).
+
+        With w a bounds' width, the cells are n = w/R where that is within 1e-4 of an integer, else the next integer above. The bounds
+        grow to n R: about the centre for x and y, upwards from the lower one for z and the radius. Azimuth keeps its
+        bounds. In a cylindrical grid a single R is radial and vertical, and azimuth keeps the published proportion.
+
+        Args:
+            resolution: metres, or one value an axis (cylindrical: metres, radians, metres).
+
+        Raises:
+            ArgumentError: a resolution is not a positive number.
+        """
+        per_axis = [float(v) for v in (resolution if isinstance(resolution, Sequence) else [resolution])]
+        if len(per_axis) not in (1, 3) or not all(math.isfinite(r) and r > 0 for r in per_axis):
+            raise ArgumentError(
+                "resolution", expected="one or three positive numbers", found=f"{', '.join(map(str, per_axis))}"
+            )
+        size, lower, upper = list(self.size), list(self.lower), list(self.upper)
+        for axis, step in enumerate(per_axis * (3 // len(per_axis))):
+            width = self.upper[axis] - self.lower[axis]
+            cells = _cells(width, step)
+            if self.coordinates == "cylindrical" and axis == 1:
+                size[1] = cells if len(per_axis) == 3 else max(1, round(_PROPORTION * width / (2 * _PI32) / step))
+                continue
+            size[axis] = cells
+            if axis == 2 or self.coordinates == "cylindrical":
+                lower[axis] = _float32(self.lower[axis])
+                upper[axis] = _float32(self.lower[axis] + cells * step)
+            else:
+                centre = (self.lower[axis] + self.upper[axis]) / 2
+                lower[axis] = _float32(centre - cells * step / 2)
+                upper[axis] = _float32(centre + cells * step / 2)
+        return GridSpec(
+            self.coordinates,
+            cast(tuple[int, int, int], tuple(size)),
+            cast(Triple, tuple(lower)),
+            cast(Triple, tuple(upper)),
+        )
+
+    @property
+    def num_voxels(self) -> int:
+        """Number of cells."""
+        return math.prod(self.size)
+
+    @property
+    def voxel_size(self) -> NDArray[np.float64]:
+        """(3,) size of a cell an axis: the float32 difference of float32 bounds over the size (FORMAT section 4).
+
+        Bounds that are no float32 numbers keep their exact difference.
+        """
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        rounded = (upper.astype(np.float32) - lower.astype(np.float32)).astype(np.float64)
+        exact = (lower != lower.astype(np.float32)) | (upper != upper.astype(np.float32))
+        return np.where(exact, upper - lower, rounded) / np.array(self.size, np.float64)
+
+    def to_axes(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Take Cartesian points to the grid's axes: themselves, or radius, azimuth, z.
+
+        An azimuth that leaves the bounds comes back by a whole turn where that lands inside: so exactly +pi falls in the
+        first cell where the upper bound is pi.
+
+        Args:
+            points: (N, 3) metres, the grid's frame.
+
+        Returns:
+            (N, 3), same dtype.
+        """
+        if self.coordinates == "cartesian":
+            return points
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        turned = azimuth + np.where(
+            azimuth < self.lower[1], 2 * np.pi, np.where(azimuth >= self.upper[1], -2 * np.pi, 0.0)
+        ).astype(azimuth.dtype)
+        inside = (turned >= self.lower[1]) & (turned < self.upper[1])
+        return np.stack(
+            [np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2), np.where(inside, turned, azimuth), points[:, 2]], axis=1
+        )
+
+    def from_axes(self, axes: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Take (..., 3) coordinates on the grid's axes back to Cartesian points."""
+        if self.coordinates == "cartesian":
+            return axes
+        radius, azimuth, z = np.moveaxis(axes, -1, 0)
+        return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+
+    def index(self, axes: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+        """Find the cell of points given on the grid's axes: half-open, floor, clamp (FORMAT section 4).
+
+        Args:
+            axes: (N, 3) as `to_axes` returns.
+
+        Returns:
+            (N, 3) int32 cells, clamped to the grid, and (N,) bool: whether the point is inside. NaN is outside.
+        """
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        inside: NDArray[np.bool_] = np.all((axes >= lower) & (axes < upper), axis=1)
+        cells = np.floor((np.where(inside[:, None], axes, lower) - lower) / self.voxel_size)
+        return np.clip(cells, 0, np.array(self.size) - 1).astype(np.int32), inside
+
+    def flat_index(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Return the C-order index of the voxel of each Cartesian point (N, 3), -1 outside: to_axes, index, ravel."""
+        cells, inside = self.index(self.to_axes(points))
+        return np.where(inside, np.ravel_multi_index(tuple(cells.T), self.size), -1)
+
+    def edges(self, axis: int) -> NDArray[np.float64]:
+        """Return the (n + 1,) cell edges along an axis."""
+        return self.lower[axis] + np.arange(self.size[axis] + 1) * self.voxel_size[axis]
+
+    def centers(self) -> NDArray[np.float64]:
+        """Return the (X, Y, Z, 3) centres of the cells, on the grid's axes."""
+        lines = [self.lower[a] + (np.arange(self.size[a]) + 0.5) * self.voxel_size[a] for a in range(3)]
+        return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+
+    def __str__(self) -> str:
+        return f"{self.coordinates} {' x '.join(map(str, self.size))}"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What is in the cells of a grid.
+
+    Attributes:
+        spec: where the cells lie.
+        labels: (X, Y, Z) unsigned integer classes, 0 is free, and also where unknown.
+        counts: (X, Y, Z) number of votes, 0 means unknown: never evaluated. None where a grid has no counts.
+
+    Raises:
+        FormatError: shapes do not fit the spec.
+    """
+
+    spec: GridSpec
+    labels: NDArray[np.unsignedinteger]
+    counts: NDArray[Any] | None = None
+
+    def __post_init__(self) -> None:
+        for name, array in (("labels", self.labels), ("counts", self.counts)):
+            if array is not None and array.shape != self.spec.size:
+                raise FormatError(f"grid {name}", expected=f"shape {self.spec.size}", found=f"{array.shape}")
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) bool: voxels with a vote; all of them where there are no counts."""
+        return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
+
+
+def _float32(value: float) -> float:
+    return float(np.float32(value))
+
+
+def _cells(width: float, step: float) -> int:
+    """Number of cells of `step` that cover `width`: as exact as the format's float32 bounds allow."""
+    ratio = width / step
+    return max(1, round(ratio) if abs(ratio - round(ratio)) <= 1e-4 else math.ceil(ratio))

@@ -1,0 +1,271 @@
+"""The class tables of the data sets, and the remaps between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable, Color, Remap
+from carlasc.errors import ArgumentError, FormatError
+
+_CARLA: tuple[tuple[str, Color, int], ...] = (  # name, colour, 11-class id; ids in order (FORMAT section 2)
+    ("Free", (255, 255, 255), 0),
+    ("Building", (70, 70, 70), 1),
+    ("Fence", (100, 40, 40), 2),
+    ("Other", (55, 90, 80), 3),
+    ("Pedestrian", (220, 20, 60), 4),
+    ("Pole", (153, 153, 153), 5),
+    ("RoadLine", (157, 234, 50), 6),
+    ("Road", (128, 64, 128), 6),
+    ("Sidewalk", (244, 35, 232), 8),
+    ("Vegetation", (107, 142, 35), 9),
+    ("Vehicle", (0, 0, 142), 10),
+    ("Wall", (102, 102, 156), 2),
+    ("TrafficSign", (220, 220, 0), 5),
+    ("Sky", (70, 130, 180), 3),
+    ("Ground", (81, 0, 81), 7),
+    ("Bridge", (150, 100, 100), 3),
+    ("RailTrack", (230, 150, 140), 3),
+    ("GuardRail", (180, 165, 180), 2),
+    ("TrafficLight", (250, 170, 30), 5),
+    ("Static", (110, 190, 160), 3),
+    ("Dynamic", (170, 120, 50), 3),
+    ("Water", (45, 60, 150), 3),
+    ("Terrain", (145, 170, 100), 7),
+)
+CARLA = ClassTable(
+    "carla",
+    {i: name for i, (name, _, _) in enumerate(_CARLA)},
+    {i: color for i, (_, color, _) in enumerate(_CARLA)},
+    movable=frozenset({4, 10}),
+    deformable=frozenset({4}),
+    num_channels=25,  # as every published params.json says, although 23 classes exist
+)
+CARLASC11 = ClassTable(
+    "carlasc11",
+    dict(enumerate("Free Building Barrier Other Pedestrian Pole Road Ground Sidewalk Vegetation Vehicles".split())),
+    dict(
+        enumerate(
+            [(245, 150, 100), (245, 230, 100), (150, 60, 30), (180, 30, 80), (255, 80, 100), (30, 30, 255)]
+            + [(200, 40, 255), (90, 30, 150), (255, 0, 255), (255, 150, 255), (75, 0, 75)]
+        )
+    ),
+    movable=frozenset({4, 10}),
+    deformable=frozenset({4}),
+)
+
+_KITTI: tuple[tuple[int, str, Color, int], ...] = (  # raw id, name, colour, class of the benchmark (0: ignored)
+    (0, "unlabeled", (255, 255, 255), 0),
+    (1, "outlier", (90, 90, 90), 0),
+    (10, "car", (80, 130, 240), 1),
+    (11, "bicycle", (90, 215, 235), 2),
+    (13, "bus", (60, 90, 200), 5),
+    (15, "motorcycle", (40, 70, 150), 3),
+    (16, "on-rails", (30, 50, 110), 5),
+    (18, "truck", (100, 50, 180), 4),
+    (20, "other-vehicle", (60, 90, 230), 5),
+    (30, "person", (230, 40, 40), 6),
+    (31, "bicyclist", (240, 70, 190), 7),
+    (32, "motorcyclist", (150, 40, 100), 8),
+    (40, "road", (128, 64, 128), 9),
+    (44, "parking", (240, 160, 240), 10),
+    (48, "sidewalk", (90, 20, 90), 11),
+    (49, "other-ground", (160, 20, 80), 12),
+    (50, "building", (230, 190, 40), 13),
+    (51, "fence", (240, 130, 60), 14),
+    (52, "other-structure", (220, 150, 30), 0),
+    (60, "lane-marking", (160, 230, 170), 9),
+    (70, "vegetation", (30, 160, 40), 15),
+    (71, "trunk", (130, 70, 30), 16),
+    (72, "terrain", (150, 220, 90), 17),
+    (80, "pole", (230, 220, 150), 18),
+    (81, "traffic-sign", (240, 30, 20), 19),
+    (99, "other-object", (80, 220, 210), 0),
+    (252, "moving-car", (80, 130, 240), 1),
+    (253, "moving-bicyclist", (240, 70, 190), 7),
+    (254, "moving-person", (230, 40, 40), 6),
+    (255, "moving-motorcyclist", (150, 40, 100), 8),
+    (256, "moving-on-rails", (30, 50, 110), 5),
+    (257, "moving-bus", (60, 90, 200), 5),
+    (258, "moving-truck", (100, 50, 180), 4),
+    (259, "moving-other-vehicle", (60, 90, 230), 5),
+)
+SEMANTICKITTI = ClassTable(
+    "semantickitti",
+    {i: name for i, name, _, _ in _KITTI},
+    {i: color for i, _, color, _ in _KITTI},
+    moving=frozenset(range(252, 260)),
+    movable=frozenset({10, 11, 13, 15, 16, 18, 20, 30, 31, 32, *range(252, 260)}),
+    deformable=frozenset({30, 254}),
+)
+_KITTI19 = {0: "unlabeled"} | {k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)}
+SEMANTICKITTI19 = ClassTable(
+    "semantickitti19",
+    dict(sorted(_KITTI19.items())),
+    {0: (255, 255, 255)} | {k: color for i, _, color, k in _KITTI if k and i < 252 and i not in (13, 16, 60)},
+    movable=frozenset(range(1, 9)),
+    deformable=frozenset({6}),
+)
+
+
+def _ranges(table: str) -> dict[int, int]:
+    """Read "1->7 14..19->10 12,13->4" as a mapping."""
+    mapping: dict[int, int] = {}
+    for entry in table.split():
+        left, right = entry.split("->")
+        for part in left.split(","):
+            first, _, last = part.partition("..")
+            mapping |= dict.fromkeys(range(int(first), int(last or first) + 1), int(right))
+    return mapping
+
+
+_POSS_NAMES = {
+    0: "unlabeled",
+    4: "person",
+    5: "people",
+    6: "rider",
+    7: "car",
+    8: "trunk",
+    9: "plants",
+    10: "sign 1",
+} | {
+    11: "sign 2",
+    12: "sign 3",
+    13: "pole",
+    14: "trashcan",
+    15: "building",
+    16: "cone/stone",
+    17: "fence",
+    21: "bike",
+    22: "ground",
+}
+_POSS_TO_CARLA = {0: 0} | _ranges(
+    "4..6->4 7,21->10 8,9->9 10..12->12 13->5 14->20 15->1 16->19 17->2 22->14 1..3,18..20->0"
+)
+SEMANTICPOSS = ClassTable(
+    "semanticposs",
+    {i: _POSS_NAMES.get(i, f"class {i}") for i in sorted(_POSS_TO_CARLA)},
+    {i: _CARLA[_POSS_TO_CARLA[i]][1] for i in sorted(_POSS_TO_CARLA)},
+    movable=frozenset({4, 5, 6, 7, 21}),
+    deformable=frozenset({4, 5}),
+)
+
+
+REMAPS: Mapping[str, Remap] = MappingProxyType(
+    {
+        remap.name: remap
+        for remap in (
+            # Ids 23 and 24 exist only as vote channels: no class of the paper's table maps them.
+            Remap("carlasc11", CARLA, CARLASC11, {i: k for i, (_, _, k) in enumerate(_CARLA)}),
+            Remap("semantickitti19", SEMANTICKITTI, SEMANTICKITTI19, {i: k for i, _, _, k in _KITTI}),
+            Remap(
+                "semantickitti_to_carla",
+                SEMANTICKITTI,
+                CARLA,
+                _ranges(
+                    "10,11,13,15,16,18,20,252,256..259->10 30..32,253..255->4 40->7 60->6 44,49->14 48->8 50->1 51->2"
+                    " 52->19 70,71->9 72->22 80->5 81->12 99->3 0,1->0"
+                ),
+            ),
+            Remap(
+                "carla_to_semantickitti",
+                CARLA,
+                SEMANTICKITTI,
+                _ranges(
+                    "0->0 1->50 2->51 3->99 4->30 5->80 6->60 7->40 8->48 9->70 10->10 11->52 12->81 13->0 14->49 15->52 16->49 17->51"
+                    " 18->80 19->52 20->99 21->0 22->72"
+                ),
+            ),
+            Remap("semanticposs_to_carla", SEMANTICPOSS, CARLA, _POSS_TO_CARLA),
+            Remap(  # tags of CARLA 0.9.14 and later; before, the ids are those of CARLA above
+                "carla0914_to_carla",
+                ClassTable(
+                    "carla0.9.14", {i: f"tag {i}" for i in range(29)}, dict.fromkeys(range(29), (128, 128, 128))
+                ),
+                CARLA,
+                _ranges(
+                    "0->0 1->7 2->8 3->1 4->11 5->2 6->5 7->18 8->12 9->9 10->22 11->13 12,13->4 14..19->10 20->19 21->20 22->3"
+                    " 23->21 24->6 25->14 26->15 27->16 28->17"
+                ),
+            ),
+        )
+    }
+)
+TABLES: Mapping[str, ClassTable] = MappingProxyType(
+    {t.name: t for t in (CARLA, CARLASC11, SEMANTICKITTI, SEMANTICKITTI19, SEMANTICPOSS)}
+)
+
+TRAIN_VOXEL_COUNTS = np.array(
+    [
+        4166593275, 42309744, 8550180, 478193, 905663, 2801091, 6452733, 229316930, 112863867, 29816894, 13839655, 15581458,
+        221821, 0, 7931550, 467989, 3354, 9201043, 61011, 3796746, 3217865, 215372, 79669695,
+    ],
+    np.int64,
+)  # fmt: skip
+"""(23,) voxels of each CARLA class in the training split, coarse Cartesian (FORMAT section 2)."""
+
+
+def table_named(name: str) -> ClassTable:
+    """Return a class table by its name in carlasc.json.
+
+    Raises:
+        FormatError: no table has that name.
+    """
+    if name not in TABLES:
+        raise FormatError(f"class table {name!r}: expected one of {', '.join(TABLES)}")
+    return TABLES[name]
+
+
+def remap_named(name: str) -> Remap:
+    """Return a remap by name.
+
+    Raises:
+        ArgumentError: no remap has that name.
+    """
+    if name not in REMAPS:
+        raise ArgumentError(f"remap {name!r}: expected one of {', '.join(REMAPS)}")
+    return REMAPS[name]
+
+
+def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
+    """Return the remaps that lead from one table to another: none, one, or two by way of CARLA's.
+
+    Raises:
+        ArgumentError: none do.
+    """
+
+    def direct(one: ClassTable, other: ClassTable) -> Remap | None:
+        return next((r for r in REMAPS.values() if r.source == one and r.target == other), None)
+
+    if source == target:
+        return ()
+    if (remap := direct(source, target)) is not None:
+        return (remap,)
+    first, second = direct(source, CARLA), direct(CARLA, target)
+    if first is None or second is None:
+        ways = sorted({r.target.name for r in REMAPS.values() if r.source == source} | {source.name})
+        raise ArgumentError(f"classes {target.name}: expected one of {', '.join(ways)} for labels of {source.name}")
+    return first, second
+
+
+def to_table(
+    labels: NDArray[np.unsignedinteger], source: ClassTable, target: ClassTable, where: str
+) -> NDArray[np.unsignedinteger]:
+    """Return labels of one table as ids of another.
+
+    Args:
+        labels: ids of `source`.
+        source: their table.
+        target: the table wanted.
+        where: file or field, for the error message.
+
+    Raises:
+        ArgumentError: no remaps lead from one to the other.
+        FormatError: a label is not of `source`.
+    """
+    for remap in remaps_between(source, target):
+        labels = remap(labels, where)
+    return labels

@@ -1,0 +1,220 @@
+"""Which sequences and frames a Dataset is made of: splits, sequences and their grids put together, frames that have everything."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import Coordinates, GridSpec
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.storage import layout
+from carlasc.storage.protocol import Sequence, Source
+
+_RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One sequence of a Dataset.
+
+    Attributes:
+        scans: where scans, poses and metadata are read from.
+        grids: where grids are read from: the same, the sequence's other `<coordinates>` folder, or one of another root. None
+            where no grid is needed.
+        grid: name of the grid there.
+        frames: the frames that are samples, rising.
+        scanned: the frames that have a scan.
+    """
+
+    scans: Sequence
+    grids: Sequence | None
+    grid: str
+    frames: NDArray[np.int64]
+    scanned: frozenset[int]
+
+    def history(self, frame: int, length: int) -> list[int | None]:
+        """Return the frames of a stack, oldest first; None before the sequence's start and before a gap."""
+        past: list[int | None] = [None] * length
+        for back in range(length):
+            if frame - back not in self.scanned:
+                break
+            past[length - 1 - back] = frame - back
+        return past
+
+    def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
+        """Return (T, 4, 4) transforms of past sensor frames to that of `frame`; the identity for itself and for None."""
+        transforms = np.tile(np.eye(4), (len(past), 1, 1))
+        others = {row: number for row, number in enumerate(past) if number is not None and number != frame}
+        if others:
+            first_T_past = np.array([self.scans.read_pose(number) for number in others.values()])
+            transforms[list(others)] = np.linalg.inv(self.scans.read_pose(frame)) @ first_T_past
+        return transforms
+
+    def check_poses(self) -> None:
+        """Check that every frame has a pose that can be inverted.
+
+        Raises:
+            MissingDataError: there is no poses.txt.
+            FormatError: it has too few lines, or a line is no pose.
+        """
+        where = f"{self.scans.location}/{layout.POSES}"
+        poses = self.scans.poses
+        if len(self.frames):
+            self.scans.read_pose(int(self.frames[-1]))  # the last frame has a line only if all have
+        rotations = np.nan_to_num(poses[:, :3, :3])
+        rigid = np.isfinite(poses).all((1, 2)) & (np.abs(np.linalg.det(rotations) - 1) < _RIGID)
+        if not rigid.all():
+            line = int(np.argmin(rigid))
+            raise FormatError(
+                where,
+                expected="rigid transforms",
+                found=f"none in line {line + 1}",
+                advice=f"{poses[line, :3].ravel().tolist()}",
+            )
+
+
+def choose(source: Source, split: str | Iterable[str] | None, coordinates: Coordinates) -> list[Sequence]:
+    """Return the sequences of a split, or of the given names, in their Source's order: those that scans are read from.
+
+    Raises:
+        ArgumentError: `split` is neither one of the splits nor a list of names.
+        MissingDataError: nothing there has that split or name.
+    """
+    groups = _groups(source)
+    return [_with_scans(groups[key], coordinates) for key in _match(source, groups, split)]
+
+
+def find_grids(chosen: list[Sequence], source: Source, coordinates: Coordinates) -> list[Sequence]:
+    """Return, for each sequence, the one that its grids are read from.
+
+    Sequences go together by split and name; by name alone where a path tells no split; and two roots that are each just one
+    sequence go together whatever their names.
+
+    Raises:
+        MissingDataError: a sequence has no counterpart.
+    """
+    groups = _groups(source)
+    only = list(groups.values()) if len(groups) == len(chosen) == 1 else []
+    found = []
+    for scans in chosen:
+        candidates = [
+            group
+            for (split, name, _), group in groups.items()
+            if name == scans.name and (split == scans.split or None in (split, scans.split))
+        ]
+        exact = [group for group in candidates if any(member.location == scans.location for member in group.values())]
+        group = next(iter(exact or candidates or only), {})
+        if coordinates not in group:
+            there = ", ".join(
+                sorted(f"{member.split or '?'}/{member.name}" for g in groups.values() for member in g.values())
+            )
+            raise MissingDataError(
+                source.location,
+                expected=f"{coordinates} grids of {scans.split or '?'}/{scans.name}",
+                found=f"{'only ' + ', '.join(group) if group else 'the sequences ' + there}",
+            )
+        found.append(group[coordinates])
+    return found
+
+
+def grid_named(grids: Sequence, grid: str | GridSpec) -> str:
+    """Return the name of a sequence's grid, given by name or by geometry.
+
+    Raises:
+        MissingDataError: it has no such grid.
+    """
+    if isinstance(grid, str):
+        if grid in grids.grids:
+            return grid
+    else:
+        for name, spec in grids.grids.items():
+            if spec == grid:
+                return name
+    there = ", ".join(f"{name} ({spec})" for name, spec in grids.grids.items()) or "none"
+    raise MissingDataError(
+        grids.location,
+        expected=f"the grid {grid}",
+        found=f"{there}",
+        advice="give another grid=, or for scans alone a GridSpec",
+    )
+
+
+def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int64]:
+    """Return the frames that have all fields of `wanted`.
+
+    Raises:
+        MissingDataError: a field is nowhere in the sequence.
+    """
+    common: NDArray[np.int64] | None = None
+    for sequence, field in wanted:
+        frames = sequence.frames(field)
+        if not len(frames):
+            raise MissingDataError(
+                sequence.location,
+                expected=f"the field {field}",
+                found="no frame that has it",
+                advice="leave the sequence out with split=[names], or do not ask for the field",
+            )
+        common = frames if common is None else np.intersect1d(common, frames, assume_unique=True)
+    return np.empty(0, np.int64) if common is None else common
+
+
+_Key = tuple[str | None, str, str]  # split, name, and the path of the sequence's folder
+
+
+def _groups(source: Source) -> dict[_Key, dict[str, Sequence]]:
+    """Put the `<coordinates>` folders of each sequence together."""
+    groups: dict[_Key, dict[str, Sequence]] = {}
+    for path, sequence in source.sequences().items():
+        folder, _, last = path.rpartition("/")
+        key = (sequence.split, sequence.name, folder if last in layout.COORDINATES else path)
+        groups.setdefault(key, {})[sequence.coordinates] = sequence
+    return groups
+
+
+def _with_scans(group: dict[str, Sequence], coordinates: Coordinates) -> Sequence:
+    candidates = [group[name] for name in (coordinates, "cartesian") if name in group]
+    if not candidates:
+        (other,) = group.values()
+        raise MissingDataError(
+            other.location,
+            expected=f"{coordinates} data",
+            found=f"only {other.coordinates}",
+            advice=f"give coordinates={other.coordinates!r}",
+        )
+    return next((sequence for sequence in candidates if len(sequence.frames("points"))), candidates[0])
+
+
+def _match(source: Source, groups: Mapping[_Key, object], split: str | Iterable[str] | None) -> list[_Key]:
+    if split is None:
+        return list(groups)
+    if isinstance(split, str):
+        if split.lower() not in map(str.lower, layout.SPLITS):
+            raise ArgumentError(
+                f"split {split!r}: expected {', '.join(layout.SPLITS)} in any case, or a list of names of sequences"
+            )
+        chosen = [key for key in groups if (key[0] or "").lower() == split.lower()]
+        if not chosen:
+            there = ", ".join(sorted({key[0] or "none" for key in groups}))
+            raise MissingDataError(
+                source.location,
+                expected=f"the split {split}",
+                found=f"{there}",
+                advice="give the root that holds it, or split=None",
+            )
+        return chosen
+    names = list(split)
+    for name in names:
+        if not any(name in _names(key) for key in groups):
+            there = ", ".join(sorted(key[1] for key in groups))
+            raise MissingDataError(source.location, expected=f"the sequence {name}", found=f"{there}")
+    return [key for key in groups if not _names(key).isdisjoint(names)]
+
+
+def _names(key: _Key) -> set[str]:
+    """Return what a sequence may be called: "Town01_Light", "Train/Town01_Light", or its path."""
+    split, name, path = key
+    return {name, f"{split}/{name}", path}

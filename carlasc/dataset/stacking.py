@@ -1,0 +1,256 @@
+"""Scans to dense arrays, fast: moved, binned and counted in one pass of compiled code, and labels looked up in another.
+
+The rules are those of `GridSpec` (`to_axes`, `index`): every voxel is the same, for where quicker arithmetic could be in doubt the rules
+themselves are followed. A scan is
+worked through in blocks that stay in the cache: the columns are split, and the rest vectorises. Loading this module loads Numba.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+
+_BLOCK = 128  # points at once: their columns and cells take 6 KB of the first-level cache, and half a page of the file
+_DEGREE = 11
+_ARCTAN = tuple(  # of s: arctan(sqrt(s)) / sqrt(s) on 0..1, off by less than 1e-9
+    np.polynomial.chebyshev.Chebyshev.interpolate(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), _DEGREE, [0, 1])
+    .convert(kind=np.polynomial.Polynomial)
+    .coef.tolist()
+)
+_ARCTAN_ERROR = 1e-9
+
+
+def stack_scans(
+    scans: Sequence[NDArray[np.float32] | None],
+    grid_T_scans: NDArray[np.float64],
+    spec: GridSpec,
+    what: Literal["occupancy", "density"] = "occupancy",
+    min_range_m: float | None = None,
+    max_range_m: float | None = None,
+) -> NDArray[Any]:
+    """Bin scans into a stack of grids.
+
+    Args:
+        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, rows or the transpose of contiguous x, y and z;
+            None leaves its grid empty.
+        grid_T_scans: (T, 4, 4) transforms from each scan's frame to the grid's.
+        spec: the grid.
+        what: "occupancy" marks voxels that hold a point, "density" counts their points (65535 at most).
+        min_range_m: points nearer to their own sensor are left out; None keeps all.
+        max_range_m: points farther from it are left out; None keeps all.
+
+    Returns:
+        (T, X, Y, Z) uint8 0 or 1, or uint16 points a voxel.
+    """
+    stack = np.zeros((len(scans), *spec.size), np.uint8 if what == "occupancy" else np.uint16)
+    geometry = _geometry(spec)
+    ranges = (min_range_m or 0.0, math.inf if max_range_m is None else float(max_range_m))
+    rows = grid_T_scans[:, :3].reshape(-1, 12).tolist()
+    for grid, points, row in zip(stack.reshape(len(scans), -1), scans, rows, strict=True):
+        if points is not None and len(points):
+            planes = points[:, :3].T
+            if planes.flags.aligned and planes.strides[1] == planes.itemsize and points.dtype == np.float32:
+                x, y, z = map(_read_only, planes)
+                _bin_planes(x, y, z, tuple(row), geometry, ranges, grid)
+            else:
+                _bin_rows(_as_words(points), tuple(row), geometry, ranges, grid)
+    return stack
+
+
+def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype: np.dtype[Any]) -> NDArray[Any] | None:
+    """Return `table[labels]` as `dtype`, or None if a label is not in the table (beyond its end, or -1 there)."""
+    found = np.empty(labels.shape, dtype)
+    flat = np.ascontiguousarray(labels).reshape(-1)
+    return found if _look_up(_read_only(flat), table, found.reshape(-1)) else None
+
+
+def _geometry(spec: GridSpec) -> tuple[Any, ...]:
+    voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
+    cylindrical = spec.coordinates == "cylindrical"
+    # How many cells a quick coordinate may be off: its rounding, that of voxel_size * size against the bounds, and the azimuth's error.
+    doubt = 1e-6 + 1e-7 * max(sizes) + (_ARCTAN_ERROR / float(voxel[1]) if cylindrical else 0.0)
+    return spec.lower, spec.upper, tuple(voxel), tuple(1.0 / voxel), sizes, cylindrical, doubt
+
+
+def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Return the bytes of the points as (2 N,) words, x and y in one, z and a fourth number in the next."""
+    if points.shape[1] != 4:
+        points = np.column_stack([points[:, :3], np.zeros(len(points), np.float32)])
+    words = np.ascontiguousarray(points, np.float32).reshape(-1).view(np.uint64)
+    return _read_only(words if words.flags.aligned else words.copy())
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the array as the one kind that the kernels are compiled for."""
+    if array.flags.writeable:
+        array = array.view()
+        array.flags.writeable = False
+    return array
+
+
+_step = numba.njit(nogil=True, inline="always")  # pasted into the loop over blocks: only there does it vectorise
+
+
+@_step
+def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
+    """Take x, y and z of each point apart: two 64-bit words a point vectorise, four floats do not."""
+    for n in range(len(words) // 2):
+        xy, zw = words[2 * n], words[2 * n + 1]
+        x[n] = np.uint32(xy).view(np.float32)
+        y[n] = np.uint32(xy >> np.uint64(32)).view(np.float32)
+        z[n] = np.uint32(zw).view(np.float32)
+
+
+@_step
+def _copy_columns(xs, ys, zs, x, y, z):  # type: ignore[no-untyped-def]
+    for n in range(len(xs)):
+        x[n] = xs[n]
+        y[n] = ys[n]
+        z[n] = zs[n]
+
+
+@_step
+def _leave_out(x, y, z, count, near_squared, far_squared):  # type: ignore[no-untyped-def]
+    for n in range(count):
+        squared = x[n] * x[n] + y[n] * y[n] + z[n] * z[n]
+        if squared < near_squared or squared > far_squared:
+            x[n] = np.nan  # not a number is inside no grid
+
+
+@_step
+def _move(x, y, z, count, rows):  # type: ignore[no-untyped-def]
+    r00, r01, r02, t0, r10, r11, r12, t1, r20, r21, r22, t2 = rows
+    for n in range(count):
+        a, b, c = x[n], y[n], z[n]
+        x[n] = a * r00 + b * r01 + c * r02 + t0
+        y[n] = a * r10 + b * r11 + c * r12 + t1
+        z[n] = a * r20 + b * r21 + c * r22 + t2
+
+
+@_step
+def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore[no-untyped-def]
+    """Write the radius, and the azimuth to within _ARCTAN_ERROR: `arctan2` itself does not vectorise."""
+    c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, c11 = _ARCTAN
+    for n in range(count):
+        a, b = np.abs(x[n]), np.abs(y[n])
+        long, short = (a, b) if a > b else (b, a)
+        t = short / long
+        s = t * t
+        high = c6 + s * (c7 + s * (c8 + s * (c9 + s * (c10 + s * c11))))
+        angle = t * (c0 + s * (c1 + s * (c2 + s * (c3 + s * (c4 + s * (c5 + s * high))))))
+        angle = np.pi / 2 - angle if b > a else angle
+        angle = np.pi - angle if x[n] < 0 else angle
+        angle = -angle if y[n] < 0 else angle
+        turned = angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
+        angle = turned if (turned >= lower) & (turned < upper) else angle
+        azimuth[n] = angle if long > 0 else lower  # at the origin: on an edge, so looked at again
+        radius[n] = np.sqrt(a * a + b * b)
+
+
+@_step
+def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def]
+    """Write the flat index of each point's voxel given on the grid's axes: -1 outside, -2 where it is in doubt.
+
+    Three divisions a point would take half the time. So multiply, and doubt what comes near to a cell's edge.
+    """
+    (l0, l1, l2), _, _, (w0, w1, w2), (s0, s1, s2), _, doubt = geometry
+    clear = 0.5 - doubt
+    doubtful = 0
+    for n in range(count):
+        a, b, c = (x[n] - l0) * w0, (y[n] - l1) * w1, (z[n] - l2) * w2
+        i, j, k = np.floor(a), np.floor(b), np.floor(c)
+        inside = (i >= 0) & (i < s0) & (j >= 0) & (j < s1) & (k >= 0) & (k < s2)
+        edge = (np.abs(a - i - 0.5) > clear) | (np.abs(b - j - 0.5) > clear) | (np.abs(c - k - 0.5) > clear)
+        doubtful += edge
+        cell = (i * s1 + j) * s2 + k if inside else -1.0
+        cells[n] = np.int32(-2.0 if edge else cell)
+    return doubtful
+
+
+@_step
+def _find_cell(x, y, z, geometry):  # type: ignore[no-untyped-def]
+    """Return the flat index of the voxel of one Cartesian point, -1 outside: the rules of `GridSpec` to the letter."""
+    (l0, l1, l2), (u0, u1, u2), (v0, v1, v2), _, (s0, s1, s2), cylindrical, _ = geometry
+    if cylindrical:
+        azimuth = np.arctan2(y, x)
+        turned = azimuth + 2 * np.pi if azimuth < l1 else (azimuth - 2 * np.pi if azimuth >= u1 else azimuth)
+        x = np.sqrt(x * x + y * y)
+        y = turned if l1 <= turned < u1 else azimuth
+    if not (l0 <= x < u0 and l1 <= y < u1 and l2 <= z < u2):
+        return np.int32(-1)
+    i = min(np.floor((x - l0) / v0), s0 - 1.0)
+    j = min(np.floor((y - l1) / v1), s1 - 1.0)
+    k = min(np.floor((z - l2) / v2), s2 - 1.0)
+    return np.int32((i * s1 + j) * s2 + k)
+
+
+@_step
+def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
+    """Mark (uint8) or count (uint16) the points of each voxel."""
+    if grid.itemsize == 1:
+        for n in range(count):
+            if cells[n] >= 0:
+                grid[cells[n]] = 1
+    else:
+        for n in range(count):
+            if cells[n] >= 0 and grid[cells[n]] < 65535:
+                grid[cells[n]] += 1
+
+
+@_step
+def _bin_block(x, y, z, radius, azimuth, cells, count, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    near, far = ranges
+    if near > 0.0 or far < np.inf:
+        _leave_out(x, y, z, count, near * near, far * far)
+    _move(x, y, z, count, rows)
+    if geometry[5]:
+        _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1], radius, azimuth)
+        doubtful = _find_cells(radius, azimuth, z, count, geometry, cells)
+    else:
+        doubtful = _find_cells(x, y, z, count, geometry, cells)
+    for n in range(count if doubtful else 0):
+        if cells[n] == -2:
+            cells[n] = _find_cell(x[n], y[n], z[n], geometry)
+    _mark(cells, count, grid)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _bin_rows(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    cells = np.empty(_BLOCK, np.int32)
+    for start in range(0, len(words), 2 * _BLOCK):
+        block = words[start : start + 2 * _BLOCK]
+        _split_columns(block, x, y, z)
+        _bin_block(x, y, z, radius, azimuth, cells, len(block) // 2, rows, geometry, ranges, grid)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _bin_planes(xs, ys, zs, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    cells = np.empty(_BLOCK, np.int32)
+    for start in range(0, len(xs), _BLOCK):
+        xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
+        _copy_columns(xb, yb, zb, x, y, z)
+        _bin_block(x, y, z, radius, azimuth, cells, len(xb), rows, geometry, ranges, grid)
+
+
+@numba.njit(nogil=True, cache=True)
+def _look_up(labels, table, found):  # type: ignore[no-untyped-def]
+    size = len(table)
+    complete = True
+    for n in range(len(labels)):
+        label = labels[n]
+        if label >= size or table[label] < 0:
+            complete = False
+        else:
+            found[n] = table[label]
+    return complete

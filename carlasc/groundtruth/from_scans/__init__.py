@@ -1,0 +1,1 @@
+"""Ground truth from one sensor's scans, merged over time."""

@@ -1,0 +1,223 @@
+"""Votes of observations on the voxels of a grid, and what the votes decide.
+
+Every labelled point votes for its class in its voxel, and free samples on its ray vote for free (class 0) in theirs. A voxel takes the
+class with most votes, ties go to the lowest id, and a voxel without any vote is unknown (FORMAT section 4).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError
+from carlasc.groundtruth.voting.observations import Observation
+from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
+
+VoteRule = Literal["sensor", "sample", "point"]
+
+OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
+
+
+def count_votes(
+    observations: Iterable[Observation],
+    spec: GridSpec,
+    classes: ClassTable = CARLA,
+    *,
+    vote: VoteRule = "sensor",
+    free_step_m: float = 1.5,
+) -> Votes:
+    """Count the votes of observations, one at a time: memory does not grow with their number.
+
+    Args:
+        observations: the voters, all in one grid frame.
+        spec: the grid.
+        classes: table of the labels.
+        vote: "sensor": at most one vote an observation, voxel and class (the published files); "sample": every sample counts; "point":
+            every point counts, free space at most once an observation and voxel.
+        free_step_m: distance between the free samples of a ray, metres.
+
+    Raises:
+        ArgumentError: an unknown vote rule, or a step that is not a positive number.
+        FormatError: a label is not below `classes.num_channels`.
+    """
+    ballot = Ballot(spec, classes, vote=vote, free_step_m=free_step_m)
+    for observation in observations:
+        ballot.add(observation)
+    return ballot.votes()
+
+
+class Ballot:
+    """Votes as they come in: `add` observations one by one, read the `votes` at any time.
+
+    A ballot is used by one thread at a time; different ballots are independent, and `add` releases the GIL.
+
+    Args:
+        spec: the grid.
+        classes: table of the labels.
+        vote: "sensor", "sample" or "point", as in `count_votes`.
+        free_step_m: distance between the free samples of a ray, metres.
+        regions: (V,) uint16 region of each voxel, for observations that vote in one of them; not with "sample".
+
+    Raises:
+        ArgumentError: an unknown vote rule, or a step that is not a positive number, or regions that do not fit.
+    """
+
+    def __init__(
+        self,
+        spec: GridSpec,
+        classes: ClassTable = CARLA,
+        *,
+        vote: VoteRule = "sensor",
+        free_step_m: float = 1.5,
+        regions: NDArray[np.uint16] | None = None,
+    ) -> None:
+        from carlasc.groundtruth.voting import kernel, rule
+
+        if vote not in ("sensor", "sample", "point"):
+            raise ArgumentError("vote rule", expected="sensor, sample or point", found=f"{vote!r}")
+        if regions is not None and (regions.shape != (spec.num_voxels,) or vote == "sample"):
+            raise ArgumentError(
+                "regions", expected=f"({spec.num_voxels},) of them and no sample votes", found=f"{regions.shape}"
+            )
+        if not (math.isfinite(free_step_m) and free_step_m > 0):
+            raise ArgumentError("free step", expected="a positive number of metres", found=f"{free_step_m}")
+        self.spec, self.classes, self.vote, self.free_step_m = spec, classes, vote, float(free_step_m)
+        self.num_observations = 0
+        free_once = vote != "sample"
+        self._cells = rule.Cells.of(spec)
+        self._tally = kernel.Tally(
+            vote == "sensor",
+            free_once,
+            free=np.zeros(spec.num_voxels + 1, np.uint32 if free_once else np.int64),
+            passed=np.zeros(spec.num_voxels + 1 if free_once else 0, np.uint8),
+            heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
+            candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
+            used=np.zeros(1, np.int64),
+            regions=np.empty(0, np.uint16) if regions is None else np.ascontiguousarray(regions, np.uint16),
+        )
+
+    def add(self, observation: Observation) -> None:
+        """Add the votes of one observation.
+
+        Raises:
+            FormatError: a label is not below the class table's number of channels; no vote was added.
+            ArgumentError: it votes in a region, and the ballot has none.
+        """
+        from carlasc.groundtruth.voting import kernel, rays, rule
+
+        self.classes.check(observation.labels, "observation labels")
+        hit_region, free_region = (
+            kernel.ANYWHERE if region is None else region
+            for region in (observation.hit_region, observation.free_region)
+        )
+        if not len(self._tally.regions) and (hit_region, free_region) != (kernel.ANYWHERE, kernel.ANYWHERE):
+            raise ArgumentError("observation: expected a ballot with regions for one that votes in a region")
+        labels = np.require(observation.labels, np.uint16, ["C", "A", "W"])
+        self._make_room(len(observation))
+        pose = rule.as_pose(observation.grid_T_sensor)
+        kernel.vote(
+            np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
+            labels,
+            labels if observation.hits is None else np.where(observation.hits, labels, np.uint16(0)),
+            pose,
+            rays.View.of(pose, self._cells),
+            self._cells,
+            self.free_step_m,
+            self.num_observations,
+            hit_region,
+            free_region,
+            self._tally,
+        )
+        self.num_observations += 1
+
+    def votes(self) -> Votes:
+        """Return the votes so far; later observations do not change them."""
+        candidates = self._tally.candidates[: self._tally.used[0]]
+        occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
+        for name in OCCUPIED_DTYPE.names or ():
+            occupied[name] = candidates[name]
+        return Votes(self.spec, self.classes, self._tally.free[:-1].reshape(self.spec.size).copy(), occupied)
+
+    def _make_room(self, points: int) -> None:
+        """Let the candidates grow by as many as there are points: at worst each is the first of its kind."""
+        used, candidates = int(self._tally.used[0]), self._tally.candidates
+        if used + points > len(candidates):
+            grown = np.empty(2 * (used + points), candidates.dtype)
+            grown[:used] = candidates[:used]
+            self._tally = self._tally._replace(candidates=grown)
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """The votes of each voxel by class, free ones apart from occupied ones.
+
+    Attributes:
+        spec: the grid.
+        classes: table of the labels.
+        free: (X, Y, Z) unsigned integer, votes for free space.
+        occupied: (M,) structured `voxel` (int32 flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0); one row
+            a voxel and class, in no order.
+    """
+
+    spec: GridSpec
+    classes: ClassTable
+    free: NDArray[Any]
+    occupied: NDArray[Any]
+
+    def to_grid(self, free_weight: NDArray[np.floating] | None = None) -> Grid:
+        """Elect a class for each voxel, and sum its votes.
+
+        Args:
+            free_weight: (K,) by class: how many votes for things one vote for free space outweighs. A voxel is occupied, by the class
+                with most votes, where its votes for things are more than that. None: free is a class among others, the class with
+                most votes wins, ties go to the lowest id (FORMAT section 4).
+        """
+        free = self.free.reshape(-1)
+        if free_weight is None:
+            labels, counts = self._elect(free)
+        else:
+            labels, things = self._elect(np.zeros_like(free))
+            labels[things <= free_weight[labels] * free] = 0
+            counts = things + free
+        return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
+
+    def _elect(self, free: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return (V,) the class with most votes, ties to the lowest id, and the sum of the votes, `free` being those of class 0."""
+        from carlasc.groundtruth.voting import kernel
+
+        labels, best, counts = np.empty(len(free), self.classes.dtype), np.empty_like(free), np.empty_like(free)
+        kernel.elect(free, self.occupied, labels, best, counts)
+        return labels, counts
+
+    def occupied_counts(self) -> NDArray[np.int64]:
+        """Return (X, Y, Z) int64: votes for any class but free."""
+        counts = np.bincount(self.occupied["voxel"], self.occupied["votes"], self.spec.num_voxels)
+        return counts.astype(np.int64).reshape(self.spec.size)
+
+    def to_sparse(self) -> NDArray[Any]:
+        """Return the votes as the layout stores them: only non-zero ones, sorted by voxel, then label; free is label 0.
+
+        Votes beyond 65535, the most that the layout holds, are kept as 65535.
+
+        Returns:
+            (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` where class ids do not fit 8 bits.
+        """
+        free = np.flatnonzero(self.free)
+        columns = {
+            "voxel": np.concatenate([free, self.occupied["voxel"]]),
+            "label": np.concatenate([np.zeros(len(free), np.uint16), self.occupied["label"]]),
+            "votes": np.minimum(np.concatenate([self.free.reshape(-1)[free], self.occupied["votes"]]), 65535),
+        }
+        order = np.lexsort((columns["label"], columns["voxel"]))
+        votes = np.empty(len(order), VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE)
+        for name, column in columns.items():
+            votes[name] = column[order]
+        return votes

@@ -1,0 +1,269 @@
+"""Bringing one file here whole: in blocks, over several connections, going on where an earlier run stopped.
+
+Bytes go to `<name>.part`, and which blocks are there to `<name>.part.json` beside it; the file takes its name only when every byte has come.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+from carlasc.errors import CarlascError, FormatError
+from carlasc.storage.downloads.http import (
+    ChangedError,
+    InterruptionError,
+    RangeIgnoredError,
+    RemoteFile,
+    probe,
+    read_range,
+    read_whole,
+)
+from carlasc.storage.files import parse_json, write_json
+
+_T = TypeVar("_T")
+
+_BLOCK = 16 << 20
+_PIECE = 256 << 10
+_TRIES = 6  # without a byte of progress between
+_RESTARTS = 3  # because the file changed
+_WAIT_S = 0.5  # before the second try, then twice as long each time
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a transfer goes about it; the defaults suit files of gigabytes.
+
+    Attributes:
+        connections: blocks that come at once.
+        block: bytes of a block.
+        wait_s: pause before the second try of a request; doubles from try to try.
+    """
+
+    connections: int = 4
+    block: int = _BLOCK
+    wait_s: float = _WAIT_S
+
+
+@dataclass
+class _State:
+    """Which bytes of which file are in the .part file: for each block, how many from its start."""
+
+    file: RemoteFile
+    block: int
+    got: dict[int, int] = field(default_factory=dict)
+
+    @property
+    def total(self) -> int:
+        return sum(self.got.values())
+
+    def stop(self, index: int) -> int:
+        """Where a block ends in the file."""
+        return min((index + 1) * self.block, self.file.size or 0)
+
+    @property
+    def open_blocks(self) -> list[int]:
+        """The blocks that are not whole."""
+        count = -(-(self.file.size or 0) // self.block)
+        return [i for i in range(count) if i * self.block + self.got.get(i, 0) < self.stop(i)]
+
+
+def find_file(url: str, settings: Settings) -> RemoteFile:
+    """Ask the server for a file, some times over if need be.
+
+    Raises:
+        CarlascError: it cannot be reached, is not there, or is no zip.
+    """
+    return _persistently(lambda: probe(url), url, settings, threading.Event())
+
+
+def remaining_bytes(file: RemoteFile, path: Path, settings: Settings) -> int:
+    """Return how many bytes are still to come, given what an earlier run has left."""
+    return (file.size or 0) - _load(file, path, settings).total
+
+
+def transfer(file: RemoteFile, path: Path, settings: Settings, advance: Callable[[int], None]) -> int:
+    """Fetch a file to `path`, going on with what an earlier run has left.
+
+    Args:
+        file: as `find_file` found it.
+        path: where it goes; `path` is there only when it is whole.
+        settings: connections, blocks.
+        advance: called with the number of bytes that came; negative where some are thrown away. From one thread at a time.
+
+    Returns:
+        The number of bytes that an earlier run had brought.
+
+    Raises:
+        CarlascError: the server gave up, or keeps changing the file. What came stays for the next run.
+    """
+    resumed = 0
+    for _ in range(_RESTARTS):
+        state = _load(file, path, settings)
+        resumed = state.total
+        advance(resumed)
+        try:
+            if file.ranges and file.size:
+                _fetch_blocks(state, path, settings, advance)
+            else:
+                _fetch_stream(state, path, settings, advance)
+            _finish(state, path)
+            return resumed
+        except ChangedError:
+            advance(-state.total)
+            _discard(path)
+            file = find_file(file.url, settings)
+        except RangeIgnoredError:  # it said it knew ranges
+            advance(-state.total)
+            _discard(path)
+            file = RemoteFile(file.url, file.size, file.validator, ranges=False)
+    raise FormatError(
+        file.url, expected="one file", found=f"another at each of {_RESTARTS} tries", advice="it keeps changing"
+    )
+
+
+def _fetch_blocks(state: _State, path: Path, settings: Settings, advance: Callable[[int], None]) -> None:
+    stop, lock = threading.Event(), threading.Lock()
+    descriptor = os.open(_part(path), os.O_RDWR | os.O_CREAT, 0o666)
+    executor = ThreadPoolExecutor(settings.connections, thread_name_prefix="download")
+    try:
+        os.ftruncate(descriptor, state.file.size or 0)
+
+        def fetch(index: int) -> None:
+            def one_try() -> None:
+                start = index * state.block + state.got.get(index, 0)
+                for data in read_range(state.file, start, state.stop(index), _PIECE):
+                    _write_at(descriptor, data, start)
+                    start += len(data)
+                    with lock:
+                        state.got[index] = state.got.get(index, 0) + len(data)
+                        advance(len(data))
+                    if stop.is_set():
+                        return
+
+            _persistently(one_try, state.file.url, settings, stop, lambda: state.got.get(index, 0))
+            with lock:
+                _save(state, path, descriptor)
+
+        futures = [executor.submit(fetch, index) for index in state.open_blocks]
+        done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        for future in done:
+            future.result()
+    finally:
+        stop.set()  # Ctrl-C and a failed block stop the others at their next piece; what they got counts
+        executor.shutdown(wait=True, cancel_futures=True)
+        _save(state, path, descriptor)
+        os.close(descriptor)
+
+
+def _fetch_stream(state: _State, path: Path, settings: Settings, advance: Callable[[int], None]) -> None:
+    """Fetch from a server without ranges: from the start each time, so nothing is kept of a try that failed."""
+
+    def one_try() -> None:
+        advance(-state.total)
+        state.got.clear()
+        with _part(path).open("wb") as file:
+            for data in read_whole(state.file, _PIECE):
+                file.write(data)
+                state.got[0] = state.got.get(0, 0) + len(data)
+                advance(len(data))
+
+    _persistently(one_try, state.file.url, settings, threading.Event())
+
+
+def _persistently(
+    work: Callable[[], _T],
+    url: str,
+    settings: Settings,
+    stop: threading.Event,
+    measure: Callable[[], int] = lambda: 0,
+) -> _T:
+    """Do the work, again after an interruption; give up after some tries that brought nothing."""
+    tries, before = 0, measure()
+    while True:
+        try:
+            return work()
+        except InterruptionError as error:
+            tries = 1 if measure() > before else tries + 1
+            before = measure()
+            if tries >= _TRIES:
+                raise CarlascError(
+                    url,
+                    expected="data",
+                    found=f"none at {tries} tries ({error})",
+                    advice="run the same command again to go on",
+                ) from error
+            if stop.wait(settings.wait_s * 2 ** (tries - 1)):
+                raise CarlascError(f"{url}: stopped") from error
+
+
+def _load(file: RemoteFile, path: Path, settings: Settings) -> _State:
+    """Find what an earlier run has left of this very file; anything else is thrown away."""
+    fresh = _State(file, settings.block)
+    part, record = _part(path), _record(path)
+    if not (part.is_file() and record.is_file() and file.ranges):
+        return fresh
+    try:
+        values = parse_json(record.read_bytes(), str(record))
+        state = _State(file, int(values["block"]), {int(k): int(v) for k, v in values["got"].items()})
+        same = (values["url"], values["size"], values["validator"]) == (file.url, file.size, file.validator)
+    except (FormatError, KeyError, TypeError, ValueError, AttributeError):
+        return fresh
+    # without a validator the same size is no proof of the same file
+    return state if same and file.validator is not None and part.stat().st_size == file.size else fresh
+
+
+def _save(state: _State, path: Path, descriptor: int) -> None:
+    """Record what is there, after it has reached the disk."""
+    os.fsync(descriptor)
+    file = state.file
+    got = {str(index): count for index, count in sorted(state.got.items())}
+    write_json(
+        _record(path),
+        {"url": file.url, "size": file.size, "validator": file.validator, "block": state.block, "got": got},
+    )
+
+
+def _finish(state: _State, path: Path) -> None:
+    """Give the file its name, if every byte has come."""
+    size, expected = _part(path).stat().st_size, state.file.size
+    if expected is not None and (state.total != expected or size != expected):
+        raise FormatError(
+            path, expected=f"{expected} bytes", found=f"{min(size, state.total)}", advice="run the same command again"
+        )
+    with _part(path).open("rb") as file:
+        _check_zip(file, path)
+        os.fsync(file.fileno())
+    _part(path).replace(path)
+    _record(path).unlink(missing_ok=True)
+
+
+def _check_zip(file: BinaryIO, path: Path) -> None:
+    """A zip ends with its table of contents: one that was cut short has none."""
+    if not zipfile.is_zipfile(file):
+        raise FormatError(path, expected="a whole zip", found="none", advice=f"remove {_part(path).name} and run again")
+
+
+def _write_at(descriptor: int, data: bytes, offset: int) -> None:
+    view = memoryview(data)
+    while view:
+        written = os.pwrite(descriptor, view, offset)
+        view, offset = view[written:], offset + written
+
+
+def _discard(path: Path) -> None:
+    _part(path).unlink(missing_ok=True)
+    _record(path).unlink(missing_ok=True)
+
+
+def _part(path: Path) -> Path:
+    return path.with_name(f"{path.name}.part")
+
+
+def _record(path: Path) -> Path:
+    return path.with_name(f"{path.name}.part.json")

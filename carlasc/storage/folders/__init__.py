@@ -1,0 +1,1 @@
+"""The published layout as files: in a folder, in a zip, behind a URL."""

@@ -1,0 +1,281 @@
+"""The published layout as one table: field, file name, dtype, shape, unit. Nothing else knows a file name.
+
+    <split>/<sequence>/<coordinates>/velodyne/000000.bin ... (FORMAT section 1)
+
+Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid>/counts`, `<grid>/votes` for the grid in the
+folder `<grid>`. `poses` and `times` live in text files, one line a frame.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError
+
+SPLITS = ("Train", "Val", "Test")
+COORDINATES = ("cartesian", "cylindrical")
+EVALUATION = "evaluation"  # the folder of the published grid
+
+POSES = "poses.txt"
+TIMES = "times.txt"
+METADATA = "carlasc.json"
+PARAMS = "params.json"
+
+FRAME_PERIOD_S = 0.1  # scans are taken at 10 Hz
+VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
+WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
+
+
+@dataclass(frozen=True)
+class Field:
+    """What one file a frame holds.
+
+    Attributes:
+        name: how a Source and a Sink call it.
+        folder: folder under `<coordinates>/`.
+        suffix: ending of the file name.
+        dtype: NumPy type on disk, little-endian.
+        columns: values a row, None for a flat array.
+        unit: unit of the values.
+        meaning: one line for the documentation.
+        published: whether the data set's download has it.
+    """
+
+    name: str
+    folder: str
+    suffix: str
+    dtype: str
+    columns: int | None
+    unit: str
+    meaning: str
+    published: bool = True
+
+    def file(self, frame: int) -> str:
+        """Return the path of a frame's file under `<coordinates>/`."""
+        return f"{self.folder}/{frame:06d}{self.suffix}"
+
+    def decode(self, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+        """Read a file's bytes as an array, without a copy where the type allows.
+
+        Args:
+            data: the whole file.
+            where: the file, for errors.
+            shape: expected shape (grids); None takes the number of rows from the size.
+
+        Raises:
+            FormatError: the size does not fit.
+        """
+        if self.suffix == ".votes.npz":
+            return _decode_votes(data, where)
+        dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
+        size = len(data)
+        if shape is not None and size != dtype.itemsize * int(np.prod(shape)):
+            expected = f"{dtype.itemsize * int(np.prod(shape))} bytes ({' x '.join(map(str, shape))} {dtype.name})"
+            raise FormatError(where, expected=f"{expected}", found=f"{size}", advice="cut short, or of another grid")
+        if size % row:
+            raise FormatError(
+                where,
+                expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} a row)",
+                found=f"{size}",
+                advice="cut short?",
+            )
+        array = np.frombuffer(data, dtype)
+        if shape is not None:
+            return array.reshape(shape)
+        return array if self.columns is None else array.reshape(-1, self.columns)
+
+    def encode(self, array: NDArray[Any], where: str) -> bytes | memoryview:
+        """Return the bytes of a frame's file.
+
+        Raises:
+            FormatError: the array's shape or values do not fit the field.
+        """
+        self.check(array, where)
+        if self.suffix == ".votes.npz":
+            return _encode_votes(array)
+        return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
+
+    def check(self, array: NDArray[Any], where: str) -> None:
+        """Check that an array may be a frame of the field.
+
+        Raises:
+            FormatError: its shape or type does not fit; `where` is the file named there.
+        """
+        if self.suffix == ".votes.npz":
+            if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
+                raise FormatError(where, expected="a table of voxel, label and votes", found=f"{array.dtype}")
+            return
+        if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
+            raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
+        dtype = np.dtype(self.dtype)
+        if dtype.kind == "u" and array.dtype.kind not in "ub":
+            raise FormatError(where, expected="unsigned integers", found=f"{array.dtype}")
+        if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
+            raise FormatError(where, expected=f"at most {dtype.name}", found=f"{array.dtype}")
+
+
+SCAN_FIELDS: dict[str, Field] = {
+    field.name: field
+    for field in (
+        Field(
+            "points",
+            "velodyne",
+            ".bin",
+            "<f4",
+            4,
+            "m",
+            "x, y, z in the sensor frame; 4th column a zero placeholder (KITTI: remission)",
+        ),
+        Field("labels", "labels", ".label", "<u4", None, "class", "class of each point; 0 is unlabelled"),
+        Field(
+            "flow",
+            "predictions",
+            ".bin",
+            "<f4",
+            3,
+            "m/s",
+            "velocity of the actor hit, sensor frame, ego motion removed",
+        ),
+        Field(
+            "instances",
+            "instances",
+            ".label",
+            "<u4",
+            None,
+            "actor",
+            "actor of each point, 0 none, consistent over a sequence",
+            False,
+        ),
+        Field("bev", "bev", ".jpg", "u1", None, "bytes", "bird's-eye camera picture, as its JPEG bytes"),
+    )
+}
+_GRID_FIELDS: dict[str, Field] = {
+    field.name: field
+    for field in (
+        Field("labels", "", ".label", "<u4", None, "class", "class of each voxel; 0 is free, also where unknown"),
+        Field("counts", "", ".bin", "<f4", None, "votes", "votes of each voxel; 0 means unknown: never evaluated"),
+        Field(
+            "votes",
+            "",
+            ".votes.npz",
+            "",
+            None,
+            "votes",
+            "votes by class: voxel (flat index), label, votes; only non-zero ones",
+            False,
+        ),
+    )
+}
+GRID_FIELDS = tuple(_GRID_FIELDS)
+LINE_FIELDS = ("poses", "times")
+
+
+def field_named(name: str) -> Field:
+    """Return the field of a flat name: `points`, `evaluation/labels`, ...
+
+    Raises:
+        FormatError: the layout has no such field.
+    """
+    if name in SCAN_FIELDS:
+        return SCAN_FIELDS[name]
+    grid, _, part = name.rpartition("/")
+    if grid and part in _GRID_FIELDS:
+        return replace(_GRID_FIELDS[part], name=name, folder=grid)
+    raise FormatError(
+        f"field {name!r}: expected one of {', '.join(SCAN_FIELDS)}, or <grid>/ and one of {', '.join(_GRID_FIELDS)}"
+    )
+
+
+def params_file(grid: str) -> str:
+    """Return the path of a grid's params.json under `<coordinates>/`."""
+    return f"{grid}/{PARAMS}"
+
+
+def grid_folder(spec: GridSpec) -> str:
+    """Return a grid's folder: `evaluation` for the published one of its coordinates, else with the size in its name."""
+    return (
+        EVALUATION if spec == GridSpec.published(spec.coordinates) else f"{EVALUATION}_{'x'.join(map(str, spec.size))}"
+    )
+
+
+def frame_of(file_name: str, suffix: str) -> int | None:
+    """Return the frame number of a file name such as `000012.label`, None if it is no frame of that suffix."""
+    if not file_name.endswith(suffix):
+        return None
+    stem = file_name[: len(file_name) - len(suffix)]
+    return int(stem) if len(stem) >= 6 and stem.isascii() and stem.isdigit() else None
+
+
+def encode_poses(poses: NDArray[np.float64]) -> bytes:
+    """Return the text of poses.txt for (F, 4, 4) transforms: the top 3 x 4, row-major, '%.18e'."""
+    return _encode_lines(poses[:, :3, :].reshape(-1, 12))
+
+
+def decode_poses(data: bytes, where: str) -> NDArray[np.float64]:
+    """Read poses.txt as (F, 4, 4) float64.
+
+    Raises:
+        FormatError: a line has not 12 numbers.
+    """
+    rows = _decode_lines(data, 12, where)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :] = rows.reshape(-1, 3, 4)
+    return poses
+
+
+def encode_times(times: NDArray[np.float64]) -> bytes:
+    """Return the text of times.txt for (F,) seconds: one a line, '%.18e'."""
+    return _encode_lines(np.asarray(times, np.float64).reshape(-1, 1))
+
+
+def decode_times(data: bytes, where: str) -> NDArray[np.float64]:
+    """Read times.txt as (F,) float64 seconds.
+
+    Raises:
+        FormatError: a line is no number.
+    """
+    return _decode_lines(data, 1, where)[:, 0]
+
+
+def _encode_lines(rows: NDArray[np.float64]) -> bytes:
+    return "".join(" ".join(f"{value:.18e}" for value in row) + "\n" for row in rows.tolist()).encode()
+
+
+def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
+    try:
+        rows = [list(map(float, line.split())) for line in data.decode().splitlines() if line.strip()]
+    except (UnicodeDecodeError, ValueError) as error:
+        raise FormatError(
+            where, expected=f"{columns} numbers a line", found="something else", advice=f"{error}"
+        ) from error
+    for number, row in enumerate(rows, 1):
+        if len(row) != columns:
+            raise FormatError(where, expected=f"{columns} numbers a line", found=f"{len(row)} in line {number}")
+    return np.array(rows, np.float64).reshape(-1, columns)
+
+
+def _decode_votes(data: bytes | memoryview, where: str) -> NDArray[Any]:
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            columns = {name: archive[name] for name in ("voxel", "label", "votes")}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise FormatError(
+            where, expected="an .npz of voxel, label and votes", found="something else", advice=f"{error}"
+        ) from error
+    votes = np.empty(len(columns["voxel"]), VOTES_DTYPE if columns["label"].dtype.itemsize == 1 else WIDE_VOTES_DTYPE)
+    for name, column in columns.items():
+        votes[name] = column
+    return votes
+
+
+def _encode_votes(votes: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, voxel=votes["voxel"], label=votes["label"], votes=votes["votes"])
+    return buffer.getvalue()

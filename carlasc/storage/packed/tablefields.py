@@ -1,0 +1,196 @@
+"""How a field's frames become columns of a Parquet table, and come back: docs/storage.md, section "Tables", in code."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError
+from carlasc.storage import layout
+from carlasc.storage.packed.store import Columns, narrow, quantise
+
+Attributes = Mapping[str, Any]
+
+
+class TableField(ABC):
+    """The columns of one kind of field.
+
+    Attributes:
+        split_bytes: columns whose bytes are stored plane by plane, for numbers that hardly repeat.
+    """
+
+    split_bytes: frozenset[str] = frozenset()
+
+    def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
+        """Return what a reader needs to know, from the first frame."""
+        return {}
+
+    @abstractmethod
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return each column's type, as pyarrow calls it."""
+
+    @abstractmethod
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Return a frame's columns."""
+
+    @abstractmethod
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Return a frame's array."""
+
+
+class PointsTable(TableField):
+    """`x`, `y`, `z` and `fourth`; quantised ones are integers of `scale_m`."""
+
+    split_bytes = frozenset("xyz")
+
+    def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
+        """Note the quantisation."""
+        return {"scale_m": scale_m} if scale_m else {}
+
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return a column an axis."""
+        return dict.fromkeys("xyz", "int32" if "scale_m" in attributes else "float32") | {"fourth": "float32"}
+
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Return a column an axis."""
+        columns = {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(("x", "y", "z", "fourth"))}
+        if scale := attributes.get("scale_m"):
+            columns |= {name: quantise(columns[name], scale) for name in "xyz"}
+        return columns
+
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Return (N, 4) float32 rows."""
+        points = np.empty((len(columns["x"]), 4), np.float32)
+        scale = attributes.get("scale_m")
+        for axis, name in enumerate("xyz"):
+            points[:, axis] = columns[name] if scale is None else columns[name] * scale
+        points[:, 3] = columns["fourth"]
+        return points
+
+
+class FlowTable(TableField):
+    """`vx`, `vy`, `vz`."""
+
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return a column an axis."""
+        return dict.fromkeys(("vx", "vy", "vz"), "float32")
+
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Return a column an axis."""
+        return {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(("vx", "vy", "vz"))}
+
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Return (N, 3) float32."""
+        return np.stack([columns["vx"], columns["vy"], columns["vz"]], axis=1)
+
+
+class ValuesTable(TableField):
+    """One column of integers or counts in their published type; a grid's voxels in C order."""
+
+    def __init__(self, name: str, dtype: str) -> None:
+        self.name = name
+        self.dtype = dtype
+
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return the one column."""
+        return {self.name: self.dtype}
+
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Return the flat values."""
+        return {self.name: np.ascontiguousarray(array, self.dtype).reshape(-1)}
+
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Return the flat values, labels as narrow as they may be."""
+        values = columns[self.name]
+        return narrow(values) if self.name == "label" else values
+
+
+class PictureTable(TableField):
+    """`jpeg`: one row a frame, the file's bytes."""
+
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return the one column."""
+        return {"jpeg": "binary"}
+
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Return one value."""
+        picture = np.empty(1, object)
+        picture[0] = array.tobytes()
+        return {"jpeg": picture}
+
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Return (B,) uint8."""
+        return np.frombuffer(columns["jpeg"][0], np.uint8)
+
+
+class VotesTable(TableField):
+    """`voxel`, `label`, `votes`: the table as it is."""
+
+    def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
+        """Note whether labels are wide."""
+        return {"label_bytes": array.dtype["label"].itemsize}
+
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return the table's columns."""
+        return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
+
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Take the table apart."""
+        if array.dtype["label"].itemsize != attributes["label_bytes"]:
+            raise FormatError(
+                f"expected labels of {attributes['label_bytes']} bytes, as in the first frame, found others"
+            )
+        return {name: np.ascontiguousarray(array[name]) for name in self.columns(attributes)}
+
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Put the table together."""
+        wide = attributes["label_bytes"] > 1
+        votes = np.empty(len(columns["voxel"]), layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)
+        for name, column in columns.items():
+            votes[name] = column
+        return votes
+
+
+_SCANS: dict[str, TableField] = {
+    "points": PointsTable(),
+    "flow": FlowTable(),
+    "labels": ValuesTable("label", "uint32"),
+    "instances": ValuesTable("actor", "uint32"),
+    "bev": PictureTable(),
+}
+_GRIDS: dict[str, TableField] = {
+    "labels": ValuesTable("label", "uint32"),
+    "counts": ValuesTable("votes", "float32"),
+    "votes": VotesTable(),
+}
+
+
+def table_field(name: str) -> TableField:
+    """Return how a field stands in a table.
+
+    Raises:
+        FormatError: the layout has no such field.
+    """
+    layout.field_named(name)
+    return _GRIDS[name.rpartition("/")[2]] if "/" in name else _SCANS[name]
+
+
+def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
+    """Return what frames.parquet says of a field's frame."""
+    if field == "points":
+        finite = array[np.isfinite(array).all(axis=1), :3]
+        reach = float(np.sqrt((finite.astype(np.float64) ** 2).sum(axis=1).max())) if len(finite) else None
+        return {"points": len(array), "farthest_m": reach}
+    if field == "labels":
+        return {"labelled_points": int(np.count_nonzero(array))}
+    if field == "flow":
+        return {"moving_points": int((array != 0).any(axis=1).sum())}
+    if field.endswith("/labels"):
+        return {f"{field.removesuffix('/labels')}_occupied_voxels": int(np.count_nonzero(array))}
+    if field.endswith("/counts"):
+        return {f"{field.removesuffix('/counts')}_known_voxels": int(np.count_nonzero(array))}
+    return {}

@@ -1,0 +1,227 @@
+"""Where a picture is taken from.
+
+Everything is in the frame of the data. Only the camera knows its handedness: in CarlaSC's left-handed frame (y right) the
+camera's right is `up x forward`, in a right-handed one (y left) `forward x up`. So left is left in either, and no geometry is ever
+mirrored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
+from carlasc.errors import ArgumentError
+
+Floats = NDArray[np.float64]
+
+DEFAULT_ELEVATION_RAD = np.deg2rad(42.0)
+DEFAULT_FOV_RAD = np.deg2rad(32.0)
+
+_NEAREST_M = 1.0
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """What a caller may say of the camera; None leaves it to the fit around the scene.
+
+    Attributes:
+        azimuth_rad: where the camera stands around the target: 0 behind the ego vehicle, positive towards its right.
+        elevation_rad: how high it stands above the horizon.
+        distance_m: how far from the target; None: so that the whole scene is in the picture.
+        target: (3,) point that is looked at, metres; None: the middle of the scene.
+        position: (3,) where the camera stands; azimuth, elevation and distance then play no part.
+        fov_rad: vertical field of view.
+
+    Raises:
+        ArgumentError: a number that makes no camera.
+    """
+
+    azimuth_rad: float = 0.0
+    elevation_rad: float = DEFAULT_ELEVATION_RAD
+    distance_m: float | None = None
+    target: tuple[float, float, float] | None = None
+    position: tuple[float, float, float] | None = None
+    fov_rad: float = DEFAULT_FOV_RAD
+
+    def __post_init__(self) -> None:
+        flat = [self.azimuth_rad, self.elevation_rad, self.fov_rad, self.distance_m or 0.0]
+        flat += [*(self.target or ()), *(self.position or ())]
+        if not np.isfinite(flat).all():
+            raise ArgumentError("camera", expected="finite numbers", found=f"{self}")
+        if not 0 < self.fov_rad < np.pi:
+            raise ArgumentError(
+                "camera", expected="a field of view of 0 to 180 degrees", found=f"{np.rad2deg(self.fov_rad):g}"
+            )
+        if abs(self.elevation_rad) > np.pi / 2:
+            raise ArgumentError(
+                "camera", expected="an elevation of -90 to 90 degrees", found=f"{np.rad2deg(self.elevation_rad):g}"
+            )
+        if self.distance_m is not None and self.distance_m <= 0:
+            raise ArgumentError("camera", expected="a distance over 0 m", found=f"{self.distance_m:g}")
+
+    @classmethod
+    def parse(cls, text: str) -> Viewpoint:
+        """Read `key=value` words: azimuth, elevation, fov in degrees, distance in metres, position and target as x,y,z.
+
+        Raises:
+            ArgumentError: an unknown key, or no number.
+        """
+        names = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "fov": "fov_rad", "distance": "distance_m"}
+        values: dict[str, Any] = {}
+        for word in text.replace(";", " ").split():
+            key, _, value = word.partition("=")
+            try:
+                numbers = [float(number) for number in value.split(",")]
+            except ValueError:
+                numbers = []
+            if key in ("position", "target") and len(numbers) == 3:
+                values[key] = tuple(numbers)
+            elif key in names and len(numbers) == 1:
+                values[names[key]] = numbers[0] if key == "distance" else float(np.deg2rad(numbers[0]))
+            else:
+                raise ArgumentError(
+                    "camera",
+                    expected="azimuth=DEG, elevation=DEG, fov=DEG, distance=M, position=X,Y,Z or target=X,Y,Z",
+                    found=f"{word!r}",
+                )
+        return cls(**values)
+
+    def turned(self, angle_rad: float) -> Viewpoint:
+        """Return the viewpoint moved around the target by an angle, positive towards the right.
+
+        Raises:
+            ArgumentError: a fixed position cannot turn.
+        """
+        if self.position is not None:
+            raise ArgumentError("camera", expected="azimuth, elevation and distance for an orbit", found="a position")
+        return replace(self, azimuth_rad=self.azimuth_rad + angle_rad)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole or an orthographic camera.
+
+    Attributes:
+        position: (3,) metres.
+        axes: (3, 3) rows right, up, forward: unit vectors in the data's frame.
+        half_height: tangent of half the vertical field of view; orthographic: half the height that is seen, metres.
+        orthographic: parallel rays.
+    """
+
+    position: Floats
+    axes: Floats
+    half_height: float
+    orthographic: bool = False
+
+    def rays(self, width: int, height: int, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return origins and directions (n, 3) float32 through the pixels of some rows, row by row.
+
+        Directions have length 1 along the camera's forward axis, so a ray's parameter is the depth.
+        """
+        x = (np.arange(width) + 0.5 - width / 2) * (2 * self.half_height / height)
+        y = (height / 2 - np.arange(height)[rows] - 0.5) * (2 * self.half_height / height)
+        right, up, forward = self.axes
+        offsets = (x[None, :, None] * right + y[:, None, None] * up).reshape(-1, 3)
+        if self.orthographic:
+            origins, directions = self.position + offsets, np.broadcast_to(forward, offsets.shape)
+        else:
+            origins, directions = np.broadcast_to(self.position, offsets.shape), offsets + forward
+        return np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
+
+    def project(self, points: ArrayLike, width: int, height: int) -> tuple[Floats, Floats, Floats]:
+        """Return pixel column, row and depth of (N, 3) points; only those with a depth over 0 are before a pinhole."""
+        x, y, depth = self.axes @ (np.asarray(points, np.float64) - self.position).T
+        scale = height / (2 * self.half_height)
+        with np.errstate(divide="ignore", invalid="ignore"):  # points beside a pinhole; their depth is not over 0
+            zoom = scale if self.orthographic else scale / depth
+            return width / 2 + x * zoom, height / 2 - y * zoom, depth
+
+    def footprint(self, height: int) -> float:
+        """Return how wide a pixel is at depth 1 (pinhole), or everywhere (orthographic), metres."""
+        return 2 * self.half_height / height
+
+    def moved(self, dst_T_src: Transform) -> Camera:
+        """Return the same camera in another frame."""
+        return replace(
+            self, position=transform_points(dst_T_src, self.position), axes=rotate_vectors(dst_T_src, self.axes)
+        )
+
+
+def perspective_camera(
+    scene: Floats, viewpoint: Viewpoint, aspect: float, *, left_handed: bool = True, margin: float = 0.02
+) -> Camera:
+    """Return the camera of a viewpoint; what the viewpoint leaves open is fitted to the scene.
+
+    Args:
+        scene: (N, 3) points that should be in the picture, metres.
+        viewpoint: what is asked for.
+        aspect: width over height.
+        left_handed: the data's frame has y on the right.
+        margin: part of the picture left free on each side by the fit.
+    """
+    tan_y = float(np.tan(viewpoint.fov_rad / 2))
+    target = np.asarray(viewpoint.target if viewpoint.target is not None else (scene.min(0) + scene.max(0)) / 2)
+    if viewpoint.position is not None:
+        position = np.asarray(viewpoint.position, np.float64)
+        if np.allclose(position, target):
+            raise ArgumentError(
+                "camera", expected="a target away from the position", found=f"both at {target.tolist()}"
+            )
+        return Camera(position, _axes(target - position, left_handed), tan_y)
+
+    side = 1.0 if left_handed else -1.0
+    azimuth, elevation = viewpoint.azimuth_rad, viewpoint.elevation_rad
+    forward = np.array(
+        [np.cos(azimuth) * np.cos(elevation), -side * np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)]
+    )
+    axes = _axes(forward, left_handed, azimuth)
+    if viewpoint.distance_m is not None:
+        return Camera(target - viewpoint.distance_m * axes[2], axes, tan_y)
+    seen = 1 - 2 * margin
+    if viewpoint.target is None:
+        distance, shift = _fit(scene - target, axes, tan_y * aspect * seen, tan_y * seen)
+        target = target + shift[0] * axes[0] + shift[1] * axes[1]
+    else:
+        distance = max(_fit(scene - target, axes, tan_y * aspect * seen, tan_y * seen)[0], 1.0)
+    return Camera(target - distance * axes[2], axes, tan_y)
+
+
+def birdseye_camera(scene: Floats, aspect: float, *, left_handed: bool = True, margin: float = 0.01) -> Camera:
+    """Return an orthographic camera straight above the scene: x is up in the picture, the vehicle's right on the right."""
+    lower, upper = scene.min(0), scene.max(0)
+    extent = np.maximum(upper - lower, 1e-3)
+    axes = np.array([[0.0, 1.0 if left_handed else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    half_height = max(extent[0], extent[1] / aspect) / 2 / (1 - 2 * margin)
+    middle = (lower + upper) / 2
+    return Camera(np.array([middle[0], middle[1], upper[2] + 10.0]), axes, float(half_height), orthographic=True)
+
+
+def _axes(forward: Floats, left_handed: bool, azimuth: float = 0.0) -> Floats:
+    """Rows right, up, forward of a camera that stands upright; straight down, its top points where `azimuth` looks."""
+    forward = forward / np.linalg.norm(forward)
+    side = 1.0 if left_handed else -1.0
+    right = side * np.cross((0.0, 0.0, 1.0), forward)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.array([np.sin(azimuth), side * np.cos(azimuth), 0.0])
+    right = right / np.linalg.norm(right)
+    return np.array([right, side * np.cross(forward, right), forward])
+
+
+def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[float, tuple[float, float]]:
+    """Return the least distance, and the shift along right and up, from which all points are inside the picture.
+
+    No point comes nearer than `_NEAREST_M`: a very wide angle would have the camera stand in the scene's corner.
+
+    A point at (x, y, z) along right, up and forward is inside when |y - shift| <= tan_y (distance + z): two lines an axis.
+    """
+    x, y, z = axes @ points.T
+    distances, shifts = [], []
+    for across, tangent in ((x, tan_x), (y, tan_y)):
+        above, below = (across - tangent * z).max(), (-across - tangent * z).max()
+        distances.append((above + below) / (2 * tangent))
+        shifts.append((above - below) / 2)
+    return float(max(*distances, _NEAREST_M - z.min())), (float(shifts[0]), float(shifts[1]))

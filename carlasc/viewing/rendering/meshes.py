@@ -1,0 +1,220 @@
+"""What is ray-cast: meshes of quads. A grid becomes the exposed faces of its occupied voxels, an arrow a few quads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.core.grids import GridSpec
+
+_WIDEST_ARC_RAD = np.deg2rad(4.0)  # wider cylindrical cells are drawn as several flat pieces
+_SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))  # corners of a face, in order around it
+
+
+@dataclass(frozen=True)
+class QuadMesh:
+    """Flat four-cornered faces.
+
+    Attributes:
+        corners: (Q, 4, 3) float32, metres, in order around each face.
+        normals: (Q, 3) float32 unit vectors, outward.
+        colors: (Q, 3) uint8 RGB.
+        openness: (Q, 4) float32 0..1: how much of the sky the immediate neighbours leave to each corner.
+        edges: (Q, 4) bool: whether the edge from corner i to i + 1 is drawn.
+        open_sky: (Q,) bool: the face counts as seeing the whole sky (one too large for one value all over it).
+    """
+
+    corners: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    openness: NDArray[np.float32]
+    edges: NDArray[np.bool_]
+    open_sky: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def triangles(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is the triangles 2 q and 2 q + 1."""
+        first = 4 * np.arange(len(self), dtype=np.int32)[:, None, None]
+        return self.corners.reshape(-1, 3), (first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)).reshape(-1, 3)
+
+
+def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
+    """Return one mesh of several."""
+    return QuadMesh(
+        *(
+            np.concatenate([getattr(mesh, name) for mesh in meshes])
+            for name in ("corners", "normals", "colors", "openness", "edges", "open_sky")
+        )
+    )
+
+
+def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky: bool = False) -> QuadMesh:
+    """Return a mesh of (Q, 4, 3) faces of one colour or (Q, 3) colours; normals by the order of their corners."""
+    points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
+    normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    count = len(points)
+    return QuadMesh(
+        points,
+        normals,
+        np.broadcast_to(np.asarray(color, np.uint8), (count, 3)),
+        np.ones((count, 4), np.float32),
+        np.full((count, 4), edges),
+        np.full(count, open_sky),
+    )
+
+
+def grid_mesh(spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bool_]) -> QuadMesh:
+    """Return the exposed faces of a grid's occupied cells: boxes, or wedges in a cylindrical grid.
+
+    Args:
+        spec: where the cells lie.
+        colors: (X, Y, Z, 3) uint8 RGB of each cell.
+        occupied: (X, Y, Z) bool.
+    """
+    pieces = 1
+    if spec.coordinates == "cylindrical":
+        pieces = int(np.ceil(spec.voxel_size[1] / _WIDEST_ARC_RAD))
+        spec = spec.with_size((spec.size[0], spec.size[1] * pieces, spec.size[2]))
+        occupied, colors = np.repeat(occupied, pieces, axis=1), np.repeat(colors, pieces, axis=1)
+    solid = _surrounded(spec, occupied)
+    return join([_faces(spec, colors, solid, axis, side, pieces) for axis in range(3) for side in (0, 1)])
+
+
+def _surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells with a rim of one: empty, but a full turn of azimuth closes on itself."""
+    solid = np.pad(occupied, 1)
+    if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
+        solid[:, 0], solid[:, -1] = solid[:, -2], solid[:, 1]
+    return solid
+
+
+def _faces(
+    spec: GridSpec, colors: NDArray[np.uint8], solid: NDArray[np.bool_], axis: int, side: int, pieces: int
+) -> QuadMesh:
+    """The exposed faces towards one side of one axis."""
+    step = np.zeros(3, np.int64)
+    step[axis] = 2 * side - 1
+    inner = tuple(slice(1, n + 1) for n in spec.size)
+    outer = tuple(slice(1 + s, n + 1 + s) for n, s in zip(spec.size, step, strict=True))
+    exposed = solid[inner] & ~solid[outer]
+    if spec.coordinates == "cylindrical" and axis == 0 and side == 0 and spec.lower[0] == 0:
+        exposed[0] = False  # at the axis the wedge ends in a line
+    cells = np.argwhere(exposed)
+
+    across, along = (axis + 1) % 3, (axis + 2) % 3
+    edges = [spec.edges(a) for a in range(3)]
+    corners: NDArray[np.floating] = np.empty((len(cells), 4, 3))
+    openness = np.empty((len(cells), 4), np.float32)
+    for number, (first, second) in enumerate(_SQUARE):
+        offset = np.zeros(3, np.int64)
+        offset[[axis, across, along]] = side, first, second
+        lattice = cells + offset
+        corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
+        openness[:, number] = _corner_openness(solid, cells + 1 + step, across, along, 2 * first - 1, 2 * second - 1)
+    corners = spec.from_axes(corners)
+
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) * (2 * side - 1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return QuadMesh(
+        corners.astype(np.float32),
+        normals.astype(np.float32),
+        colors[tuple(cells.T)],
+        openness,
+        _drawn_edges(cells, across, along, pieces),
+        np.zeros(len(cells), np.bool_),
+    )
+
+
+def _corner_openness(
+    solid: NDArray[np.bool_], front: NDArray[np.int64], across: int, along: int, first: int, second: int
+) -> NDArray[np.float32]:
+    """How open a face's corner is, by the three cells around it in the layer in front of the face."""
+    one, two = front.copy(), front.copy()
+    one[:, across] += first
+    two[:, along] += second
+    both = one.copy()
+    both[:, along] += second
+    a, b, c = (solid[tuple(cells.T)] for cells in (one, two, both))
+    closed = np.where(a & b, 3, a.astype(np.int64) + b + c)
+    return np.array([1.0, 0.82, 0.68, 0.56], np.float32)[closed]
+
+
+def _drawn_edges(cells: NDArray[np.int64], across: int, along: int, pieces: int) -> NDArray[np.bool_]:
+    """Every edge of a face but those between the flat pieces of one wide wedge."""
+    drawn = np.ones((len(cells), 4), np.bool_)  # edge 0: along low, 1: across high, 2: along high, 3: across low
+    if pieces > 1:
+        piece = cells[:, 1] % pieces
+        if across == 1:
+            drawn[:, 3], drawn[:, 1] = piece == 0, piece == pieces - 1
+        elif along == 1:
+            drawn[:, 0], drawn[:, 2] = piece == 0, piece == pieces - 1
+    return drawn
+
+
+def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
+    """Return (Q, 4, 3) faces, upwards, of the ground plan of a grid at a height, metres."""
+    pieces = (1, 1)
+    if spec.coordinates == "cylindrical":  # several along the radius too: slivers cost Embree dear
+        pieces = (16, int(np.ceil((spec.upper[1] - spec.lower[1]) / _WIDEST_ARC_RAD)))
+    first, second = (np.linspace(spec.lower[a], spec.upper[a], pieces[a] + 1) for a in range(2))
+    corners = [
+        [(first[i + di], second[j + dj], height) for di, dj in _SQUARE]
+        for i in range(pieces[0])
+        for j in range(pieces[1])
+    ]
+    return spec.from_axes(np.array(corners)).astype(np.float32)
+
+
+def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 0.0) -> QuadMesh:
+    """Return an axis-aligned box, its top drawn in by `taper` metres on every side."""
+    low_high = np.array([lower, upper], np.float32)
+    inwards = np.array([[taper, taper, 0.0], [-taper, -taper, 0.0]], np.float32)
+    faces = []
+    for axis in range(3):
+        for side in (0, 1):
+            face = np.empty((4, 3), np.float32)
+            for number, (first, second) in enumerate(_SQUARE):
+                pick = np.zeros(3, np.int64)
+                pick[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, first, second
+                face[number] = low_high[pick, np.arange(3)] + pick[2] * inwards[pick, np.arange(3)]
+            faces.append(face if side else face[::-1])
+    return quads(np.array(faces), color, edges=True, open_sky=True)
+
+
+def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: ArrayLike, width: float) -> QuadMesh:
+    """Return arrows as six-sided shafts with cones.
+
+    Args:
+        tails: (N, 3) where they begin, metres.
+        vectors: (N, 3) from tail to tip, metres, none of length 0.
+        color: RGB.
+        width: of the shaft, metres; the head is three times as wide, or shorter arrows in proportion.
+    """
+    lengths = np.linalg.norm(vectors, axis=1)[:, None]
+    forward = vectors / lengths
+    helper = np.where(np.abs(forward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    right = np.cross(forward, helper)
+    right /= np.linalg.norm(right, axis=1)[:, None]
+    up = np.cross(right, forward)
+    head = np.minimum(4.5 * width, 0.5 * lengths)
+    neck, tip = tails + vectors - head * forward, tails + vectors
+    angles = np.arange(7) * (np.pi / 3)
+    faces = []
+    for one, two in pairwise(angles):
+        a, b = (np.cos(angle) * right + np.sin(angle) * up for angle in (one, two))
+        thin, thick = head / 9, head / 3
+        faces += [
+            (tails + thin * a, tails + thin * b, neck + thin * b, neck + thin * a),
+            (neck + thick * a, neck + thick * b, tip, tip),
+            (neck + thin * a, neck + thin * b, neck + thick * b, neck + thick * a),
+            (tails, tails, tails + thin * b, tails + thin * a),
+        ]
+    corners = np.array(faces).transpose(2, 0, 1, 3).reshape(-1, 4, 3)
+    return quads(corners[:, ::-1], color)

@@ -1,0 +1,223 @@
+"""Meshes to pictures: rays against Embree, then light. No screen, no GPU.
+
+A sun with soft shadows, and a sky: a face takes as much of it as a handful of rays from the face find free. Voxels get thin
+edges, which fade where a voxel is only a few pixels wide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import import_extra
+from carlasc.viewing.rendering.cameras import Camera
+from carlasc.viewing.rendering.meshes import QuadMesh
+
+BACKGROUND = 255
+SAMPLES = 2  # samples a pixel, each way
+
+_SKY_RAYS = 12
+_SKY_RANGE_M = 6.0  # what stands farther away darkens no sky
+_TO_SUN = np.array([-0.42, -0.62, 1.0])  # from behind on the left
+_AMBIENT = 0.6
+_SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that an open, level, sunlit face has just its own colour
+_EDGE_DARKNESS = 0.34
+_BAND = 1 << 19  # rays at a time: keeps memory bounded
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture with its depth, `SAMPLES` times as wide and high as what comes out of it.
+
+    Attributes:
+        colors: (h, w, 3) uint8 RGB.
+        depth: (h, w) float32 metres along the camera's axis; infinite where nothing is.
+    """
+
+    colors: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+
+    def resolve(self) -> NDArray[np.uint8]:
+        """Return (H, W, 3) uint8: the mean of each pixel's samples."""
+        total = np.full((self.depth.shape[0] // SAMPLES, self.depth.shape[1] // SAMPLES, 3), SAMPLES, np.uint16)
+        for row in range(SAMPLES):
+            for column in range(SAMPLES):
+                total += self.colors[row::SAMPLES, column::SAMPLES]
+        return (total // SAMPLES**2).astype(np.uint8)
+
+
+def empty_frame(width: int, height: int) -> Frame:
+    """Return a frame for a picture of width x height pixels with nothing in it."""
+    shape = (height * SAMPLES, width * SAMPLES)
+    return Frame(np.full((*shape, 3), BACKGROUND, np.uint8), np.full(shape, np.inf, np.float32))
+
+
+def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = True) -> None:
+    """Draw a mesh into a frame, lit.
+
+    Args:
+        mesh: what to draw.
+        camera: where from.
+        frame: drawn into; what it holds already is drawn over where the mesh is nearer.
+        left_handed: the data's frame has y on the right: the sun stays behind on the left.
+    """
+    if not len(mesh):
+        return
+    scene, geometry = _embree_scene(mesh)
+    sky = _sky_visibility(scene, mesh)
+    suns = _suns(left_handed)
+    extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
+    height, width = frame.depth.shape
+    band = max(1, _BAND // width)
+    for top in range(0, height, band):
+        rows = slice(top, min(top + band, height))
+        origins, directions = camera.rays(width, height, rows)
+        hits = scene.run(origins, directions, output=True)
+        quad, depth = hits["primID"], hits["tfar"]
+        # Each sample of a pixel sees another point of the sun's disc: shadows are soft without a further ray.
+        columns = np.arange(width) % SAMPLES
+        which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
+        starts, towards, facing = _shadow_rays(mesh.normals, quad, origins, directions, depth, suns, which)
+        shadowed = np.zeros(len(quad), np.bool_)
+        if len(facing):
+            shadowed[facing] = scene.run(starts, towards, query="OCCLUDED") >= 0
+        _shade(
+            extents,
+            mesh.normals,
+            mesh.colors,
+            mesh.openness,
+            mesh.edges,
+            sky,
+            suns,
+            which,
+            quad,
+            hits["u"],
+            hits["v"],
+            depth,
+            shadowed,
+            np.float32(camera.footprint(height // SAMPLES)),
+            camera.orthographic,
+            frame.colors[rows].reshape(-1, 3),
+            frame.depth[rows].reshape(-1),
+        )
+    del geometry
+
+
+def _embree_scene(mesh: QuadMesh) -> tuple[Any, Any]:
+    rtcore_scene = import_extra("embreex.rtcore_scene", "render")
+    construction = import_extra("embreex.mesh_construction", "render")
+    scene = rtcore_scene.EmbreeScene()
+    return scene, construction.TriangleMesh(scene, *mesh.triangles())
+
+
+def _suns(left_handed: bool) -> NDArray[np.float32]:
+    """(SAMPLES^2, 3) unit vectors to points of the sun's disc, behind on the left of the vehicle."""
+    sun = _TO_SUN * (1.0, 1.0 if left_handed else -1.0, 1.0)
+    spread = 0.02 * np.array([(a, b) for a in np.linspace(-1, 1, SAMPLES) for b in np.linspace(-1, 1, SAMPLES)])
+    suns = sun + np.column_stack([spread, np.zeros(len(spread))])
+    return (suns / np.linalg.norm(suns, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
+    """(Q,) part of the sky that a face sees: rays from its middle, spread about its normal by the cosine law."""
+    number = np.arange(_SKY_RAYS) + 0.5
+    radius, angle = np.sqrt(number / _SKY_RAYS), number * (np.pi * (3 - np.sqrt(5)))
+    local = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - number / _SKY_RAYS)])
+    helper = np.where(np.abs(mesh.normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    tangent = np.cross(helper, mesh.normals)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    frames = np.stack([tangent, np.cross(mesh.normals, tangent), mesh.normals], axis=1)
+    starts = np.ascontiguousarray(mesh.corners.mean(1) + np.float32(1e-3) * mesh.normals)
+    visible = np.zeros(len(mesh), np.float32)
+    for ray in local:
+        directions = np.ascontiguousarray(np.einsum("a,qac->qc", ray, frames), np.float32)
+        distances = scene.run(starts, directions, query="DISTANCE")
+        visible += np.minimum(distances / _SKY_RANGE_M, 1.0)
+    return np.where(mesh.open_sky, np.float32(1), visible / _SKY_RAYS)
+
+
+@numba.njit(cache=True)
+def _shadow_rays(normals, quad, origins, directions, depth, suns, which):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """Starts and directions of the rays from the points that face the sun to it, and which samples these are."""
+    count = 0
+    facing = np.empty(len(quad), np.int64)
+    for i in range(len(quad)):
+        if quad[i] >= 0:
+            n, s = normals[quad[i] >> 1], suns[which[i]]
+            if n[0] * s[0] + n[1] * s[1] + n[2] * s[2] > 0:
+                facing[count] = i
+                count += 1
+    starts = np.empty((count, 3), np.float32)
+    towards = np.empty((count, 3), np.float32)
+    for k in range(count):
+        i = facing[k]
+        n = normals[quad[i] >> 1]
+        lift = np.float32(2e-3) + np.float32(2e-5) * depth[i]
+        for a in range(3):
+            starts[k, a] = origins[i, a] + depth[i] * directions[i, a] + lift * n[a]
+            towards[k, a] = suns[which[i], a]
+    return starts, towards, facing[:count]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    extents,
+    normals,
+    colors,
+    openness,
+    edges,
+    sky,
+    suns,
+    which,
+    quad,
+    u,
+    v,
+    depth,
+    shadowed,
+    footprint,
+    flat,
+    out,
+    out_depth,
+):
+    """Light every sample that a ray found, and write it where it is nearer than what is there."""
+    for i in range(len(quad)):
+        if quad[i] < 0 or depth[i] >= out_depth[i]:
+            continue
+        q = quad[i] >> 1
+        # where on the face: s from corner 0 to 1, t from corner 0 to 3
+        if quad[i] & 1 == 0:
+            s, t = u[i] + v[i], v[i]
+        else:
+            s, t = u[i], u[i] + v[i]
+        n, sun = normals[q], suns[which[i]]
+        low = openness[q, 0] * (1 - s) + openness[q, 1] * s
+        high = openness[q, 3] * (1 - s) + openness[q, 2] * s
+        ambient = sky[q] * (low * (1 - t) + high * t) * (0.86 + 0.14 * n[2])
+        direct = np.float32(0.0)
+        if not shadowed[i]:
+            direct = max(np.float32(0.0), n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2])
+        light = _AMBIENT * (0.3 + 0.7 * ambient) + _SUN * direct
+
+        pixel = footprint if flat else footprint * depth[i]
+        line = np.float32(0.0)
+        for e in range(4):
+            if not edges[q, e]:
+                continue
+            if e % 2 == 0:
+                other = extents[q, 1]
+                distance = (t if e == 0 else 1 - t) * other
+            else:
+                other = extents[q, 0]
+                distance = (s if e == 3 else 1 - s) * other
+            wide = other / pixel  # of the voxel, in pixels
+            strength = min(np.float32(1.0), max(np.float32(0.0), (wide - 2.5) / 7.5))
+            reach = max(0.55 * pixel, 0.022 * other)
+            line = max(line, strength * min(np.float32(1.0), max(np.float32(0.0), 1.5 - distance / reach)))
+        light *= 1 - _EDGE_DARKNESS * line
+        for c in range(3):
+            out[i, c] = np.uint8(min(np.float32(255.0), colors[q, c] * light + np.float32(0.5)))
+        out_depth[i] = depth[i]

@@ -1,0 +1,312 @@
+"""Recording from a stand-in server. Nothing here has spoken to a live one (docs/commands/capture.md says so)."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("carla", reason="the carla package is not installed: pip install 'carlasc[carla]'")
+
+import carla
+from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, StandIn
+
+from carlasc.captures.carla import record
+from carlasc.captures.carla.sensors import LidarModel
+from carlasc.captures.carla.server import DETECTION, Server, ServerError, decode_sweep
+from carlasc.captures.raw import Capture, sensor_offsets
+from carlasc.cli import app
+from carlasc.core.geometry import transform_points
+from carlasc.errors import ArgumentError, CarlascError, ConflictError
+
+ROAD, VEHICLE, WALKER = 7, 10, 4
+
+
+def call(out, server, **options):
+    chosen = {"frames": 3, "sensors": 4, "town": "Town01", "traffic": "light", "timeout_s": 5.0, "bev": False} | options
+    return record(out, carla=server, **chosen)
+
+
+@pytest.fixture(params=["0.9.13", "0.9.14", "0.9.16-dirty"])
+def server(request):
+    return StandIn(request.param)
+
+
+def test_a_capture_is_recorded_that_reads_back(server, tmp_path):
+    result = call(tmp_path, server)
+    capture = Capture(tmp_path)
+    assert capture.sensors == (0, 1, 2, 3) and capture.frames.tolist() == [0, 1, 2]
+    assert (result.written, result.sensors, result.vehicles, result.walkers) == (3, 4, 19, 25)
+    assert result.server_version == server.version
+    for frame in range(3):
+        for sensor in range(4):
+            recording = capture.read(sensor, frame)
+            assert len(recording.scan) > 40
+            assert set(np.unique(recording.scan.labels)) <= {ROAD, VEHICLE, WALKER}
+    times = [capture.read_time(frame) for frame in range(3)]
+    assert np.allclose(np.diff(times), 0.1)
+
+
+def test_classes_are_ours_whatever_the_servers_version(tmp_path):
+    assert TAGS[False] != TAGS[True]
+    old, new = (StandIn(version) for version in ("0.9.13", "0.9.15"))
+    call(tmp_path / "old", old)
+    call(tmp_path / "new", new)
+    for frame in range(3):
+        one, other = (Capture(tmp_path / name).read(1, frame).scan for name in ("old", "new"))
+        assert np.array_equal(one.labels, other.labels)
+        assert {ROAD, VEHICLE, WALKER} == set(np.unique(one.labels))
+        road = transform_points(Capture(tmp_path / "new").read_pose(1, frame), other.points[other.labels == ROAD])
+        assert np.abs(road[:, 2]).max() < 0.05  # poses take points to the world: the ground is level there
+
+
+def test_sensors_are_placed_as_the_format_says(tmp_path):
+    server = StandIn()
+    call(tmp_path, server, sensors=20, frames=1)
+    capture = Capture(tmp_path)
+    poses = np.stack([capture.read_pose(sensor, 0) for sensor in range(20)])
+    (ego,) = [a for a in server.worlds[-1].actors if a.attributes.get("role_name") == "hero"]
+    world_T_ego = poses[0] @ np.linalg.inv(np.block([[np.eye(3), np.array([[-0.5], [0.0], [1.8]])], [np.zeros(3), 1]]))
+    assert np.allclose(
+        world_T_ego[:3, 3], [ego._transform.location.x, ego._transform.location.y, ego._transform.location.z], atol=1e-4
+    )
+    offsets = np.stack([(np.linalg.inv(world_T_ego) @ pose)[:3, 3] for pose in poses])
+    assert np.allclose(poses[:, :3, :3], poses[0, :3, :3], atol=1e-6)  # the vehicle's own orientation
+    assert np.allclose(offsets, sensor_offsets(20, np.random.default_rng(0)), atol=1e-4)
+    assert (np.abs(offsets[1:, :2]) <= 20).all() and (offsets[1:, 2] >= 1).all() and (offsets[1:, 2] <= 5).all()
+    assert not np.allclose(sensor_offsets(20, np.random.default_rng(1))[1:], offsets[1:], atol=0.1)
+    assert np.allclose(sensor_offsets(1, np.random.default_rng(1)), [[-0.5, 0, 1.8]])
+    lidars = [a for a in server.worlds[-1].actors if "lidar" in a.type_id]
+    wanted = {
+        "channels": "64",
+        "range": "50.0",
+        "points_per_second": "1300000",
+        "rotation_frequency": "10",
+        "upper_fov": "2.0",
+        "lower_fov": "-25.0",
+    }
+    assert all(wanted.items() <= lidar.attributes.items() for lidar in lidars)
+
+
+def test_the_ego_vehicle_is_not_seen_and_others_are_where_they_are(tmp_path):
+    server = StandIn()
+    call(tmp_path, server)
+    (ego,) = [a for a in server.worlds[-1].actors if a.attributes.get("role_name") == "hero"]
+    capture = Capture(tmp_path)
+    for sensor in range(4):
+        recording = capture.read(sensor, 2)
+        actors = recording.scan.labels != ROAD
+        places = transform_points(recording.world_T_sensor, recording.scan.points[actors])
+        at = ego._transform.location
+        assert np.linalg.norm(places - (at.x, at.y, at.z), axis=1).min() > 1.0
+        everybody = np.array(
+            [
+                [place.x, place.y, place.z]
+                for a in server.worlds[-1].actors
+                if a.type_id[:7] in ("vehicle", "walker.")
+                for place in [a._transform.location]
+            ]
+        )
+        nearest = np.abs(places[:, None] - everybody[None]).max(-1).min(1)
+        assert nearest.max() < 0.45  # within the body's points and 2 cm of noise
+
+
+def test_points_have_noise_of_at_most_two_centimetres(tmp_path):
+    call(tmp_path / "plain", StandIn(), lidar=LidarModel(noise_m=0.0), frames=1)
+    call(tmp_path / "noisy", StandIn(), frames=1)
+    plain, noisy = (Capture(tmp_path / name).read(0, 0).scan.points for name in ("plain", "noisy"))
+    error = np.abs(plain - noisy)
+    assert 0.015 < error.max() <= 0.0201
+
+
+def test_velocities_are_over_ground_in_the_sensors_frame(tmp_path):
+    server = StandIn()
+    call(tmp_path, server)
+    recording = Capture(tmp_path).read(0, 1)
+    hit = np.unique(recording.scan.instances[recording.scan.instances > 0])
+    assert recording.velocities[:, 0].tolist() == hit.tolist()
+    vehicles = np.unique(recording.scan.instances[recording.scan.labels == VEHICLE])
+    rows = {int(row[0]): row[1:] for row in recording.velocities}
+    speeds = [np.linalg.norm(rows[actor]) for actor in vehicles]
+    assert np.allclose(speeds, SPEED_M_S, atol=1e-4)
+    later = Capture(tmp_path).read(0, 2)
+    for actor in vehicles:  # and they go where the velocity points, in the world
+        if not (later.scan.instances == actor).any():
+            continue
+        middle = [
+            transform_points(r.world_T_sensor, r.scan.points[r.scan.instances == actor]).mean(0)
+            for r in (recording, later)
+        ]
+        assert np.allclose(middle[1] - middle[0], 0.1 * recording.world_T_sensor[:3, :3] @ rows[actor], atol=0.03)
+
+
+def test_an_actor_keeps_its_number_through_the_sequence_and_in_a_second_run(tmp_path):
+    call(tmp_path / "one", StandIn())
+    server = StandIn()
+    server._ids = 5000  # a server that has been running for long
+    call(tmp_path / "other", server)
+    one, other = (Capture(tmp_path / name).read(2, 2) for name in ("one", "other"))
+    assert np.array_equal(one.scan.instances, other.scan.instances)
+    assert one.scan.instances.max() < 100
+
+
+def test_the_picture_from_above_has_the_published_size(tmp_path):
+    from PIL import Image
+
+    call(tmp_path, StandIn(), bev=True, frames=1, sensors=1)
+    picture = Image.open(io.BytesIO(Capture(tmp_path).read_bev(0)))
+    assert picture.size == (1920, 1080)
+    assert np.abs(np.asarray(picture)[5, 5].astype(int) - (10, 120, 250)).max() < 8
+
+
+def all_is_undone(server):
+    settings = server.worlds[-1].settings
+    assert server.left_behind == [] and server.complaints == []
+    assert not settings.synchronous_mode and not settings.fixed_delta_seconds
+    assert not any(manager.synchronous for manager in server.managers.values())
+
+
+def test_the_server_is_left_as_it_was(server, tmp_path):
+    call(tmp_path, server)
+    all_is_undone(server)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("time-out of 5000ms"), MemoryError()])
+@pytest.mark.parametrize(("what", "after"), [("tick", 0), ("tick", 2), ("spawn", 0), ("spawn", 9), ("spawn", 70)])
+def test_the_server_is_left_as_it_was_whatever_happens(tmp_path, error, what, after):
+    server = StandIn()
+    server.fail_at = (what, after, error)
+    expected = ServerError if isinstance(error, RuntimeError) else type(error)
+    with pytest.raises(expected):
+        call(tmp_path, server)
+    all_is_undone(server)
+
+
+def test_what_cannot_be_undone_is_told(tmp_path):
+    server = StandIn()
+    server.stubborn = True
+    with pytest.raises(ServerError, match="could not be cleaned up"):
+        call(tmp_path, server)
+    assert set(server.left_behind) <= {
+        "vehicle.tesla.model3",
+        "vehicle.audi.tt",
+    }  # the others were destroyed all the same
+    assert not server.worlds[-1].settings.synchronous_mode
+
+
+def test_an_interrupted_recording_goes_on(tmp_path):
+    whole = call(tmp_path / "whole", StandIn(), frames=5)
+    server = StandIn()
+    server.fail_at = ("tick", 4, KeyboardInterrupt())  # the first tick is the pedestrians'
+    with pytest.raises(KeyboardInterrupt):
+        call(tmp_path / "cut", server, frames=5)
+    assert Capture(tmp_path / "cut").frames.tolist() == [0, 1, 2]
+    (tmp_path / "cut" / "raw" / "labels2" / "1.npy").unlink()  # and a frame in the middle is not whole
+    kept = (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns
+    result = call(tmp_path / "cut", StandIn(), frames=5)
+    assert (result.written, whole.written) == (3, 5)
+    assert (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns == kept
+    for frame in range(5):
+        for sensor in range(4):
+            one, other = (Capture(tmp_path / name).read(sensor, frame) for name in ("whole", "cut"))
+            assert np.array_equal(one.scan.labels, other.scan.labels) and np.allclose(
+                one.world_T_sensor, other.world_T_sensor
+            )
+    idle = StandIn()
+    assert call(tmp_path / "cut", idle, frames=5).written == 0
+    assert idle.ticks == 0  # nothing to do: the town is not even loaded
+
+
+def test_a_replay_that_leaves_the_drive_is_not_mixed_with_it(tmp_path):
+    call(tmp_path, StandIn(), frames=2)
+    server = StandIn()
+    server.drift = 0.5
+    with pytest.raises(ConflictError, match="frame 0: expected the replay to follow"):
+        call(tmp_path, server, frames=4)
+    assert Capture(tmp_path).frames.tolist() == [0, 1]
+    all_is_undone(server)
+
+
+def test_other_settings_do_not_mix(tmp_path):
+    call(tmp_path, StandIn(), frames=1)
+    with pytest.raises(ConflictError, match="seed"):
+        call(tmp_path, StandIn(), frames=1, seed=1)
+    with pytest.raises(ConflictError, match="server_version"):
+        call(tmp_path, StandIn("0.9.15"), frames=1)
+    (tmp_path / "else" / "raw" / "velodyne0").mkdir(parents=True)
+    with pytest.raises(ConflictError, match=r"recording\.json"):
+        call(tmp_path / "else", StandIn())
+
+
+def test_a_crowded_town_has_fewer_vehicles_but_always_the_ego_one(tmp_path):
+    server = StandIn()
+    server.places = 3
+    result = call(tmp_path, server, frames=1)
+    assert result.vehicles == 2
+    server = StandIn()
+    server.places = 0
+    with pytest.raises(CarlascError, match="places"):
+        call(tmp_path / "none", server)
+
+
+def test_sensors_that_stay_silent_are_named(tmp_path):
+    server = StandIn()
+    server.deaf = True
+    with pytest.raises(ServerError, match="LiDAR 0 to measure within"):
+        call(tmp_path, server, timeout_s=0.2)
+    all_is_undone(server)
+
+
+def test_a_town_that_is_not_there_is_named_with_those_that_are(tmp_path):
+    with pytest.raises(ArgumentError, match="Town01, Town10HD_Opt"):
+        call(tmp_path / "a", StandIn(), town="Town99")
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("options", [{"frames": 0}, {"sensors": 0}, {"seed": -1}, {"traffic": "none"}])
+def test_senseless_arguments_are_refused(tmp_path, options):
+    with pytest.raises(ArgumentError):
+        call(tmp_path, StandIn(), **options)
+
+
+def test_the_real_packages_bytes_and_poses_are_understood():
+    transform = carla.Transform(carla.Location(1.0, 2.0, 3.0), carla.Rotation(pitch=10.0, yaw=30.0, roll=5.0))
+    records = np.array([(1, 2, 3, 0.5, 77, 14)], DETECTION)
+    assert records.dtype.itemsize == 24
+    measurement = type("Measurement", (), {"raw_data": records.tobytes(), "transform": transform, "timestamp": 1.5})
+    sweep = decode_sweep(measurement)
+    assert sweep.detections["actor"].tolist() == [77] and sweep.detections["tag"].tolist() == [14]
+    moved = carla.Location(1.0, 2.0, 3.0)
+    moved = transform.transform(moved)
+    assert np.allclose(
+        transform_points(sweep.world_T_sensor, np.array([[1.0, 2, 3]])), [[moved.x, moved.y, moved.z]], atol=1e-4
+    )
+    measurement.raw_data = b"abc"
+    with pytest.raises(CarlascError, match="24 bytes"):
+        decode_sweep(measurement)
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"), [("0.9.13", (0, 9, 13)), ("0.9.15-dirty", (0, 9, 15)), ("0.10.0", (0, 10, 0))]
+)
+def test_versions_are_read(text, numbers):
+    assert Server("127.0.0.1", 2000, 1.0, StandIn(text)).version_numbers == numbers
+
+
+def test_without_a_server_the_command_says_so_in_one_line(tmp_path):
+    result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), "--port", "1", "--timeout", "1", "--frames", "1"])
+    assert result.exit_code == 1
+    assert "127.0.0.1:1" in result.stderr and "--host" in result.stderr
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_command_records(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "carla", StandIn())
+    options = ["--frames", "2", "--sensors", "2", "--traffic", "light", "--no-bev", "--json"]
+    result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), *options])
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["written"] == 2
+    assert PEDESTRIAN and Capture(tmp_path / "a").frames.tolist() == [0, 1]

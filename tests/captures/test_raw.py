@@ -1,0 +1,213 @@
+import pickle
+
+import numpy as np
+import pytest
+from helpers.captures import make_recording, write_capture
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from carlasc.captures.raw import Capture, CaptureWriter, Recording, find_captures
+from carlasc.core.scans import Scan
+from carlasc.errors import FormatError, MissingDataError, StorageError
+
+
+def _npy(capture, folder, frame=100):
+    return capture.raw / folder / f"{frame}.npy"
+
+
+def test_the_golden_capture_is_read_as_the_format_says(golden_capture):
+    capture = Capture(golden_capture)
+    assert capture.sensors == (0, 1, 2, 3, 4)
+    assert capture.frames.tolist() == [100, 101, 102]
+    recording = capture.read(0, 100)
+    assert recording.scan.points.shape == (8215, 3)
+    assert recording.scan.points.flags.c_contiguous  # the files are in Fortran order
+    assert recording.velocities.shape == (5, 4)
+    assert capture.read(1, 100).velocities.shape == (0, 4)
+    assert capture.read_time(101) == 101 * 0.1
+    assert capture.read_bev(100) == (golden_capture / "cartesian/bev/000000.jpg").read_bytes()
+
+
+def test_raw_itself_is_taken_as_well_as_the_folder_that_holds_it(tmp_path):
+    write_capture(tmp_path, frames=1)
+    assert Capture(tmp_path).raw == Capture(tmp_path / "raw").raw == tmp_path / "raw"
+
+
+@given(st.integers(0, 50), st.integers(0, 4), st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_what_is_written_comes_back(tmp_path_factory, points, actors, seed):
+    root = tmp_path_factory.mktemp("capture")
+    written = make_recording(points, actors, seed)
+    writer = CaptureWriter(root)
+    writer.write(3, 7, written)
+    writer.write(0, 7, written)
+    assert writer.has(3, 7) and not writer.has(3, 8)
+    read = Capture(root).read(3, 7)
+    for array, other in (
+        (read.scan.points, written.scan.points),
+        (read.scan.labels, written.scan.labels),
+        (read.scan.instances, written.scan.instances),
+        (read.velocities, written.velocities),
+        (read.world_T_sensor, written.world_T_sensor),
+    ):
+        assert array.dtype == other.dtype
+        assert np.array_equal(array, other)
+
+
+def test_an_empty_list_of_actors_is_written_as_the_authors_do(tmp_path):
+    CaptureWriter(tmp_path).write(0, 1, make_recording(actors=0))
+    assert np.load(tmp_path / "raw/velocities0/1.npy").shape == (0,)
+
+
+def test_a_frame_is_there_only_with_all_its_files(tmp_path):
+    capture = write_capture(tmp_path, frames=1)
+    writer = CaptureWriter(tmp_path)
+    assert writer.has(1, 100)
+    _npy(capture, "pose1").unlink()
+    assert not writer.has(1, 100)
+
+
+def test_the_last_line_of_a_times_file_counts(tmp_path):
+    writer = CaptureWriter(tmp_path)
+    write_capture(tmp_path, frames=1)
+    writer.write_time(0, 100, 77.5)
+    assert Capture(tmp_path).read_time(100) == 77.5
+    with pytest.raises(MissingDataError, match=r"times0.txt: expected a line for frame 4"):
+        Capture(tmp_path).read_time(4)
+    (tmp_path / "raw/times0.txt").write_text("100 10.0\n")
+    with pytest.raises(FormatError, match=r"times0.txt: expected .* found '100 10.0' in line 1"):
+        Capture(tmp_path).read_time(100)
+
+
+def test_times_are_written_in_the_words_of_the_golden_capture(tmp_path, golden_capture):
+    for frame in (100, 101, 102):
+        CaptureWriter(tmp_path).write_time(0, frame, frame * 0.1)
+    assert (tmp_path / "raw/times0.txt").read_bytes() == (golden_capture / "raw/times0.txt").read_bytes()
+
+
+def test_a_capture_without_pictures_has_none(tmp_path):
+    capture = write_capture(tmp_path, frames=1)
+    assert capture.has_bev(100) and not capture.has_bev(101)
+    assert capture.read_bev(101) is None
+
+
+def test_flow_is_the_velocity_of_each_points_actor_and_zero_elsewhere():
+    scan = Scan(np.zeros((5, 3), np.float32), None, None, np.array([9, 0, 4, 7, 9], np.uint32))
+    velocities = np.array([[9, 1, 2, 3], [4, -1, 0, 0], [0, 5, 5, 5]], np.float64)
+    flow = Recording(scan, np.eye(4), velocities).flow()
+    assert flow.dtype == np.float32
+    assert flow.tolist() == [[1, 2, 3], [0, 0, 0], [-1, 0, 0], [0, 0, 0], [1, 2, 3]]
+    assert not Recording(scan, np.eye(4), np.empty((0, 4))).flow().any()
+
+
+def test_a_capture_pickles_into_a_worker(tmp_path):
+    capture = write_capture(tmp_path, frames=1)
+    again = pickle.loads(pickle.dumps(capture))
+    assert np.array_equal(again.read(0, 100).scan.points, capture.read(0, 100).scan.points)
+
+
+def test_captures_are_found_with_their_paths(tmp_path):
+    for path in ("Train/Town01_Light", "Val/Town07_Heavy"):
+        write_capture(tmp_path / path, frames=1)
+    assert list(find_captures(tmp_path)) == ["Train/Town01_Light", "Val/Town07_Heavy"]
+    assert list(find_captures(tmp_path / "Val")) == ["Town07_Heavy"]
+    assert list(find_captures(tmp_path / "Val/Town07_Heavy")) == [""]
+    assert list(find_captures(tmp_path / "Val/Town07_Heavy/raw")) == [""]
+    with pytest.raises(MissingDataError, match="expected a capture .*found none"):
+        find_captures(tmp_path / "Val/Town07_Heavy/raw/bev")
+
+
+def test_no_folder_no_sensor_and_no_frame_are_said(tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere: expected a folder, found nothing"):
+        Capture(tmp_path / "nowhere")
+    (tmp_path / "raw").mkdir()
+    with pytest.raises(MissingDataError, match="raw: expected the ego sensor's folder velodyne0, found no sensor"):
+        _ = Capture(tmp_path).sensors
+    (tmp_path / "raw/velodyne2").mkdir()
+    with pytest.raises(MissingDataError, match=r"found only the sensors \[2\]"):
+        _ = Capture(tmp_path).sensors
+    (tmp_path / "raw/velodyne0").mkdir()
+    with pytest.raises(MissingDataError, match="raw: expected frames such as velodyne0/100.npy, found none"):
+        _ = Capture(tmp_path).frames
+
+
+def test_a_missing_file_is_named(tmp_path):
+    capture = write_capture(tmp_path, frames=1)
+    _npy(capture, "labels1").unlink()
+    with pytest.raises(MissingDataError, match=r"labels1/100.npy: expected a file, found nothing"):
+        capture.read(1, 100)
+
+
+def test_a_sensor_that_lost_its_points_is_missed_all_the_same(tmp_path):
+    capture = write_capture(tmp_path, frames=1)
+    _npy(capture, "velodyne1").unlink()
+    (capture.raw / "velodyne1").rmdir()
+    assert Capture(tmp_path).sensors == (0, 1)
+
+
+SPOILT = {  # folder -> (array that is written over it, what the error says)
+    "wrong type": ("velodyne0", np.zeros((300, 3)), "expected float32 values, found float64"),
+    "wrong shape": ("velodyne0", np.zeros((300, 4), np.float32), "expected an array of N x 3 values, found 300 x 4"),
+    "too flat": ("velodyne0", np.zeros(900, np.float32), "expected an array of N x 3 values, found 900"),
+    "NaN": (
+        "velodyne0",
+        np.full((300, 3), np.nan, np.float32),
+        "expected finite coordinates, found .*nan.* at point 0",
+    ),
+    "infinite": ("velodyne0", np.full((300, 3), np.inf, np.float32), "expected finite coordinates, found .*inf.*"),
+    "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 on 300 of 300"),
+    "short labels": ("labels0", np.zeros(299, np.uint32), "expected 300 values, one a point .*, found 299"),
+    "long instances": ("instances0", np.zeros(301, np.uint32), "expected 300 values, one a point .*, found 301"),
+    "signed labels": ("labels0", np.zeros(300, np.int32), "expected uint32 values, found int32"),
+    "NaN velocity": ("velocities0", np.full((1, 4), np.nan), "expected finite"),
+    "scaled pose": ("pose0", 2 * np.eye(4), "expected a rigid transform"),
+    "mirrored pose": ("pose0", np.diag([1.0, -1, 1, 1]), "expected a rotation, found a reflection"),
+    "NaN pose": ("pose0", np.full((4, 4), np.nan), "expected finite numbers"),
+    "three rows": ("pose0", np.eye(4)[:3], "expected an array of 4 x 4 values, found 3 x 4"),
+    "objects": ("pose0", np.array([{}], object), "expected float64 values, found object"),
+}
+
+
+@pytest.mark.parametrize("spoilt", SPOILT)
+def test_a_spoilt_file_is_named_with_what_was_expected_and_found(tmp_path, spoilt):
+    folder, array, message = SPOILT[spoilt]
+    capture = write_capture(tmp_path, frames=1)
+    np.save(_npy(capture, folder), array)
+    with pytest.raises(FormatError, match=f"{folder}/100.npy: {message}") as caught:
+        capture.read(0, 100)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data[:-5], r"expected 3728 bytes \(300 x 3 float32\), found 3723: cut short"),
+        (lambda data: data + b"more", r"expected 3728 bytes .*, found 3732: cut short, or something was added"),
+        (lambda data: data[:60], "expected a .npy array, found something else"),
+        (lambda data: b"", "expected a .npy array, found something else"),
+        (lambda data: b"x" * 4000, "expected a .npy array, found something else"),
+    ],
+)
+def test_a_file_of_odd_size_is_named(tmp_path, change, message):
+    capture = write_capture(tmp_path, frames=1)
+    path = _npy(capture, "velodyne0")
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(FormatError, match=f"velodyne0/100.npy: {message}"):
+        capture.read(0, 100)
+
+
+def test_a_recording_without_labels_is_not_written(tmp_path):
+    scan = Scan(np.zeros((1, 3), np.float32))
+    with pytest.raises(FormatError, match="sensor 0, frame 5: expected labels and instances"):
+        CaptureWriter(tmp_path).write(0, 5, Recording(scan, np.eye(4), np.empty((0, 4))))
+
+
+def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
+    (tmp_path / "raw").write_text("a file in the way")
+    for write in (
+        lambda w: w.write(0, 1, make_recording()),
+        lambda w: w.write_time(0, 1, 0.1),
+        lambda w: w.write_bev(1, b""),
+    ):
+        with pytest.raises(StorageError, match=r"raw/.*: cannot be written"):
+            write(CaptureWriter(tmp_path))

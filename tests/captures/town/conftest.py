@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+import pytest
+
+from carlasc.captures.town.drive import Drive
+from carlasc.captures.town.lidar import Lidar
+
+
+@pytest.fixture(scope="session")
+def drive() -> Drive:
+    """A drive in heavy traffic with a coarse LiDAR, as noisy as the real one."""
+    return _drive()
+
+
+@pytest.fixture(scope="session")
+def twin() -> Drive:
+    """The same drive, made once more and asked for one thing only: what another process would see."""
+    return _drive()
+
+
+def _drive() -> Drive:
+    return Drive(seed=3, traffic="heavy", lidar=Lidar(channels=32, points=16_000))

@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from carlasc.captures.town.actors import EGO_ID
+from carlasc.captures.town.drive import Drive, Snapshot
+from carlasc.captures.town.lidar import RayScene
+from carlasc.captures.town.meshes import MeshBuilder
+from carlasc.core.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError
+
+ROAD, ROAD_LINE = CARLA.id_of("Road"), CARLA.id_of("RoadLine")
+
+
+def put_before(drive: Drive, frame: int, box_at: tuple[float, float, float]) -> Snapshot:
+    """A snapshot that holds nothing but a box of Wall, 1 m wide, in the ego vehicle's frame."""
+    real = drive.snapshot(frame)
+    builder = MeshBuilder()
+    builder.boxes(CARLA.id_of("Wall"), box_at, (1.0, 1.0, 1.0))
+    mesh = builder.build().moved(real.world_T_ego)
+    instances = np.zeros(len(mesh.faces), np.uint32)
+    scene = RayScene(mesh, real.world_T_ego[:3, 3])
+    return Snapshot(frame, real.world_T_ego, real.actors, mesh, instances, scene)
+
+
+def test_the_road_is_at_minus_1_8_m_within_noise(drive: Drive) -> None:
+    for frame in (0, 90, 180):
+        scan = drive.scan(frame)
+        assert scan.labels is not None
+        road = scan.points[(scan.labels == ROAD) | (scan.labels == ROAD_LINE)]
+        assert len(road) > 1000
+        assert road[:, 2].min() >= -1.82 - 1e-5
+        assert np.quantile(road[:, 2], 0.99) <= -1.77
+        assert np.abs(np.median(road[:, 2]) + 1.8) < 0.01
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
+def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(drive: Drive, yaw_rad: float) -> None:
+    drive = copy(drive)
+    for at, axis, sign in (((0.0, 8.0, 1.0), 1, 1), ((0.0, -8.0, 1.0), 1, -1), ((8.0, 0.0, 1.0), 0, 1)):
+        snapshot = put_before(drive, 0, at)
+        pose = snapshot.world_T_ego @ translation((-0.5, 0.0, 1.8)) @ rotation_z(yaw_rad)
+        drive._snapshot = snapshot
+        points = drive._observe(0, pose, np.random.default_rng(0)).scan.points
+        assert len(points) > 10
+        upright = transform_points(rotation_z(yaw_rad), points) + (-0.5, 0.0, 1.8)
+        assert (sign * upright[:, axis] > 7.4).all()
+        assert np.abs(np.delete(upright, axis, axis=1)[:, 0]).max() < 0.6
+        assert upright[:, 2].min() > 0.9
+
+
+def test_yaw_turns_x_towards_y_and_vehicles_keep_right(drive: Drive) -> None:
+    """Left-handed: a turn to the right raises the yaw, and the lane's middle is on the right of the street's."""
+    pose = drive.ego_pose(0)
+    streets = drive.town.streets
+    lane = min(
+        (lane for lane in streets.lanes if not lane.turn),
+        key=lambda lane: float(np.linalg.norm(lane.path - pose[:2, 3], axis=1).min()),
+    )
+    middle = (streets.nodes[lane.start] + streets.nodes[lane.end]) / 2
+    seen = transform_points(invert(pose), np.append(middle, 0.0))
+    assert seen[1] == pytest.approx(-1.75, abs=0.05)  # the centre line is on the left: y < 0
+
+
+def test_labels_are_ids_of_the_table_and_nothing_is_unlabelled(drive: Drive) -> None:
+    for sensor in range(5):
+        labels = drive.record(40, sensor).scan.labels
+        assert labels is not None
+        assert labels.dtype == np.uint32
+        assert set(np.unique(labels).tolist()) <= set(CARLA.names) - {0}
+
+
+def test_many_classes_appear_on_a_short_drive(drive: Drive) -> None:
+    found: set[int] = set()
+    for frame in (0, 60, 120):
+        for sensor in range(8):
+            labels = drive.record(frame, sensor).scan.labels
+            assert labels is not None
+            found |= set(np.unique(labels).tolist())
+    assert len(found) >= 15
+
+
+def test_noise_is_uniform_and_at_most_two_centimetres_an_axis(drive: Drive) -> None:
+    quiet = copy(drive)
+    quiet.lidar = replace(drive.lidar, noise_m=0.0)
+    clean, noisy = quiet.scan(10), drive.scan(10)
+    error = noisy.points.astype(np.float64) - clean.points
+    assert np.abs(error).max() <= 0.02 + 1e-5
+    assert np.abs(error).max(axis=0) == pytest.approx([0.02] * 3, abs=1e-3)
+    assert error.std(axis=0) == pytest.approx([0.02 / np.sqrt(3)] * 3, rel=0.05)
+
+
+def test_no_point_is_beyond_the_range(drive: Drive) -> None:
+    assert np.linalg.norm(drive.scan(0).points, axis=1).max() <= drive.lidar.range_m + 0.05
+
+
+def test_the_ego_vehicle_is_never_recorded_though_it_hides_what_is_behind_it(drive: Drive) -> None:
+    for sensor in range(20):
+        recording = drive.record(30, sensor)
+        assert recording.scan.instances is not None
+        assert EGO_ID not in recording.scan.instances
+        assert EGO_ID not in recording.velocities[:, 0]
+    scan = drive.scan(30)
+    below = np.hypot(*scan.points[:, :2].T) < 2.0
+    assert not below.any()  # its own roof and bonnet
+
+
+def test_actor_points_lie_on_their_actor_and_in_nobody_else(drive: Drive) -> None:
+    frame = 75
+    actors = {actor.id: actor for actor in drive.actors(frame)}
+    checked = 0
+    for sensor in range(6):
+        recording = drive.record(frame, sensor)
+        assert recording.scan.instances is not None
+        world = transform_points(recording.world_T_sensor, recording.scan.points)
+        for id in np.unique(recording.scan.instances[recording.scan.instances != 0]).tolist():
+            points = transform_points(invert(actors[id].world_T_actor), world[recording.scan.instances == id])
+            low, high = actors[id].mesh.vertices.min(axis=0), actors[id].mesh.vertices.max(axis=0)
+            assert (points > low - 0.03).all()
+            assert (points < high + 0.03).all()
+            checked += len(points)
+    assert checked > 500
+
+
+def test_velocities_are_of_those_hit_over_ground_in_the_sensors_frame(drive: Drive) -> None:
+    recording = drive.record(100, 3)
+    assert recording.scan.instances is not None
+    hit = np.unique(recording.scan.instances[recording.scan.instances != 0])
+    np.testing.assert_array_equal(recording.velocities[:, 0], hit)
+    actors = {actor.id: actor for actor in drive.actors(100)}
+    world = rotate_vectors(recording.world_T_sensor, recording.velocities[:, 1:])
+    np.testing.assert_allclose(world, [actors[int(id)].velocity for id in hit], atol=1e-9)
+    assert drive.scan(100, 3).flow is not None
+
+
+def test_sensors_are_where_the_data_set_has_them(drive: Drive) -> None:
+    offsets = drive.sensor_offsets(40)
+    np.testing.assert_array_equal(offsets[0], (-0.5, 0.0, 1.8))
+    assert (np.abs(offsets[1:, :2]) <= 20).all()
+    assert ((offsets[1:, 2] >= 1) & (offsets[1:, 2] <= 5)).all()
+    np.testing.assert_array_equal(drive.sensor_offsets(20), offsets[:20])
+    for frame in (0, 150):
+        poses = drive.sensor_poses(frame, 3)
+        for pose, offset in zip(poses, offsets[:3], strict=True):
+            np.testing.assert_allclose(invert(drive.ego_pose(frame)) @ pose, translation(offset), atol=1e-9)
+
+
+def test_every_seed_has_its_own_sensors(drive: Drive) -> None:
+    other = copy(drive)
+    other.seed = drive.seed + 1
+    assert not np.isin(other.sensor_offsets(5)[1:], drive.sensor_offsets(5)[1:]).any()
+
+
+def test_the_reference_has_other_sensors_in_free_space_at_the_same_instant(drive: Drive) -> None:
+    reference = drive.reference_observations(50, sensors=20)
+    assert len(reference) == 20
+    own = drive.sensor_poses(50, 40)[:, :3, 3]
+    ego = drive.sensor_poses(50, 1)[0]
+    for recording in reference:
+        place = recording.world_T_sensor[:3, 3]
+        assert drive.is_free(50, place)
+        assert np.linalg.norm(own - place, axis=1).min() > 1e-3
+        assert np.abs(transform_points(invert(ego), place)[:2]).max() <= 25.6
+    again = drive.reference_observations(50, sensors=20)
+    np.testing.assert_array_equal(again[7].scan.points, reference[7].scan.points)
+    assert not np.array_equal(
+        drive.reference_observations(50, sensors=1, seed=1)[0].world_T_sensor, reference[0].world_T_sensor
+    )
+
+
+def test_the_inside_of_a_building_is_not_free(drive: Drive) -> None:
+    footprint, height = drive.town.solids[0]
+    assert not drive.is_free(0, np.append(footprint.centre, height / 2))
+    assert drive.is_free(0, np.append(footprint.centre, height + 30.0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"), [({"seed": -1}, "seed"), ({"traffic": "jammed"}, "light, medium, heavy")]
+)
+def test_a_senseless_drive_is_refused(arguments: dict[str, object], word: str) -> None:
+    with pytest.raises(ArgumentError, match=word):
+        Drive(**arguments)  # type: ignore[arg-type]
+
+
+def test_a_frame_before_the_start_and_no_sensor_are_refused(drive: Drive) -> None:
+    with pytest.raises(ArgumentError, match="frame"):
+        drive.record(-1)
+    with pytest.raises(ArgumentError, match="sensor"):
+        drive.record(0, -1)
+    with pytest.raises(ArgumentError, match="sensors"):
+        drive.sensor_offsets(0)
+    with pytest.raises(ArgumentError, match="sensors"):
+        drive.reference_observations(0, sensors=0)

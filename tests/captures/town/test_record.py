@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from carlasc.captures.raw import Capture
+from carlasc.captures.town.drive import Drive
+from carlasc.captures.town.lidar import Lidar
+from carlasc.captures.town.record import simulate
+from carlasc.errors import ArgumentError, ConflictError
+
+SMALL: dict[str, Any] = {"frames": 3, "sensors": 2, "seed": 4, "traffic": "light", "channels": 8, "points": 800}
+
+
+def digests(root: Path) -> dict[str, str]:
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("recorded")
+    simulate(out, **SMALL, workers=1)
+    return out
+
+
+def test_what_is_read_back_is_what_the_drive_saw(recorded: Path) -> None:
+    capture = Capture(recorded)
+    drive = Drive(SMALL["seed"], SMALL["traffic"], Lidar(SMALL["channels"], SMALL["points"]))
+    assert capture.sensors == (0, 1)
+    assert capture.frames.tolist() == [0, 1, 2]
+    for sensor in capture.sensors:
+        read, seen = capture.read(sensor, 2), drive.record(2, sensor)
+        np.testing.assert_array_equal(read.scan.points, seen.scan.points)
+        assert read.scan.labels is not None and seen.scan.labels is not None
+        np.testing.assert_array_equal(read.scan.labels, seen.scan.labels)
+        np.testing.assert_array_equal(read.velocities, seen.velocities)
+        np.testing.assert_array_equal(read.world_T_sensor, seen.world_T_sensor)
+        assert capture.read_time(2, sensor) == pytest.approx(0.2)
+
+
+def test_the_birds_eye_picture_has_the_published_size_and_shows_the_road_in_the_middle(recorded: Path) -> None:
+    data = Capture(recorded).read_bev(0)
+    assert data is not None
+    picture = Image.open(io.BytesIO(data))
+    assert picture.size == (1920, 1080)
+    pixels = np.asarray(picture, np.int64)
+    assert pixels.std() > 10
+    assert np.abs(pixels[540, 960] - (0, 0, 142)).max() < 70  # the ego vehicle, from above
+
+
+def test_another_process_with_two_workers_and_another_hash_seed_writes_the_same_bytes(
+    recorded: Path, tmp_path: Path
+) -> None:
+    script = (
+        "from carlasc.captures.town.record import simulate\n"
+        f"if __name__ == '__main__':\n    simulate({str(tmp_path / 'two')!r}, **{SMALL!r}, workers=2)\n"
+    )
+    (tmp_path / "run.py").write_text(script)
+    subprocess.run([sys.executable, str(tmp_path / "run.py")], check=True, env={**os.environ, "PYTHONHASHSEED": "77"})
+    assert digests(tmp_path / "two") == digests(recorded)
+
+
+def test_frames_do_not_depend_on_those_recorded_before(recorded: Path, tmp_path: Path) -> None:
+    simulate(tmp_path, **{**SMALL, "frames": 1}, first_frame=2, workers=1)
+    alone, whole = digests(tmp_path / "raw"), digests(recorded / "raw")
+    frames = {name for name in alone if name.endswith(("/2.npy", "/2.jpg"))}
+    assert len(frames) == 11
+    assert all(alone[name] == whole[name] for name in frames)
+
+
+def test_a_second_run_goes_on_and_ends_with_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
+    first = simulate(tmp_path, **{**SMALL, "frames": 2}, workers=1)
+    (tmp_path / "raw" / "labels1" / "1.npy").unlink()
+    second = simulate(tmp_path, **SMALL, executor=ThreadPoolExecutor(1))
+    assert (first.written, second.written, second.frames) == (2, 2, 3)
+    assert simulate(tmp_path, **SMALL, workers=1).written == 0
+    ours, theirs = digests(tmp_path), digests(recorded)
+    assert {k: v for k, v in ours.items() if "times" not in k} == {k: v for k, v in theirs.items() if "times" not in k}
+    assert Capture(tmp_path).read_time(1, 1) == pytest.approx(0.1)
+
+
+def test_an_interrupted_run_leaves_whole_files_and_is_finished_by_the_next(recorded: Path, tmp_path: Path) -> None:
+    def interrupt(done: int, total: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(tmp_path, **SMALL, workers=1, progress=interrupt)
+    simulate(tmp_path, **SMALL, workers=1)
+    assert digests(tmp_path) == digests(recorded)
+
+
+def test_a_capture_of_other_settings_is_refused_and_left_alone(recorded: Path) -> None:
+    before = digests(recorded)
+    for change in ({"seed": 5}, {"traffic": "heavy"}, {"sensors": 3}, {"channels": 4}, {"bev": False}):
+        with pytest.raises(ConflictError, match=str(next(iter(change)))):
+            simulate(recorded, **{**SMALL, **change}, workers=1)
+    assert digests(recorded) == before
+
+
+def test_somebody_elses_capture_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "velodyne0").mkdir(parents=True)
+    with pytest.raises(ConflictError, match=r"simulation\.json"):
+        simulate(tmp_path, **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"frames": 0}, "frames"),
+        ({"sensors": 0}, "sensors"),
+        ({"traffic": "none"}, "light, medium, heavy"),
+        ({"channels": 0}, "channels"),
+        ({"points": 1}, "points"),
+        ({"max_range_m": -1.0}, "range"),
+        ({"seed": -1}, "seed"),
+        ({"first_frame": -1}, "first frame"),
+        ({"workers": 0}, "workers"),
+    ],
+)
+def test_senseless_arguments_are_refused_before_anything_is_written(
+    tmp_path: Path, change: dict[str, Any], word: str
+) -> None:
+    with pytest.raises(ArgumentError, match=word):
+        simulate(tmp_path / "out", **{**SMALL, **change})
+    assert not (tmp_path / "out" / "raw" / "velodyne0").exists()
+
+
+def test_the_command_records_and_prints_its_figures_as_json(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from carlasc.cli import app
+
+    arguments = ["--frames", "1", "--sensors", "1", "--seed", "4", "--traffic", "light", "--channels", "8"]
+    arguments += ["--points", "800", "--workers", "1"]
+    result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments, "--no-bev", "--json"])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["written"] == 1
+    assert figures["points"] == sum(figures["classes"].values()) > 50
+    assert not Capture(tmp_path / "out").has_bev(0)
+    assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--frames", "0"]).exit_code == 2
+    assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--traffic", "jam"]).exit_code == 2
+    assert CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments]).exit_code == 1

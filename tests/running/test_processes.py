@@ -1,0 +1,98 @@
+import os
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from helpers import jobs
+
+from carlasc.errors import ArgumentError, CarlascError
+from carlasc.running.processes import run_all
+
+
+class RecordingExecutor(Executor):
+    """Does its work when asked for the result, and counts what is under way."""
+
+    def __init__(self):
+        self.submitted, self.most_pending, self.pending = [], 0, 0
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.submitted.append((fn, args))
+        self.pending += 1
+        self.most_pending = max(self.most_pending, self.pending)
+        executor = self
+
+        class Lazy(Future):
+            def result(self, timeout=None):
+                executor.pending -= 1
+                return fn(*args, **kwargs)
+
+        return Lazy()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_the_order_of_the_items(workers):
+    assert list(run_all(jobs.square, range(20), workers=workers)) == [n * n for n in range(20)]
+
+
+def test_one_worker_works_in_this_process_and_two_in_others():
+    assert set(run_all(jobs.name_of_process, range(3), workers=1)) == {os.getpid()}
+    others = set(run_all(jobs.name_of_process, range(8), workers=2))
+    assert others and os.getpid() not in others
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_the_function_is_raised_in_its_place(workers):
+    results = run_all(jobs.fail_at_three, range(6), workers=workers)
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(ValueError, match="three"):
+        next(results)
+
+
+def test_a_callers_executor_gets_a_bounded_number_of_tasks_and_stays_open():
+    executor = RecordingExecutor()
+    assert list(run_all(jobs.square, range(50), workers=3, executor=executor)) == [n * n for n in range(50)]
+    assert len(executor.submitted) == 50
+    assert executor.most_pending == 6
+    with ThreadPoolExecutor(2) as threads:
+        assert list(run_all(jobs.square, range(5), executor=threads)) == [0, 1, 4, 9, 16]
+        assert threads.submit(jobs.square, 9).result() == 81
+
+
+def test_workers_have_one_thread_each_and_the_caller_keeps_its_environment(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"]
+    assert list(run_all(jobs.environment, names, workers=2)) == ["1", "1"]
+    assert [os.environ.get(name) for name in names] == ["7", None]
+
+
+def test_workers_are_deaf_to_ctrl_c():
+    assert list(run_all(jobs.ignores_interrupt, range(2), workers=2)) == [True, True]
+
+
+def test_a_worker_that_is_killed_is_one_clear_line():
+    with pytest.raises(CarlascError, match="a worker process died: out of memory") as caught:
+        list(run_all(jobs.kill_itself, range(4), workers=2))
+    assert "\n" not in str(caught.value)
+
+
+def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file(tmp_path: Path):
+    slow = [tmp_path / "a.bin", tmp_path / "b.bin"]
+    started = time.monotonic()
+    with (
+        pytest.raises(KeyboardInterrupt),
+        closing(run_all(jobs.write_for_a_minute, [Path("nothing"), *slow], workers=2)) as results,
+    ):
+        next(results)
+        while not all(path.with_suffix(".begun").exists() for path in slow):
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert time.monotonic() - started < 30
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.begun", "b.begun"]
+
+
+def test_a_number_of_workers_below_one_makes_no_sense():
+    with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
+        list(run_all(jobs.square, range(3), workers=0))

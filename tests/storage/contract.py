@@ -1,0 +1,252 @@
+"""What every Source and every Sink must hold: each store's tests subclass these."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.sequences import FRAMES, published_bytes, write_dataset
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage import FolderSource, Sequence, Sink, Source, layout
+
+WHOLE = "Train/Town01_Light/cartesian"
+BARE = "Val/Town07_Heavy/cartesian"
+GRIDS = "Test/Town10_Medium/cylindrical"
+
+
+def read_sum(sequence: Sequence) -> float:
+    """Sum a scan in another process, and start one more from there."""
+    return float(sequence.read("points", FRAMES[-1])[:, :3].sum())
+
+
+class SourceContract:
+    """Reads what `write_dataset` wrote, however the store keeps it."""
+
+    processes = ("fork", "spawn")  # ways to start processes that are worth a test: a spawn takes two seconds
+
+    def build(self, published: Path, folder: Path) -> Source:
+        """Return a source of the same sequences, made in `folder`."""
+        raise NotImplementedError
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def published(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_dataset(tmp_path_factory.mktemp("published") / "data")
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def source(cls, published: Path, tmp_path_factory: pytest.TempPathFactory) -> Source:
+        return cls().build(published, tmp_path_factory.mktemp("store"))
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def expected(cls, published: Path) -> dict[str, Sequence]:
+        return dict(FolderSource(published).sequences())
+
+    def test_finds_the_sequences_sorted_by_their_paths(self, source: Source) -> None:
+        assert list(source.sequences()) == sorted([WHOLE, BARE, GRIDS])
+
+    def test_tells_who_they_are(self, source: Source) -> None:
+        found = {(s.split, s.name, s.coordinates) for s in source.sequences().values()}
+        assert found == {
+            ("Train", "Town01_Light", "cartesian"),
+            ("Val", "Town07_Heavy", "cartesian"),
+            ("Test", "Town10_Medium", "cylindrical"),
+        }
+
+    @pytest.mark.parametrize("path", [WHOLE, BARE, GRIDS])
+    def test_has_the_same_fields_frames_and_bits(
+        self, source: Source, expected: dict[str, Sequence], path: str
+    ) -> None:
+        sequence, reference = source.sequences()[path], expected[path]
+        assert sequence.fields() == reference.fields()
+        for name in reference.fields():
+            frames = reference.frames(name)
+            assert sequence.frames(name).tolist() == frames.tolist()
+            for frame, together in zip(frames.tolist(), sequence.read_many(name, frames.tolist()), strict=True):
+                alone, wanted = sequence.read(name, frame), reference.read(name, frame)
+                assert alone.shape == together.shape == wanted.shape
+                assert published_bytes(name, alone) == published_bytes(name, wanted), (name, frame)
+                assert published_bytes(name, together) == published_bytes(name, wanted), (name, frame)
+
+    @pytest.mark.parametrize("path", [WHOLE, BARE, GRIDS])
+    def test_has_the_same_text_files(self, source: Source, expected: dict[str, Sequence], path: str) -> None:
+        sequence, reference = source.sequences()[path], expected[path]
+        assert set(sequence.documents()) == set(reference.documents())
+        for name in reference.documents():
+            assert sequence.read_document(name) == reference.read_document(name)
+
+    def test_points_are_float32_and_labels_unsigned(self, source: Source) -> None:
+        sequence = source.sequences()[WHOLE]
+        assert sequence.read("points", 5).dtype == np.float32
+        assert sequence.read("flow", 5).dtype == np.float32
+        assert sequence.read("instances", 5).dtype == np.uint32
+        assert sequence.read("labels", 5).dtype.kind == "u"
+        assert sequence.read("evaluation/labels", 5).dtype.kind == "u"
+
+    def test_reads_frames_in_any_order_and_twice(self, source: Source) -> None:
+        sequence = source.sequences()[WHOLE]
+        order = [5, 0, 2, 5, 1]
+        for frame, array in zip(order, sequence.read_many("points", order), strict=True):
+            assert np.array_equal(array, sequence.read("points", frame))
+
+    def test_coordinates_are_those_of_the_points_also_where_memory_is_used_again(self, source: Source) -> None:
+        sequence = source.sequences()[WHOLE]
+        spare: list[NDArray[np.float32]] = []
+        for frames in ([0, 1, 2], [5, 2], [1, 0, 5]):
+            found = sequence.read_xyz(frames, spare)
+            for frame, xyz in zip(frames, found, strict=True):
+                points = sequence.read("points", frame)
+                assert xyz.dtype == np.float32 and xyz.shape[0] == len(points)
+                assert xyz[:, :3].tobytes() == points[:, :3].tobytes()
+            spare = found
+
+    def test_no_frames_read_are_none(self, source: Source) -> None:
+        assert source.sequences()[WHOLE].read_many("points", []) == []
+
+    def test_an_absent_field_has_no_frames_and_is_an_error_to_read(self, source: Source) -> None:
+        sequence = source.sequences()[BARE]
+        assert len(sequence.frames("flow")) == 0
+        with pytest.raises(MissingDataError, match="flow.*labels.*points"):
+            sequence.read("flow", 0)
+
+    def test_an_absent_frame_is_an_error(self, source: Source) -> None:
+        with pytest.raises(MissingDataError):
+            source.sequences()[WHOLE].read("points", 3)
+
+    def test_an_absent_text_file_is_an_error(self, source: Source) -> None:
+        with pytest.raises(MissingDataError):
+            source.sequences()[BARE].read_document("poses.txt")
+
+    def test_pickles_before_and_after_reading(self, source: Source) -> None:
+        sequence = source.sequences()[WHOLE]
+        before = pickle.loads(pickle.dumps(source)).sequences()[WHOLE]
+        wanted = sequence.read("points", 2)
+        after = pickle.loads(pickle.dumps(sequence))
+        assert np.array_equal(before.read("points", 2), wanted)
+        assert np.array_equal(after.read("points", 2), wanted)
+
+    @pytest.mark.parametrize("method", ["fork", "spawn"])
+    def test_reads_in_other_processes_after_reading_in_this_one(self, source: Source, method: str) -> None:
+        if method not in self.processes:
+            pytest.skip("in the memory of this process only, or tried with another store of the kind")
+        sequence = source.sequences()[WHOLE]
+        wanted = read_sum(sequence)
+        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(method)) as pool:
+            assert list(pool.map(read_sum, [sequence] * 4)) == [wanted] * 4
+        assert read_sum(sequence) == wanted
+
+    def test_keeps_no_file_open(self, source: Source) -> None:
+        sequence = source.sequences()[WHOLE]
+        for name in sequence.fields():
+            sequence.read(name, 5)
+        links = [Path(f"/proc/self/fd/{number}") for number in os.listdir("/proc/self/fd")]
+        targets = [str(link.readlink()) for link in links if link.is_symlink()]
+        assert not [target for target in targets if target.startswith(source.location)]
+
+
+class SinkContract:
+    """Takes the sequences of `write_dataset`, however it keeps them."""
+
+    rising = True  # whether frames must come in rising order
+
+    def sink(self, out: Path) -> Sink:
+        """Return a sink that writes `out`."""
+        raise NotImplementedError
+
+    def read(self, out: Path) -> Source:
+        """Return a source of what was written."""
+        raise NotImplementedError
+
+    @pytest.fixture
+    def out(self, tmp_path: Path) -> Path:
+        return tmp_path / "out"
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def given(cls, tmp_path_factory: pytest.TempPathFactory) -> Source:
+        return FolderSource(write_dataset(tmp_path_factory.mktemp("published") / "data", seed=1))
+
+    def write_all(self, given: Source, sink: Sink, order: Callable[[list[str]], list[str]] = sorted) -> None:
+        with sink:
+            for path, sequence in given.sequences().items():
+                with sink.sequence(path) as writer:
+                    for name in sequence.documents():
+                        writer.write_document(name, sequence.read_document(name))
+                    frames = sorted({int(f) for name in sequence.fields() for f in sequence.frames(name)})
+                    for frame in frames:  # all fields of a frame, then the next, as a run over frames does
+                        for name in order([n for n in sequence.fields() if frame in sequence.frames(n)]):
+                            writer.write(name, frame, sequence.read(name, frame))
+                            assert writer.has(name, frame)
+
+    def test_gives_back_what_it_took(self, given: Source, out: Path) -> None:
+        self.write_all(given, self.sink(out))
+        found = self.read(out).sequences()
+        assert list(found) == list(given.sequences())
+        for path, sequence in given.sequences().items():
+            assert found[path].fields() == sequence.fields()
+            assert {n: found[path].read_document(n) for n in found[path].documents()} == {
+                n: sequence.read_document(n) for n in sequence.documents()
+            }
+            for name in sequence.fields():
+                assert found[path].frames(name).tolist() == sequence.frames(name).tolist()
+                for frame in sequence.frames(name).tolist():
+                    got, wanted = found[path].read(name, frame), sequence.read(name, frame)
+                    assert published_bytes(name, got) == published_bytes(name, wanted), (path, name, frame)
+
+    def test_has_only_what_was_written(self, given: Source, out: Path) -> None:
+        writer = self.sink(out).sequence(BARE)
+        assert not writer.has("points", 0)
+        writer.write("points", 0, given.sequences()[BARE].read("points", 0))
+        assert writer.has("points", 0)
+        assert not writer.has("points", 1)
+        assert not writer.has("labels", 0)
+
+    def test_text_files_come_back_before_it_is_closed(self, out: Path) -> None:
+        writer = self.sink(out).sequence(BARE)
+        assert writer.read_document("times.txt") is None
+        writer.write_document("times.txt", b"0\n")
+        assert writer.read_document("times.txt") == b"0\n"
+
+    def test_refuses_an_array_that_does_not_fit(self, out: Path) -> None:
+        writer = self.sink(out).sequence(BARE)
+        with pytest.raises(FormatError, match="N, 4"):
+            writer.write("points", 0, np.zeros((5, 3), np.float32))
+
+    def test_refuses_a_field_that_the_layout_lacks(self, out: Path) -> None:
+        with pytest.raises(FormatError, match="velocity"):
+            self.sink(out).sequence(BARE).write("velocity", 0, np.zeros((5, 3), np.float32))
+
+    def test_empty_arrays_keep_their_shape(self, out: Path) -> None:
+        with self.sink(out) as sink, sink.sequence(BARE) as writer:
+            writer.write("points", 0, np.zeros((0, 4), np.float32))
+            writer.write("flow", 0, np.zeros((0, 3), np.float32))
+            writer.write("labels", 0, np.zeros(0, np.uint32))
+        sequence = self.read(out).sequences()[BARE]
+        assert sequence.read("points", 0).shape == (0, 4)
+        assert sequence.read("flow", 0).shape == (0, 3)
+        assert sequence.read("labels", 0).shape == (0,)
+
+    def test_refuses_frames_out_of_order_or_takes_them(self, given: Source, out: Path) -> None:
+        labels = given.sequences()[BARE].read("labels", 0)
+        with self.sink(out) as sink, sink.sequence(BARE) as writer:
+            writer.write("labels", 5, labels)
+            if self.rising:
+                with pytest.raises(FormatError, match="rising"):
+                    writer.write("labels", 4, labels)
+            else:
+                writer.write("labels", 4, labels)
+        frames = self.read(out).sequences()[BARE].frames("labels").tolist()
+        assert frames == ([5] if self.rising else [4, 5])
+
+    def test_the_layout_names_every_field(self, given: Source) -> None:
+        names = {name for sequence in given.sequences().values() for name in sequence.fields()}
+        assert {n.rpartition("/")[2] for n in names} >= {*layout.SCAN_FIELDS, *layout.GRID_FIELDS}

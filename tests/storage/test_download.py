@@ -1,0 +1,335 @@
+"""`carlasc.download` against a server that behaves, and against one that does not."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import stat
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.http_server import Site, serve
+
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
+from carlasc.storage.downloads import archives, download, extraction
+from carlasc.storage.downloads.transfer import Settings
+
+VAL = "/val_cartesian.zip"
+QUICK = Settings(connections=3, block=20_000, wait_s=0.01)
+MEMBERS = {f"Val/Town07_Light/cartesian/velodyne/{i:06d}.bin": 9_000 + 16 * i for i in range(20)}
+
+
+def make_zip(seed: int, members: dict[str, int] | None = None) -> bytes:
+    """A stored zip of random bytes, about 180 kB."""
+    rng, buffer = np.random.default_rng(seed), io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, size in (members or MEMBERS).items():
+            archive.writestr(name, rng.bytes(size))
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    with serve(Site({VAL: make_zip(0)})) as running:
+        yield running
+
+
+def get(site: Site, folder: Path, **options: object) -> Path:
+    settings = options.pop("settings", QUICK)
+    download(folder, split="val", base_url=site.url, settings=settings, **options)  # type: ignore[arg-type]
+    return folder / VAL[1:]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_zip_comes_byte_for_byte_in_blocks_and_leaves_nothing_beside_it(site: Site, tmp_path: Path) -> None:
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+    assert names(tmp_path) == ["val_cartesian.zip"]
+    assert len(site.requests) > 5
+
+
+def test_progress_ends_at_the_size_and_never_passes_it(site: Site, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    get(site, tmp_path, progress=lambda done, total: seen.append((done, total)))
+    size = len(site.files[VAL])
+    assert seen[-1] == (size, size)
+    assert all(0 <= done <= total == size for done, total in seen)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_a_server_that_drops_every_connection_is_outlasted(site: Site, tmp_path: Path) -> None:
+    site.drop_after = 7_001
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_an_interrupted_download_goes_on_with_what_is_there(site: Site, tmp_path: Path) -> None:
+    def stop_at_a_third(done: int, total: int) -> None:
+        if done > total / 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        get(site, tmp_path, progress=stop_at_a_third)
+    assert names(tmp_path) == ["val_cartesian.zip.part", "val_cartesian.zip.part.json"]
+    before = site.sent
+    result = download(tmp_path, split="val", base_url=site.url, settings=QUICK)
+    size = len(site.files[VAL])
+    assert (tmp_path / VAL[1:]).read_bytes() == site.files[VAL]
+    assert result.archives[0].fetched < size * 0.75
+    assert site.sent - before == result.archives[0].fetched + 2  # the two bytes of the first look
+    assert names(tmp_path) == ["val_cartesian.zip"]
+
+
+def test_a_server_that_dies_leaves_no_file_that_looks_complete_and_the_next_run_finishes(
+    site: Site, tmp_path: Path
+) -> None:
+    content = site.files[VAL]
+
+    def die(number: int) -> None:
+        if number > 4:
+            site.files.clear()
+
+    site.before = die
+    with pytest.raises(MissingDataError, match="404"):
+        get(site, tmp_path)
+    assert names(tmp_path) == ["val_cartesian.zip.part", "val_cartesian.zip.part.json"]
+    site.before, site.files[VAL] = None, content
+    assert get(site, tmp_path).read_bytes() == content
+
+
+def test_a_file_that_changed_between_two_runs_is_not_mixed(site: Site, tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        get(site, tmp_path, progress=stop)
+    site.files[VAL] = make_zip(1)  # another content of the same size
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+@pytest.mark.parametrize("size_too", [False, True])
+def test_a_file_that_changes_in_the_middle_is_begun_again(site: Site, tmp_path: Path, size_too: bool) -> None:
+    changed = make_zip(2, {**MEMBERS, "Val/more": 3_000} if size_too else None)
+
+    def change(number: int) -> None:
+        if number == 5:
+            site.files[VAL] = changed
+
+    site.before = change
+    assert get(site, tmp_path).read_bytes() == changed
+
+
+def test_a_file_that_keeps_changing_is_given_up_with_one_line(site: Site, tmp_path: Path) -> None:
+    def change(number: int) -> None:
+        site.files[VAL] = make_zip(number)
+
+    site.before = change
+    with pytest.raises(FormatError, match="keeps changing"):
+        get(site, tmp_path, settings=Settings(1, 20_000, 0.01))
+    assert "val_cartesian.zip" not in names(tmp_path)
+
+
+def test_a_server_that_knows_no_ranges_is_read_as_a_stream(site: Site, tmp_path: Path) -> None:
+    site.ranges = False
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_a_server_that_promises_ranges_and_ignores_them_is_read_as_a_stream(site: Site, tmp_path: Path) -> None:
+    site.ignore_ranges_after = 3
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_a_stream_that_always_breaks_is_given_up_and_leaves_no_complete_file(site: Site, tmp_path: Path) -> None:
+    site.ranges, site.drop_after = False, 50_000
+    with pytest.raises(CarlascError, match="at 6 tries.*again"):
+        get(site, tmp_path)
+    assert "val_cartesian.zip" not in names(tmp_path)
+
+
+def test_a_stream_without_a_length_that_breaks_is_found_by_looking_into_the_zip(site: Site, tmp_path: Path) -> None:
+    site.ranges = site.lengths = False
+    site.drop_after = 50_000
+    with pytest.raises(FormatError, match="whole zip"):
+        get(site, tmp_path)
+    assert "val_cartesian.zip" not in names(tmp_path)
+
+
+def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path: Path) -> None:
+    site.shift_range = 16
+    with pytest.raises(CarlascError, match="expected bytes"):
+        get(site, tmp_path)
+    assert "val_cartesian.zip" not in names(tmp_path)
+
+
+def test_a_file_without_an_etag_comes_whole_and_is_not_resumed(site: Site, tmp_path: Path) -> None:
+    site.etags = False
+
+    def stop(done: int, total: int) -> None:
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        get(site, tmp_path, progress=stop)
+    site.files[VAL] = make_zip(1)
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_a_damaged_record_of_an_earlier_run_is_no_obstacle(site: Site, tmp_path: Path) -> None:
+    (tmp_path / "val_cartesian.zip.part").write_bytes(b"x" * len(site.files[VAL]))
+    (tmp_path / "val_cartesian.zip.part.json").write_text('{"url": 3, "got": []')
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_a_redirect_is_followed_with_its_range(site: Site, tmp_path: Path) -> None:
+    site.files["/elsewhere"] = site.files.pop(VAL)
+    site.redirect[VAL] = "/elsewhere"
+    assert get(site, tmp_path).read_bytes() == site.files["/elsewhere"]
+    assert all(site.requests)
+
+
+def test_a_page_in_place_of_the_zip_is_refused_at_the_first_look(site: Site, tmp_path: Path) -> None:
+    site.files[VAL], site.content_type = b"<html>gone</html>" * 500, "text/html"
+    with pytest.raises(FormatError, match="expected a zip, found text/html"):
+        get(site, tmp_path)
+    assert names(tmp_path) == []
+
+
+def test_a_missing_file_is_one_line_with_its_address(site: Site, tmp_path: Path) -> None:
+    site.files.clear()
+    with pytest.raises(MissingDataError, match="val_cartesian.zip: expected a file, found status 404"):
+        get(site, tmp_path)
+
+
+def test_a_zip_that_is_there_is_not_fetched_again_and_another_is_not_overwritten(site: Site, tmp_path: Path) -> None:
+    path = get(site, tmp_path)
+    count = len(site.requests)
+    get(site, tmp_path)
+    assert len(site.requests) == count + 1  # only the look at its size
+    path.write_bytes(b"mine")
+    with pytest.raises(ConflictError, match="move it away"):
+        get(site, tmp_path)
+    assert path.read_bytes() == b"mine"
+
+
+def test_too_little_room_is_told_before_anything_is_written(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) + 10))
+    with pytest.raises(CarlascError, match="free space for the zips and what is in them"):
+        get(site, tmp_path, unpack=True)
+    assert names(tmp_path) == []
+    assert get(site, tmp_path).exists()
+
+
+def test_unpacking_gives_the_files_removes_the_zip_and_is_not_done_twice(site: Site, tmp_path: Path) -> None:
+    assert not get(site, tmp_path, unpack=True).exists()
+    with zipfile.ZipFile(io.BytesIO(site.files[VAL])) as archive:
+        for name in MEMBERS:
+            assert (tmp_path / name).read_bytes() == archive.read(name)
+    count = len(site.requests)
+    result = download(tmp_path, split="val", base_url=site.url, unpack=True)
+    assert len(site.requests) == count
+    assert result.archives[0].files == len(MEMBERS)
+
+
+def test_unpacking_can_keep_the_zip(site: Site, tmp_path: Path) -> None:
+    assert get(site, tmp_path, unpack=True, keep=True).exists()
+
+
+def test_grids_are_unpacked_beside_the_sequences_not_over_them(site: Site, tmp_path: Path) -> None:
+    member = "Val/Town07_Light/cartesian/evaluation/000000.bin"
+    site.files["/eval_fine.zip"] = make_zip(3, {member: 64})
+    download(tmp_path, what="fine", base_url=site.url, unpack=True, settings=QUICK)
+    assert (tmp_path / "eval_fine" / member).stat().st_size == 64
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "C:/evil", "a\\..\\evil"])
+def test_a_name_that_leads_out_of_the_folder_is_refused_before_anything_is_unpacked(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "x.zip"
+    path.write_bytes(make_zip(0, {"good": 10, name: 10}))
+    with pytest.raises(FormatError, match="names inside the folder"):
+        extraction.extract(path, tmp_path / "out", lambda _: None)
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "evil").exists()
+
+
+def test_a_link_in_a_zip_is_refused(tmp_path: Path) -> None:
+    path, link = tmp_path / "x.zip", zipfile.ZipInfo("link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+    with pytest.raises(FormatError, match="found the link"):
+        extraction.extract(path, tmp_path / "out", lambda _: None)
+
+
+def test_a_damaged_member_is_named_and_not_left_half_written(tmp_path: Path) -> None:
+    content = bytearray(make_zip(0, {"a": 100, "b": 100}))
+    place = content.index(b"PK", 10) + 80  # inside the second file
+    content[place] ^= 0xFF
+    path = tmp_path / "x.zip"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="damaged.*'b'"):
+        extraction.extract(path, tmp_path / "out", lambda _: None)
+    assert names(tmp_path / "out") == ["a"]
+
+
+def test_unpacking_goes_on_after_an_interruption_and_refuses_foreign_files(tmp_path: Path) -> None:
+    path, out = tmp_path / "x.zip", tmp_path / "out"
+    path.write_bytes(make_zip(0, {"a": 100, "b": 200}))
+    extraction.extract(path, out, lambda _: None)
+    stamp = (out / "a").stat().st_mtime_ns
+    (out / "b").unlink()
+    assert extraction.extract(path, out, lambda _: None) == 2
+    assert (out / "a").stat().st_mtime_ns == stamp
+    assert (out / "b").stat().st_size == 200
+    (out / "b").write_bytes(b"other")
+    with pytest.raises(ConflictError, match="another"):
+        extraction.extract(path, out, lambda _: None)
+
+
+def test_the_table_answers_for_each_split_and_kind() -> None:
+    def chosen(*splits: str, what: str = "sequences") -> list[str]:
+        return [archive.name for archive in archives.choose_archives(splits, what)]
+
+    assert chosen("Train") == ["train_cartesian_13.zip", "train_cartesian_46.zip"]
+    assert chosen("val", "test") == ["val_cartesian.zip", "test_cartesian.zip"]
+    assert len(chosen("all")) == 4
+    assert chosen(what="cylindrical") == ["eval_cylindrical.zip"]
+    assert all(archive.url.startswith("https://") for archive in archives.ARCHIVES)
+
+
+@pytest.mark.parametrize(
+    ("splits", "what", "message"),
+    [
+        (("validation",), "sequences", "expected one of train, val, test, all"),
+        ((), "sequences", "found none"),
+        (("val",), "fine", "leave it out"),
+        ((), "coarse", "what"),
+    ],
+)
+def test_a_senseless_choice_is_an_argument_error(splits: tuple[str, ...], what: str, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        archives.choose_archives(splits, what)
+
+
+def test_the_record_beside_a_part_names_the_file_and_its_blocks(site: Site, tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        get(site, tmp_path, progress=stop)
+    record = json.loads((tmp_path / "val_cartesian.zip.part.json").read_text())
+    assert record["size"] == len(site.files[VAL])
+    assert record["url"] == f"{site.url}{VAL}"
+    part = (tmp_path / "val_cartesian.zip.part").read_bytes()
+    for index, count in record["got"].items():
+        start = int(index) * record["block"]
+        assert part[start : start + count] == site.files[VAL][start : start + count]

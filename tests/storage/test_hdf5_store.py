@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.sequences import scan
+from storage.contract import BARE, WHOLE, SinkContract, SourceContract
+
+import carlasc
+from carlasc.errors import ArgumentError, ConflictError, FormatError
+from carlasc.storage import FolderSource, Sink, Source
+from carlasc.storage.packed.hdf5_store import HDF5Sink
+from carlasc.storage.packed.store import Options
+from carlasc.storage.packing import pack
+
+h5py = pytest.importorskip("h5py")
+ENDING = ".h5"
+
+
+class TestHDF5Source(SourceContract):
+    def build(self, published: Path, folder: Path) -> Source:
+        pack(published, folder / "x.h5")
+        return carlasc.open(folder / "x.h5")
+
+
+class TestHDF5Sink(SinkContract):
+    def sink(self, out: Path) -> Sink:
+        return HDF5Sink(out)
+
+    def read(self, out: Path) -> Source:
+        return carlasc.open(out)
+
+
+def test_h5py_with_hdf5plugin_reads_the_same_numbers(published: Path, store: Path) -> None:
+    pytest.importorskip("hdf5plugin")
+    reference = FolderSource(published).sequences()[WHOLE]
+    with h5py.File(store) as file:
+        points = file[WHOLE]["scans/points"]
+        for frame, (start, end) in zip(points["frames"][:], points["xyz_offsets"][:], strict=True):
+            assert np.array_equal(points["xyz"][:, start:end].T, reference.read("points", int(frame))[:, :3])
+        cells = file[WHOLE]["grids/evaluation/counts"]
+        for position, frame in enumerate(cells["frames"][:]):
+            assert np.array_equal(cells["values"][position], reference.read("evaluation/counts", int(frame)))
+        assert np.array_equal(file[WHOLE]["times"][:], reference.times)
+
+
+def test_every_data_set_says_type_version_dtype_and_unit(store: Path) -> None:
+    found = []
+
+    def look(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            found.append(name)
+            assert {"type", "version", "dtype", "unit"} <= set(item.attrs), name
+            assert item.attrs["dtype"] == item.dtype.name, name
+
+    with h5py.File(store) as file:
+        file.visititems(look)
+    assert len(found) > 30
+
+
+def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
+    values = [np.arange(20), np.array([256, 3]), np.array([2]), np.array([70000, 0])]
+    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(BARE) as writer:
+        for frame, labels in enumerate(values):
+            writer.write("labels", frame, labels.astype(np.uint32))
+    sequence = carlasc.open(tmp_path / "x.h5").sequences()[BARE]
+    for frame, labels in enumerate(values):
+        assert sequence.read("labels", frame).tolist() == labels.tolist()
+
+
+def test_a_scan_larger_than_the_first_takes_several_chunks(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    scans = [scan(rng, count)["points"] for count in (300, 40000, 300)]
+    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(BARE) as writer:
+        for frame, points in enumerate(scans):
+            writer.write("points", frame, points)
+    sequence = carlasc.open(tmp_path / "x.h5").sequences()[BARE]
+    for points, found in zip(scans, sequence.read_many("points", range(3)), strict=True):
+        assert np.array_equal(points, found)
+
+
+def test_a_corrupted_chunk_names_field_and_frame(store: Path) -> None:
+    with h5py.File(store) as file:
+        info = file[WHOLE]["scans/points/xyz"].id.get_chunk_info(2)  # frame 0 is empty, the others take one each
+    data = bytearray(store.read_bytes())
+    data[info.byte_offset + info.size // 2] ^= 1
+    store.write_bytes(data)
+    sequence = carlasc.open(store).sequences()[WHOLE]
+    with pytest.raises(FormatError, match="field points, frame 5.*checksum"):
+        sequence.read("points", 5)
+    assert len(sequence.read("points", 2)) == 777
+
+
+def test_a_truncated_file_is_one_clear_error(store: Path) -> None:
+    store.write_bytes(store.read_bytes()[: store.stat().st_size // 2])
+    with pytest.raises(FormatError, match=r"x\.h5: cannot be read as HDF5.*cut short"):
+        carlasc.open(store)
+
+
+def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
+    with h5py.File(store, "r+") as file:
+        file.attrs["version"] = 7
+    with pytest.raises(FormatError, match="found version 7: upgrade carlasc"):
+        carlasc.open(store)
+
+
+def test_another_hdf5_file_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["data"] = np.arange(3)
+    with pytest.raises(FormatError, match="expected a store packed by carlasc"):
+        carlasc.open(tmp_path / "x.h5")
+
+
+def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
+    sink = HDF5Sink(tmp_path / "x.h5")
+    sink.sequence(BARE).close()
+    assert not (tmp_path / "x.h5").exists()
+    sink._store._file.close()  # type: ignore[attr-defined]
+    with pytest.raises(FormatError):
+        carlasc.open(tmp_path / "x.h5.part")
+    with HDF5Sink(tmp_path / "x.h5"):  # a second run starts anew
+        pass
+    assert not carlasc.open(tmp_path / "x.h5").sequences()
+
+
+def test_pcodec_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r"\.zarr"):
+        HDF5Sink(tmp_path / "x.h5", Options(small=True))
+
+
+def test_another_file_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "x.h5").write_bytes(b"diary")
+    with pytest.raises(ConflictError, match="packed store"):
+        HDF5Sink(tmp_path / "x.h5", overwrite=True)

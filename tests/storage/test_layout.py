@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError
+from carlasc.storage import layout
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(arrays(np.float64, st.tuples(st.integers(0, 5), st.just(3), st.just(4)), elements=finite))
+def test_poses_come_back_bit_for_bit(rows):
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows
+    assert np.array_equal(layout.decode_poses(layout.encode_poses(poses), "poses.txt"), poses)
+
+
+@given(arrays(np.float64, st.integers(0, 20), elements=finite))
+def test_times_come_back_bit_for_bit(times):
+    assert np.array_equal(layout.decode_times(layout.encode_times(times), "times.txt"), times)
+
+
+def test_the_golden_text_files_are_written_as_they_stand(golden_capture):
+    for name, decode, encode in (
+        ("poses.txt", layout.decode_poses, layout.encode_poses),
+        ("times.txt", layout.decode_times, layout.encode_times),
+    ):
+        data = (golden_capture / "cartesian" / name).read_bytes()
+        assert encode(decode(data, name)) == data
+
+
+@pytest.mark.parametrize("field", list(layout.SCAN_FIELDS.values()), ids=lambda field: field.name)
+@given(rows=st.integers(0, 7), seed=st.integers(0, 99))
+def test_scan_fields_come_back(field, rows, seed):
+    shape = (rows,) if field.columns is None else (rows, field.columns)
+    array = np.random.default_rng(seed).integers(0, 255, shape).astype(field.dtype)
+    data = bytes(field.encode(array, "x"))
+    assert len(data) == array.nbytes
+    assert np.array_equal(field.decode(data, "x"), array)
+
+
+def test_votes_come_back():
+    field = layout.field_named("evaluation/votes")
+    for dtype in (layout.VOTES_DTYPE, layout.WIDE_VOTES_DTYPE):
+        votes = np.array([(3, 7, 2), (3, 0, 1), (9, 10, 65535)], dtype)
+        back = field.decode(bytes(field.encode(votes, "x")), "x")
+        assert back.dtype == dtype
+        assert (back == votes).all()
+    with pytest.raises(FormatError, match=r"v.npz: expected an .npz"):
+        field.decode(b"PK nonsense", "v.npz")
+
+
+def test_file_names_are_those_of_the_format():
+    assert layout.field_named("points").file(7) == "velodyne/000007.bin"
+    assert layout.field_named("flow").file(7) == "predictions/000007.bin"
+    assert layout.field_named("evaluation_64x64x8/counts").file(12) == "evaluation_64x64x8/000012.bin"
+    assert layout.field_named("evaluation/votes").file(1234567) == "evaluation/1234567.votes.npz"
+    assert layout.grid_folder(GridSpec.published()) == "evaluation"
+    assert layout.grid_folder(GridSpec.published("cylindrical")) == "evaluation"
+    assert layout.grid_folder(GridSpec.published("cartesian_fine")) == "evaluation_256x256x16"
+    # the published number of cells, but -2..1.2 m high: not the published grid
+    assert layout.grid_folder(GridSpec.published().with_resolution(0.4)) == "evaluation_128x128x8"
+    assert layout.frame_of("000012.label", ".label") == 12
+    assert [
+        layout.frame_of(name, ".label") for name in ("12.label", "000012.bin", "x00012.label", ".000012.label.part")
+    ] == [None] * 4
+    with pytest.raises(FormatError, match="'colour': expected one of points"):
+        layout.field_named("colour")
+
+
+def test_a_file_cut_short_is_refused_with_both_sizes():
+    with pytest.raises(FormatError, match=r"a.bin: expected a multiple of 16 bytes \(4 float32 a row\), found 17"):
+        layout.field_named("points").decode(bytes(17), "a.bin")
+    with pytest.raises(FormatError, match=r"expected 96 bytes \(2 x 3 x 4 uint32\), found 92"):
+        layout.field_named("evaluation/labels").decode(bytes(92), "a.label", (2, 3, 4))
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    with pytest.raises(FormatError, match=r"expected shape \(N, 4\), found \(2, 3\)"):
+        layout.field_named("points").encode(np.zeros((2, 3), np.float32), "a.bin")
+    with pytest.raises(FormatError, match="expected unsigned integers, found int64"):
+        layout.field_named("labels").encode(np.zeros(2, np.int64), "a.label")
+    with pytest.raises(FormatError, match="expected at most uint32"):
+        layout.field_named("labels").encode(np.zeros(2, np.uint64), "a.label")
+
+
+def test_broken_lines_are_named():
+    with pytest.raises(FormatError, match="poses.txt: expected 12 numbers a line, found 11 in line 2"):
+        layout.decode_poses(b"1 " * 12 + b"\n" + b"1 " * 11, "poses.txt")
+    with pytest.raises(FormatError, match="times.txt: expected 1 numbers a line"):
+        layout.decode_times(b"zero\n", "times.txt")

@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.sequences import FRAMES
+from storage.contract import BARE, WHOLE, SinkContract, SourceContract
+
+import carlasc
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.storage import FolderSource, Sink, Source
+from carlasc.storage.packed.store import Options
+from carlasc.storage.packed.tablewriter import ParquetSink
+from carlasc.storage.packing import pack
+
+parquet = pytest.importorskip("pyarrow.parquet")
+ENDING = ".parquet"
+
+
+class TestParquetSource(SourceContract):
+    def build(self, published: Path, folder: Path) -> Source:
+        pack(published, folder / "x.parquet")
+        return carlasc.open(folder / "x.parquet")
+
+
+class TestParquetSink(SinkContract):
+    def sink(self, out: Path) -> Sink:
+        return ParquetSink(out)
+
+    def read(self, out: Path) -> Source:
+        return carlasc.open(out)
+
+
+def test_frames_are_rows_with_pose_time_and_statistics(published: Path, packed: Path) -> None:
+    reference = FolderSource(published).sequences()[WHOLE]
+    rows = parquet.read_table(packed / WHOLE / "frames.parquet").to_pylist()
+    assert [row["frame"] for row in rows] == list(FRAMES)
+    for row in rows:
+        frame = row["frame"]
+        points, flow = reference.read("points", frame), reference.read("flow", frame)
+        assert row["time_s"] == reference.read_time(frame)
+        assert np.array_equal(np.reshape(row["pose"], (3, 4)), reference.read_pose(frame)[:3])
+        assert row["points"] == len(points)
+        assert row["moving_points"] == (flow != 0).any(axis=1).sum()
+        if len(points):
+            assert row["farthest_m"] == pytest.approx(np.linalg.norm(points[:, :3], axis=1).max(), rel=1e-6)
+        if frame in reference.frames("evaluation/labels"):
+            assert row["evaluation_known_voxels"] == (reference.read("evaluation/counts", frame) > 0).sum()
+            assert row["evaluation_occupied_voxels"] == (reference.read("evaluation/labels", frame) > 0).sum()
+        else:
+            assert row["evaluation_known_voxels"] is None
+
+
+def test_any_parquet_reader_gets_points_as_columns(published: Path, packed: Path) -> None:
+    reference = FolderSource(published).sequences()[WHOLE]
+    table = parquet.read_table(packed / WHOLE / "points.parquet", filters=[("frame", "=", 5)])
+    assert table.column_names == ["frame", "x", "y", "z", "fourth"]
+    assert np.array_equal(
+        np.stack([table[axis].to_numpy() for axis in "xyz"], axis=1), reference.read("points", 5)[:, :3]
+    )
+
+
+def test_negative_zeros_and_nan_payloads_survive(tmp_path: Path) -> None:
+    flow = np.zeros((40, 3), np.float32)
+    flow[::2] = -0.0
+    flow.view(np.uint32)[3] = 0x7FC00123
+    flow.view(np.uint32)[5] = 0x7FC00456
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+        writer.write("flow", 0, flow)
+    found = carlasc.open(tmp_path / "x.parquet").sequences()[BARE].read("flow", 0)
+    assert np.array_equal(found.view(np.uint32), flow.view(np.uint32))
+
+
+def test_a_corrupted_page_names_field_and_frame(store: Path) -> None:
+    file = store / WHOLE / "points.parquet"
+    column = parquet.ParquetFile(file).metadata.row_group(2).column(2)  # the third scan that is not empty: frame 5
+    data = bytearray(file.read_bytes())
+    data[column.data_page_offset + column.total_compressed_size // 2] ^= 1
+    file.write_bytes(data)
+    sequence = carlasc.open(store).sequences()[WHOLE]
+    with pytest.raises(FormatError, match="field points, frame 5"):
+        sequence.read("points", 5)
+    assert len(sequence.read("points", 2)) == 777
+
+
+def test_a_truncated_table_is_one_clear_error(store: Path) -> None:
+    file = store / WHOLE / "points.parquet"
+    file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(FormatError, match=r"points\.parquet: cannot be read as Parquet"):
+        carlasc.open(store).sequences()[WHOLE].read("points", 5)
+
+
+def test_a_missing_table_is_damage(store: Path) -> None:
+    (store / WHOLE / "points.parquet").unlink()
+    with pytest.raises(FormatError, match="damaged store"):
+        carlasc.open(store).sequences()[WHOLE].read("points", 5)
+
+
+def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
+    mark = store / "carlasc-tables.json"
+    mark.write_text(json.dumps(json.loads(mark.read_bytes()) | {"version": 3}))
+    with pytest.raises(FormatError, match="found version 3: upgrade carlasc"):
+        carlasc.open(store)
+
+
+def test_one_table_alone_says_to_give_the_folder(packed: Path) -> None:
+    with pytest.raises(FormatError, match="give the folder"):
+        carlasc.open(packed / WHOLE / "points.parquet")
+
+
+def test_a_second_run_keeps_finished_sequences(tmp_path: Path) -> None:
+    with ParquetSink(tmp_path / "x.parquet").sequence(BARE) as writer:
+        writer.write("labels", 0, np.arange(3, dtype=np.uint32))
+    ParquetSink(tmp_path / "x.parquet").sequence(WHOLE).write_document("times.txt", b"0\n")
+    assert not (tmp_path / "x.parquet").exists()
+    sink = ParquetSink(tmp_path / "x.parquet")
+    assert sink.finished(BARE)
+    assert not sink.finished(WHOLE)
+    assert not ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)).finished(BARE)
+
+
+def test_pcodec_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r"\.zarr"):
+        ParquetSink(tmp_path / "x.parquet", Options(small=True))

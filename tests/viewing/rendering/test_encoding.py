@@ -1,0 +1,107 @@
+import os
+
+import numpy as np
+import pytest
+from helpers.films import count_gif, read_mp4
+from PIL import Image
+
+from carlasc.errors import ArgumentError, CarlascError, StorageError
+from carlasc.viewing.rendering.encoding import check_ending, encodable_size, is_film, write_pictures
+
+
+def flat_pictures(count, size=(64, 48)):
+    """Pictures of one grey each, brighter and brighter."""
+    for i in range(count):
+        yield np.full((size[1], size[0], 3), 20 + 10 * i, np.uint8)
+
+
+def test_a_png_holds_the_picture_exactly(tmp_path):
+    picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    write_pictures(tmp_path / "a.png", [picture], 10)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), picture)
+
+
+def test_an_mp4_has_every_picture_in_order_at_its_rate(tmp_path):
+    write_pictures(tmp_path / "a.mp4", flat_pictures(17), 12.5)
+    meta, frames = read_mp4(tmp_path / "a.mp4")
+    assert len(frames) == 17
+    assert (meta["size"], meta["fps"]) == ((64, 48), 12.5)
+    assert (meta["codec"], meta["pix_fmt"].split("(")[0]) == ("h264", "yuv420p")
+    np.testing.assert_allclose([frame.mean() for frame in frames], 20 + 10 * np.arange(17), atol=3)
+
+
+def test_a_gif_has_every_picture_at_its_rate_and_runs_on(tmp_path):
+    write_pictures(tmp_path / "a.gif", flat_pictures(7), 10)
+    assert count_gif(tmp_path / "a.gif") == 7
+    film = Image.open(tmp_path / "a.gif")
+    assert (film.info["duration"], film.info["loop"]) == (100, 0)
+    for i in range(7):
+        film.seek(i)
+        assert abs(int(np.asarray(film.convert("RGB")).mean()) - (20 + 10 * i)) <= 1
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, CarlascError])
+def test_what_stops_the_pictures_leaves_nothing_half_written(tmp_path, name, error):
+    before = os.listdir("/tmp")
+
+    def broken():
+        if name != "a.png":
+            yield from flat_pictures(3)
+        raise error("stop")
+
+    with pytest.raises(error):
+        write_pictures(tmp_path / name, broken(), 10)
+    assert os.listdir(tmp_path) == []
+    assert not {left for left in set(os.listdir("/tmp")) - set(before) if left.startswith("carlasc-")}
+
+
+def test_a_film_that_is_there_is_whole_until_the_next_is(tmp_path):
+    target = tmp_path / "a.mp4"
+    write_pictures(target, flat_pictures(3), 10)
+    old = target.read_bytes()
+
+    def broken():
+        yield from flat_pictures(2)
+        assert target.read_bytes() == old
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_pictures(target, broken(), 10)
+    assert target.read_bytes() == old
+
+
+def test_the_encoders_own_words_are_told_when_it_fails(tmp_path):
+    def odd():  # yuv420p has no odd sizes: the encoder refuses
+        yield from flat_pictures(2, (63, 47))
+
+    with pytest.raises(CarlascError, match=r"exit code .*divisible by 2|exit code"):
+        write_pictures(tmp_path / "a.mp4", odd(), 10)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_made_is_named_before_anything_is_drawn(tmp_path):
+    (tmp_path / "file").write_text("x")
+
+    def never():
+        raise AssertionError("drawn for nothing")
+        yield
+
+    with pytest.raises(StorageError, match="file"):
+        write_pictures(tmp_path / "file" / "a.mp4", never(), 10)
+
+
+def test_endings_tell_the_format(tmp_path):
+    assert not is_film(tmp_path / "a.PNG")
+    assert is_film(tmp_path / "a.Mp4")
+    assert encodable_size(tmp_path / "a.mp4", (321, 200)) == (322, 200)
+    assert encodable_size(tmp_path / "a.gif", (321, 201)) == (321, 201)
+    for name in ("a.jpg", "a", "a.tiff"):
+        with pytest.raises(ArgumentError, match="ends in .png, .gif, .mp4"):
+            check_ending(tmp_path / name)
+
+
+@pytest.mark.parametrize("fps", [0, -1, 1000, float("nan")])
+def test_a_senseless_rate_is_refused(tmp_path, fps):
+    with pytest.raises(ArgumentError, match="fps"):
+        write_pictures(tmp_path / "a.gif", flat_pictures(2), fps)
