@@ -14,7 +14,7 @@ from helpers.sequences import files_of, grid, params, write_dataset
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from sources.test_zipped import write_zip
+from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
 from storage.contract import WHOLE, SourceContract
-from sources.test_zipped import write_zip
+from storage.test_zipped import write_zip
 
 import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
