@@ -60,7 +60,7 @@ def _row(sequence: SequenceOverview) -> list[str]:
         str(sequence.gaps or ""),
         ", ".join(fields) or "none",
         ", ".join(grid.name for grid in sequence.grids) or "none",
-        sequence.frame,
+        sequence.axes,
         sequence.classes,
         _size(sequence.bytes).removeprefix(", "),
     ]

@@ -33,7 +33,8 @@ from carlasc.running.processes import count_workers, run_all
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folders.folder import FolderSink
-from carlasc.storage.protocol import Metadata, SequenceWriter, Sink
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import SequenceWriter, Sink
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.from_scans.windows import Merging
@@ -126,7 +127,12 @@ def convert(
     grid = layout.grid_folder(converter.voxels) if grids == "voxels" and converter.voxels is not None else None
     target = Target(converter.classes, remap, frame == "carlasc", allow_unknown, grid)
     metadata = Metadata(
-        frame, target.classes, converter.sensor, converter.min_range_m, converter.max_range_m, f"{name} {source.name}"
+        "left" if frame == "carlasc" else "right",
+        target.classes,
+        converter.sensor,
+        converter.min_range_m,
+        converter.max_range_m,
+        f"{name} {source.name}",
     )
 
     plans = [_plan(recording, converter, sink, poses, flow, force=force) for recording in recordings]

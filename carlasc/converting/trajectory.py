@@ -13,7 +13,8 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.structure import static_structure
 from carlasc.storage import layout
-from carlasc.storage.protocol import Metadata, Sequence
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import Sequence
 
 PoseSource = Literal["file", "kiss-icp", "auto"]
 FILE, KISS_ICP = "file", "kiss-icp"
@@ -113,7 +114,7 @@ class _Scans(Sequence):
     def __init__(self, recording: Recording, converter: type[Converter]) -> None:
         self.recording, self.path, self.location = recording, "", recording.location
         self.split, self.name, self.coordinates = recording.split, recording.name, "cartesian"
-        self.metadata = Metadata("kitti", converter.classes)
+        self.metadata = Metadata("right", converter.classes)
         self._handles = {handle.number: handle for handle in recording.frames}
 
     def fields(self) -> frozenset[str]:

@@ -25,7 +25,9 @@ from carlasc.core.tables import (
     TRAIN_VOXEL_COUNTS,
     remap_named,
     remaps_between,
+    table_from_json,
     table_named,
+    table_to_json,
     to_table,
 )
 
@@ -56,7 +58,9 @@ __all__ = [
     "remaps_between",
     "rotate_vectors",
     "rotation_z",
+    "table_from_json",
     "table_named",
+    "table_to_json",
     "to_table",
     "transform_points",
     "translation",

@@ -1,13 +1,14 @@
-"""Classes as data: tables of ids, names and colours, and the remaps between them.
+"""Class tables: the ids, names, colours and roles of classes, and the remaps from one table to another.
 
-Facts: FORMAT section 2 (CarlaSC, CARLA's renumbering) and section 6 (SemanticKITTI, SemanticPOSS).
+Facts: see the format page, `docs/format.md#classes` (CarlaSC, CARLA's renumbering) and `docs/format.md#semantickitti`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,36 +16,112 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError, FormatError
 
 Color = tuple[int, int, int]
+ROLES = ("moving", "movable", "deformable", "ground")
+"""The roles that several classes of a table may have: names of attributes of `ClassTable`."""
+_MAX_ID = 65535  # ids are kept in 16 bits in memory
 
 
 @dataclass(frozen=True)
 class ClassTable:
-    """A set of classes: what each id is called and how it is drawn.
+    """A set of classes: the name, the colour and the roles of each id.
+
+    On points, id 0 is unlabelled; in voxels it is free. It has no role.
 
     Attributes:
-        name: what carlasc.json calls the table.
+        name: name of the table, as carlasc.json gives it.
         names: id -> name.
         colors: id -> RGB 0..255.
         moving: ids whose label itself says that the thing moves.
         movable: ids of things that may move, whether they do or not.
         deformable: ids of things that change their shape as they move: people.
+        ground: ids of the surfaces that things stand on: roads, pavements, grass, water.
+        geometry_only: id that points count as where a scan has no labels; None takes the largest id.
         num_channels: number of vote channels: ids are below it. More than the ids need where the format says so.
+
+    Raises:
+        ArgumentError: an id without a name or a colour, or values of another type or range.
     """
 
     name: str
     names: Mapping[int, str]
     colors: Mapping[int, Color]
-    moving: frozenset[int] = field(default=frozenset())
-    movable: frozenset[int] = field(default=frozenset())
-    deformable: frozenset[int] = field(default=frozenset())
+    moving: frozenset[int] = frozenset()
+    movable: frozenset[int] = frozenset()
+    deformable: frozenset[int] = frozenset()
+    ground: frozenset[int] = frozenset()
+    geometry_only: int | None = None
     num_channels: int = 0
 
     def __post_init__(self) -> None:
+        where = f"class table {self.name}"
+        if not self.names or min(self.names) < 0 or max(self.names) > _MAX_ID:
+            raise ArgumentError(where, expected=f"names of ids 0..{_MAX_ID}", found=str(sorted(self.names)))
         if set(self.names) != set(self.colors):
-            raise ArgumentError(f"class table {self.name}: names and colours are of different ids")
+            without = sorted(set(self.names) ^ set(self.colors))
+            raise ArgumentError(
+                where, expected="a name and a colour for each id", found=f"one of the two for {_listed(without)}"
+            )
+        for index, color in self.colors.items():
+            if len(color) != 3 or not all(0 <= value <= 255 for value in color):
+                raise ArgumentError(where, expected="three values 0..255 for each colour", found=f"{color} for {index}")
+        for role in ROLES:
+            if unknown := sorted(getattr(self, role) - set(self.names)):
+                raise ArgumentError(where, expected=f"ids of the table in {role}", found=_listed(unknown))
+        if self.geometry_only is not None and self.geometry_only not in self.names:
+            raise ArgumentError(where, expected="an id of the table in geometry_only", found=str(self.geometry_only))
+        if self.num_channels and self.num_channels <= max(self.names):
+            raise ArgumentError(where, expected=f"num_channels above {max(self.names)}", found=str(self.num_channels))
         object.__setattr__(self, "names", dict(self.names))
         object.__setattr__(self, "colors", dict(self.colors))
         object.__setattr__(self, "num_channels", self.num_channels or max(self.names) + 1)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], where: str) -> Self:
+        """Read a table as `to_dict` writes it; `where` is the file named in errors.
+
+        Raises:
+            FormatError: a key is missing, unknown or of another type, or the values make no table.
+        """
+        known = [entry.name for entry in fields(cls)]
+        if unknown := sorted(set(values) - set(known)):
+            raise FormatError(
+                f"{where}: classes", expected=f"the keys {', '.join(known)}", found=", ".join(map(str, unknown))
+            )
+        try:
+            return cls(
+                str(values["name"]),
+                {int(index): str(name) for index, name in values["names"].items()},
+                {int(index): _color(color) for index, color in values["colors"].items()},
+                **{role: frozenset(map(int, values.get(role, ()))) for role in ROLES},
+                geometry_only=None if values.get("geometry_only") is None else int(values["geometry_only"]),
+                num_channels=int(values.get("num_channels", 0)),
+            )
+        except KeyError as error:
+            raise FormatError(
+                f"{where}: classes", expected=f"the key {error}", found=", ".join(map(str, values)) or "none"
+            ) from error
+        except ArgumentError as error:
+            raise FormatError(f"{where}: {error.where}", expected=error.expected, found=error.found) from error
+        except (TypeError, ValueError, AttributeError) as error:
+            raise FormatError(
+                f"{where}: classes", expected="names and colours by id, and ids in the roles", found=str(error)
+            ) from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the table as plain values for JSON; roles that no class has are left out."""
+        values: dict[str, Any] = {
+            "name": self.name,
+            "names": {str(index): name for index, name in self.names.items()},
+            "colors": {str(index): list(color) for index, color in self.colors.items()},
+        }
+        values |= {role: sorted(getattr(self, role)) for role in ROLES if getattr(self, role)}
+        values |= {} if self.geometry_only is None else {"geometry_only": self.geometry_only}
+        return values | {"num_channels": self.num_channels}
+
+    @property
+    def geometry_id(self) -> int:
+        """The id that points count as where a scan has no labels."""
+        return max(self.names) if self.geometry_only is None else self.geometry_only
 
     @property
     def dtype(self) -> np.dtype[np.unsignedinteger]:
@@ -68,7 +145,11 @@ class ClassTable:
         for index, candidate in self.names.items():
             if candidate.lower() == name.lower():
                 return index
-        raise ArgumentError(f"class {name!r}: expected one of {', '.join(self.names.values())} (table {self.name})")
+        raise ArgumentError(
+            f"class {name!r}",
+            expected=f"one of {', '.join(self.names.values())} (table {self.name})",
+            found="none of them",
+        )
 
     def check(self, labels: NDArray[np.integer], where: str) -> None:
         """Raise FormatError naming the largest id that is not below `num_channels`; `where` is the file."""
@@ -103,7 +184,9 @@ class Remap:
         for old, new in self.mapping.items():
             if old < 0 or new not in self.target.names:
                 raise ArgumentError(
-                    f"remap {self.name}: {old} -> {new} leaves the ids of {self.source.name} or {self.target.name}"
+                    f"remap {self.name}",
+                    expected=f"ids of {self.source.name} to ids of {self.target.name}",
+                    found=f"{old} -> {new}",
                 )
 
     @cached_property
@@ -119,7 +202,7 @@ class Remap:
         return np.where(self.table < 0, 0, self.table).astype(self.target.dtype)
 
     def unknown(self, labels: NDArray[np.integer]) -> dict[int, int]:
-        """Return the ids that the mapping does not know, each with how often it stands."""
+        """Return the ids that the mapping does not know, each with its number of occurrences."""
         ids, counts = np.unique(labels, return_counts=True)
         return {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping}
 
@@ -131,7 +214,7 @@ class Remap:
             where: what to call the labels in an error: the file.
 
         Raises:
-            FormatError: an id has no target; names the id and how often it stands.
+            FormatError: an id has no target; names the ids and the number of their occurrences.
         """
         labels = np.asarray(labels)
         outside = bool(labels.size) and (int(labels.max()) >= len(self.table) or int(labels.min()) < 0)
@@ -141,8 +224,8 @@ class Remap:
         raise FormatError(
             where,
             expected=f"class ids of {self.source.name}",
-            found=f"{found}",
-            advice=f"no target in the remap {self.name}",
+            found=found,
+            advice=f"the remap {self.name} has no target for them",
         )
 
     @cached_property
@@ -151,10 +234,10 @@ class Remap:
 
 
 def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None) -> NDArray[np.float64]:
-    """Return the loss weight of each class: `1 / ln(count + 0.001)` (FORMAT section 2).
+    """Return the loss weight of each class: `1 / ln(count + 0.001)`.
 
-    Counts of 1,000 and fewer take the largest weight of the others: there the formula means nothing (it is negative
-    below 1). Absent classes take 0.
+    The formula holds for counts above 1,000 and is negative below 1. Classes with fewer voxels take the largest of the other
+    weights, absent classes take 0. See the format page, `docs/format.md#classes`.
 
     Args:
         voxel_counts: voxels of each class, by id of the remap's source table.
@@ -173,3 +256,12 @@ def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None)
     weights[common] = 1.0 / np.log(counts[common] + 0.001)
     weights[(counts > 0) & ~common] = weights.max(initial=0.0) or 1.0
     return weights
+
+
+def _color(values: Any) -> Color:
+    red, green, blue = (int(value) for value in values)
+    return red, green, blue
+
+
+def _listed(ids: list[int]) -> str:
+    return ", ".join(map(str, ids[:8])) + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

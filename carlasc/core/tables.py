@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.errors import ArgumentError, FormatError
 
-_CARLA: tuple[tuple[str, Color, int], ...] = (  # name, colour, 11-class id; ids in order (FORMAT section 2)
+_CARLA: tuple[tuple[str, Color, int], ...] = (  # name, colour, 11-class id; ids in order: docs/format.md#classes
     ("Free", (255, 255, 255), 0),
     ("Building", (70, 70, 70), 1),
     ("Fence", (100, 40, 40), 2),
@@ -42,6 +43,8 @@ CARLA = ClassTable(
     {i: color for i, (_, color, _) in enumerate(_CARLA)},
     movable=frozenset({4, 10}),
     deformable=frozenset({4}),
+    ground=frozenset({6, 7, 8, 14, 15, 16, 21, 22}),
+    geometry_only=3,  # Other
     num_channels=25,  # as every published params.json says, although 23 classes exist
 )
 CARLASC11 = ClassTable(
@@ -55,6 +58,8 @@ CARLASC11 = ClassTable(
     ),
     movable=frozenset({4, 10}),
     deformable=frozenset({4}),
+    ground=frozenset({6, 7, 8}),
+    geometry_only=3,  # Other
 )
 
 _KITTI: tuple[tuple[int, str, Color, int], ...] = (  # raw id, name, colour, class of the benchmark (0: ignored)
@@ -100,6 +105,8 @@ SEMANTICKITTI = ClassTable(
     moving=frozenset(range(252, 260)),
     movable=frozenset({10, 11, 13, 15, 16, 18, 20, 30, 31, 32, *range(252, 260)}),
     deformable=frozenset({30, 254}),
+    ground=frozenset({40, 44, 48, 49, 60, 72}),
+    geometry_only=99,  # other-object
 )
 _KITTI19 = {0: "unlabeled"} | {k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)}
 SEMANTICKITTI19 = ClassTable(
@@ -108,6 +115,7 @@ SEMANTICKITTI19 = ClassTable(
     {0: (255, 255, 255)} | {k: color for i, _, color, k in _KITTI if k and i < 252 and i not in (13, 16, 60)},
     movable=frozenset(range(1, 9)),
     deformable=frozenset({6}),
+    ground=frozenset({9, 10, 11, 12, 17}),
 )
 
 
@@ -151,6 +159,7 @@ SEMANTICPOSS = ClassTable(
     {i: _CARLA[_POSS_TO_CARLA[i]][1] for i in sorted(_POSS_TO_CARLA)},
     movable=frozenset({4, 5, 6, 7, 21}),
     deformable=frozenset({4, 5}),
+    ground=frozenset({22}),
 )
 
 
@@ -205,18 +214,50 @@ TRAIN_VOXEL_COUNTS = np.array(
     ],
     np.int64,
 )  # fmt: skip
-"""(23,) voxels of each CARLA class in the training split, coarse Cartesian (FORMAT section 2)."""
+"""(23,) voxels of each CARLA class in the training split, coarse Cartesian grid."""
 
 
 def table_named(name: str) -> ClassTable:
-    """Return a class table by its name in carlasc.json.
+    """Return one of the class tables in `TABLES` by its name.
 
     Raises:
         FormatError: no table has that name.
     """
     if name not in TABLES:
-        raise FormatError(f"class table {name!r}: expected one of {', '.join(TABLES)}")
+        raise FormatError("classes", expected=f"one of {', '.join(TABLES)}", found=repr(name))
     return TABLES[name]
+
+
+def table_from_json(value: object, where: str) -> ClassTable:
+    """Return the class table that a JSON file names, or holds whole.
+
+    Args:
+        value: the name of a table in `TABLES`, or what `ClassTable.to_dict` returns.
+        where: the file, for errors.
+
+    Raises:
+        FormatError: no table has that name, the values make no table, or they differ from those of the table in `TABLES` of that name.
+    """
+    if not isinstance(value, Mapping):
+        try:
+            return table_named(str(value))
+        except FormatError as error:
+            raise error.within(where) from error
+    table = ClassTable.from_dict(value, where)
+    known = TABLES.get(table.name)
+    if known is not None and known != table:
+        raise FormatError(
+            f"{where}: classes",
+            expected=f"a name that is not in use, or the table {table.name} of carlasc",
+            found=f"another table called {table.name}",
+            advice="give the table a name of its own",
+        )
+    return table if known is None else known
+
+
+def table_to_json(table: ClassTable) -> str | dict[str, Any]:
+    """Return what a JSON file holds for a class table: the name of one in `TABLES`, any other table whole."""
+    return table.name if TABLES.get(table.name) == table else table.to_dict()
 
 
 def remap_named(name: str) -> Remap:
@@ -226,15 +267,15 @@ def remap_named(name: str) -> Remap:
         ArgumentError: no remap has that name.
     """
     if name not in REMAPS:
-        raise ArgumentError(f"remap {name!r}: expected one of {', '.join(REMAPS)}")
+        raise ArgumentError("remap", expected=f"one of {', '.join(REMAPS)}", found=repr(name))
     return REMAPS[name]
 
 
 def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
-    """Return the remaps that lead from one table to another: none, one, or two by way of CARLA's.
+    """Return the remaps that lead from one table to another: none, one, or two with CARLA's table between them.
 
     Raises:
-        ArgumentError: none do.
+        ArgumentError: no remaps lead there.
     """
 
     def direct(one: ClassTable, other: ClassTable) -> Remap | None:
@@ -247,7 +288,9 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
     first, second = direct(source, CARLA), direct(CARLA, target)
     if first is None or second is None:
         ways = sorted({r.target.name for r in REMAPS.values() if r.source == source} | {source.name})
-        raise ArgumentError(f"classes {target.name}: expected one of {', '.join(ways)} for labels of {source.name}")
+        raise ArgumentError(
+            "classes", expected=f"one of {', '.join(ways)} for labels of {source.name}", found=target.name
+        )
     return first, second
 
 

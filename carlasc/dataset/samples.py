@@ -62,12 +62,12 @@ class Dataset(_MapStyle):
 
     The history stops at the start of a sequence and at a gap in its frame numbers: what would lie before is left empty
     and is not `valid`. Frames without a field that was asked for are left out. Points nearer than `min_range_m` or farther
-    than `max_range_m` of carlasc.json go into no grid. Arrays come in the sequences' own frame: right-handed ("kitti") data
+    than `max_range_m` of carlasc.json go into no grid. Arrays come in the sequences' own frame: right-handed data
     are neither mirrored nor mixed with left-handed ones.
 
     Attributes:
         sequences: the sequences in use, in order; a sample's `sequence` is the name of its.
-        frame: "carlasc" (y right) or "kitti" (y left).
+        axes: "left" (y to the right) or "right" (y to the left).
         classes: table of the label ids that samples hold, after the remap.
         transform: called with each sample, returns it changed; may be set later (see `carlasc.Flip`).
     """
@@ -131,7 +131,7 @@ class Dataset(_MapStyle):
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
-        self.frame = _the_one({scans.location: scans.metadata.frame for scans in self.sequences}, "frame")
+        self.axes = _the_one({scans.location: scans.metadata.axes for scans in self.sequences}, "axes")
         self._spec = grid if isinstance(grid, GridSpec) else self._spec_of_grids()
         self._labels = self._labelling(remap)
         self.classes = self._labels.target

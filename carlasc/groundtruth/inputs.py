@@ -24,7 +24,7 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes, count_votes
 from carlasc.groundtruth.voting.observations import Observation
 from carlasc.storage import layout
-from carlasc.storage.protocol import Metadata
+from carlasc.storage.metadata import Metadata
 
 FrameRange = tuple[int | None, int | None]
 """Half-open range of frame numbers; None leaves an end open."""

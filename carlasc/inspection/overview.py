@@ -15,7 +15,8 @@ from carlasc.captures.raw import Capture, find_captures
 from carlasc.errors import CarlascError, MissingDataError
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
-from carlasc.storage.protocol import Metadata, Sequence, Source
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import Sequence, Source
 
 _SIZED = 3  # files of a field whose sizes stand for those of all
 
@@ -63,7 +64,7 @@ class SequenceOverview:
         fields: number of frames by field; grids apart.
         documents: text files.
         grids: its grids.
-        frame: "carlasc" (y right) or "kitti" (y left).
+        axes: "left" (y to the right) or "right" (y to the left).
         classes: class table of its labels.
         sensor: what took the scans, where known.
         source: what the sequence was made from, where known.
@@ -82,7 +83,7 @@ class SequenceOverview:
     fields: Mapping[str, int]
     documents: tuple[str, ...]
     grids: tuple[GridOverview, ...]
-    frame: str
+    axes: str
     classes: str
     sensor: str | None
     source: str | None
@@ -211,7 +212,7 @@ def _look_at(sequence: Sequence) -> SequenceOverview:
         {name: count for name, count in fields.items() if "/" not in name},
         tuple(name for name in sequence.documents() if "/" not in name),
         grids,
-        metadata.frame,
+        metadata.axes,
         metadata.classes.name,
         metadata.sensor,
         metadata.source,

@@ -19,11 +19,6 @@ _COLUMN_M = 0.4
 _UPRIGHT_M = 0.6  # a column of points that spans less is ground
 _FOOT_M = 0.3  # the lowest part of an upright column, where it stands in the ground
 
-_GROUND = frozenset(
-    "free unlabeled outlier sky road roadline sidewalk ground terrain water bridge parking other-ground lane-marking railtrack".split()
-)
-_MOVERS = frozenset("pedestrian vehicle dynamic person people rider bicyclist motorcyclist".split())
-
 
 def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     """Read the structure of a scan.
@@ -67,9 +62,9 @@ def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArra
 
 
 def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
+    """Which ids are things that stand still and upright; where no label says that a thing moves, no movable class counts."""
     static = np.zeros(np.iinfo(np.uint16).max + 1, np.bool_)
-    for index, name in table.names.items():
-        static[index] = index not in table.moving and name.lower() not in _GROUND | _MOVERS
+    static[sorted(set(table.names) - {0} - table.ground - (table.moving or table.movable))] = True
     return static
 
 

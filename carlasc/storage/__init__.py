@@ -2,11 +2,13 @@
 
 from carlasc.storage.downloads import download
 from carlasc.storage.folders.folder import FolderSink, FolderSource
+from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.opening import as_source, open
 from carlasc.storage.packing import pack, unpack
-from carlasc.storage.protocol import Metadata, Sequence, SequenceWriter, Sink, Source
+from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source
 
 __all__ = [
+    "Axes",
     "FolderSink",
     "FolderSource",
     "Metadata",

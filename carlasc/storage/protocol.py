@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import PurePosixPath
 from types import TracebackType
@@ -22,59 +21,11 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.core.tables import CARLA, table_named
+from carlasc.core.tables import table_from_json
 from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage import layout
-from carlasc.storage.files import parse_json, to_json
-
-
-@dataclass(frozen=True)
-class Metadata:
-    """What carlasc.json says of a sequence (FORMAT section 1, "What we add"); the defaults are those of its absence.
-
-    Attributes:
-        frame: "carlasc" (left-handed, y right) or "kitti" (right-handed, y left).
-        classes: table of the labels' ids.
-        sensor: what took the scans, in words.
-        min_range_m: nearer points are left out of grids (the own car's roof).
-        max_range_m: farther points are left out of grids.
-        source: what the sequence was made from.
-        extra: further keys, kept as they are.
-    """
-
-    frame: str = "carlasc"
-    classes: ClassTable = CARLA
-    sensor: str | None = None
-    min_range_m: float | None = None
-    max_range_m: float | None = None
-    source: str | None = None
-    extra: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def from_json(cls, data: bytes, where: str) -> Metadata:
-        """Read carlasc.json; `where` is the file named in errors.
-
-        Raises:
-            FormatError: no JSON object, or an unknown frame or class table.
-        """
-        values = parse_json(data, where)
-        frame = values.pop("frame", "carlasc")
-        if frame not in ("carlasc", "kitti"):
-            raise FormatError(where, expected="the frame carlasc or kitti", found=f"{frame!r}")
-        ranges: dict[str, Any] = {name: values.pop(name, None) for name in ("min_range_m", "max_range_m")}
-        for name, value in ranges.items():
-            if value is not None and (not isinstance(value, int | float) or value < 0):
-                raise FormatError(where, expected=f"a number of metres in {name}", found=f"{value!r}")
-        classes = table_named(values.pop("classes", CARLA.name))
-        return cls(
-            frame, classes, values.pop("sensor", None), **ranges, source=values.pop("source", None), extra=values
-        )
-
-    def to_json(self) -> bytes:
-        """Return the bytes of carlasc.json."""
-        values: dict[str, Any] = {"frame": self.frame, "classes": self.classes.name, "sensor": self.sensor}
-        values |= {"min_range_m": self.min_range_m, "max_range_m": self.max_range_m, "source": self.source}
-        return to_json({key: value for key, value in values.items() if value is not None} | dict(self.extra))
+from carlasc.storage.files import parse_json
+from carlasc.storage.metadata import Metadata, check_format
 
 
 class Sequence(ABC):
@@ -174,14 +125,17 @@ class Sequence(ABC):
         return {}
 
     def classes_of(self, grid: str) -> ClassTable:
-        """Return the class table of a grid's labels: the sequence's, unless its params.json names another under `carlasc` (predictions)."""
-        name = self._record(grid).get("classes")
-        if name is None:
+        """Return the class table of a grid's labels.
+
+        It is the sequence's, unless the grid's params.json names another one, or holds it whole, under `carlasc`: predictions.
+
+        Raises:
+            FormatError: carlasc.json or params.json names an unknown table, or holds a damaged one.
+        """
+        table = self._record(grid).get("classes")
+        if table is None:
             return self.metadata.classes
-        try:
-            return table_named(str(name))
-        except FormatError as error:
-            raise FormatError(f"{self.location}/{layout.params_file(grid)}: {error}") from error
+        return table_from_json(table, f"{self.location}/{layout.params_file(grid)}")
 
     def predicted_by(self, grid: str) -> str | None:
         """Return the network that predicted a grid, as its params.json says under `carlasc`; None: it is no prediction."""
@@ -191,7 +145,10 @@ class Sequence(ABC):
     def _record(self, grid: str) -> Mapping[str, Any]:
         """How a grid was made: params.json's `carlasc`, empty if there is none."""
         record = self.params(grid).get("carlasc")
-        return record if isinstance(record, dict) else {}
+        if not isinstance(record, dict):
+            return {}
+        check_format(record.get("format", 1), f"{self.location}/{layout.params_file(grid)}: carlasc")
+        return record
 
     @cached_property
     def poses(self) -> NDArray[np.float64]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError, ConflictError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.protocol import Metadata, SequenceWriter
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import SequenceWriter
 
 RECORD = "carlasc"
 _POSE_TOLERANCE = 1e-6  # metres, and entries of a rotation: the last digits of poses.txt change with the machine
@@ -132,16 +133,16 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     """Return the carlasc.json to write, None if it is there or would say nothing but the defaults.
 
     Raises:
-        ConflictError: what is there is in another frame or of other classes.
+        ConflictError: what exists has other axes or other classes.
     """
     data = writer.read_document(layout.METADATA)
     where = f"{writer.location}/{layout.METADATA}"
     there = Metadata() if data is None else Metadata.from_json(data, where)
-    if data is not None and (there.frame, there.classes.name) != (metadata.frame, metadata.classes.name):
+    if data is not None and (there.axes, there.classes) != (metadata.axes, metadata.classes):
         raise ConflictError(
             where,
-            expected=f"the frame {metadata.frame} and the classes {metadata.classes.name}",
-            found=f"{there.frame} and {there.classes.name}",
+            expected=f"the axes {metadata.axes} and the classes {metadata.classes.name}",
+            found=f"{there.axes} and {'others called ' if there.classes.name == metadata.classes.name != there.classes else ''}{there.classes.name}",
             advice="write to another place (`-o`)",
         )
     return metadata.to_json() if data is None and metadata != Metadata() else None

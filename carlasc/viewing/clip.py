@@ -94,7 +94,7 @@ class Clip:
     @property
     def left_handed(self) -> bool:
         """Whether y is on the right."""
-        return self.data.sequence.metadata.frame == "carlasc"
+        return self.data.sequence.metadata.axes == "left"
 
     @property
     def colors(self) -> ClassColors:

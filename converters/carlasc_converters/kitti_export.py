@@ -154,7 +154,7 @@ class KittiExporter(Exporter):
 
 def right_handed_grid(sequence: storage.Sequence, spec: GridSpec) -> GridSpec:
     """Return a grid's geometry in SemanticKITTI's frame: y's bounds change places where the sequence is mirrored."""
-    if sequence.metadata.frame == "kitti":
+    if sequence.metadata.axes == "right":
         return spec
     (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
     return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
@@ -194,12 +194,12 @@ def _raw_ids(classes: ClassTable, labels: NDArray[np.integer], where: str) -> ND
 
 
 def _right_handed(sequence: storage.Sequence, poses: NDArray[np.float64]) -> Transform:
-    return poses if sequence.metadata.frame == "kitti" else MIRROR @ poses @ MIRROR
+    return poses if sequence.metadata.axes == "right" else MIRROR @ poses @ MIRROR
 
 
 def _mirror_row(sequence: storage.Sequence) -> NDArray[np.float32]:
-    return np.array([1, 1 if sequence.metadata.frame == "kitti" else -1, 1, 1], np.float32)
+    return np.array([1, 1 if sequence.metadata.axes == "right" else -1, 1, 1], np.float32)
 
 
 def _flipped(sequence: storage.Sequence, grid: NDArray[Any]) -> NDArray[Any]:
-    return grid if sequence.metadata.frame == "kitti" else grid[:, ::-1]
+    return grid if sequence.metadata.axes == "right" else grid[:, ::-1]

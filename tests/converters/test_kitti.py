@@ -73,7 +73,7 @@ def test_poses_are_the_lidars_and_match_the_drive(simulated, converted):
 
 def test_carlasc_json_says_what_the_data_are(converted, simulated):
     values = json.loads((converted / SEQUENCE / "carlasc.json").read_text())
-    assert values["frame"] == "carlasc"
+    assert values["axes"] == "left"
     assert values["classes"] == "carla"
     assert (values["min_range_m"], values["max_range_m"]) == (2.5, 70.0)
     assert "HDL-64E" in values["sensor"]
@@ -125,7 +125,7 @@ def test_labels_and_frame_of_kitti_leave_points_and_classes_as_they_are(simulate
     assert sequence.read("points", 4).tobytes() == points.tobytes()
     assert np.array_equal(sequence.read("labels", 4), both & 0xFFFF)
     assert np.abs(sequence.poses - simulated[1].poses).max() < 1e-9
-    assert (sequence.metadata.frame, sequence.metadata.classes.name) == ("kitti", "semantickitti")
+    assert (sequence.metadata.axes, sequence.metadata.classes.name) == ("right", "semantickitti")
 
 
 def test_splits_are_those_of_the_benchmark_and_can_be_chosen(tmp_path):

@@ -156,9 +156,9 @@ def test_a_second_run_goes_on_where_the_first_stopped(tmp_path, folder):
 
 def test_a_second_run_of_other_settings_stops(tmp_path, folder):
     run(tmp_path)
-    with pytest.raises(ConflictError, match=r"carlasc.json: expected the frame kitti"):
+    with pytest.raises(ConflictError, match=r"carlasc.json: expected the axes right"):
         run(tmp_path, frame="kitti")
-    with pytest.raises(ConflictError, match="expected the frame carlasc and the classes semantickitti"):
+    with pytest.raises(ConflictError, match="expected the axes left and the classes semantickitti"):
         run(tmp_path, labels="kitti")
 
 

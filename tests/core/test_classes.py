@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,9 @@ from carlasc.core.tables import (
     TABLES,
     TRAIN_VOXEL_COUNTS,
     remap_named,
+    table_from_json,
     table_named,
+    table_to_json,
 )
 from carlasc.errors import ArgumentError, FormatError
 
@@ -104,10 +108,75 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do():
 
 
 def test_a_table_must_colour_what_it_names():
-    with pytest.raises(ArgumentError, match="different ids"):
+    with pytest.raises(ArgumentError, match="expected a name and a colour for each id, found one of the two for 0"):
         ClassTable("t", {0: "a"}, {})
     with pytest.raises(ArgumentError, match="3 -> 99"):
         Remap("r", CARLA, CARLASC11, {3: 99})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"names": {-1: "a"}, "colors": {-1: (0, 0, 0)}}, "expected names of ids 0..65535"),
+        ({"names": {70000: "a"}, "colors": {70000: (0, 0, 0)}}, "expected names of ids 0..65535"),
+        ({"colors": {0: (0, 0, 256)}}, r"expected three values 0..255 for each colour, found \(0, 0, 256\) for 0"),
+        ({"ground": frozenset({1})}, "expected ids of the table in ground, found 1"),
+        ({"moving": frozenset({2})}, "expected ids of the table in moving, found 2"),
+        ({"geometry_only": 1}, "expected an id of the table in geometry_only, found 1"),
+        ({"names": {3: "a"}, "colors": {3: (0, 0, 0)}, "num_channels": 3}, "expected num_channels above 3, found 3"),
+    ],
+)
+def test_a_table_that_contradicts_itself_is_refused(values, message):
+    with pytest.raises(ArgumentError, match=f"class table t: {message}"):
+        ClassTable(**{"name": "t", "names": {0: "a"}, "colors": {0: (0, 0, 0)}} | values)
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
+def test_tables_come_back_from_json(table):
+    assert ClassTable.from_dict(json.loads(json.dumps(table.to_dict())), "a.json") == table
+    assert table_from_json(table.to_dict(), "a.json") is table_from_json(table_to_json(table), "a.json") is table
+
+
+LAB = {"name": "lab", "names": {"0": "none", "7": "floor"}, "colors": {"0": [0, 0, 0], "7": [1, 2, 3]}, "ground": [7]}
+
+
+def test_a_table_of_ones_own_is_kept_whole():
+    table = table_from_json(LAB, "a.json")
+    assert table == ClassTable("lab", {0: "none", 7: "floor"}, {0: (0, 0, 0), 7: (1, 2, 3)}, ground=frozenset({7}))
+    assert (table.num_channels, table.geometry_id) == (8, 7)
+    assert table_to_json(table) == LAB | {"num_channels": 8}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": None}, "a.json: classes: expected names and colours by id"),
+        (
+            {"colors": {"0": [0, 0, 0]}},
+            "a.json: class table lab: expected a name and a colour for each id, found .* for 7",
+        ),
+        ({"colors": {"0": [0, 0], "7": [0, 0, 0]}}, "a.json: classes: expected names and colours by id"),
+        ({"movable": [9]}, "a.json: class table lab: expected ids of the table in movable, found 9"),
+        ({"moveable": [7]}, "a.json: classes: expected the keys name, names, .*found moveable"),
+        ({"name": "carla"}, "a.json: classes: expected a name that is not in use.*give the table a name of its own"),
+    ],
+)
+def test_a_damaged_table_in_a_file_is_named(change, message):
+    with pytest.raises(FormatError, match=message):
+        table_from_json(LAB | change, "a.json")
+    with pytest.raises(FormatError, match="a.json: classes: expected the key 'names', found name"):
+        table_from_json({"name": "lab"}, "a.json")
+
+
+def test_ground_and_actors_have_roles_in_every_table():
+    for table in TABLES.values():
+        assert table.ground and table.movable and 0 not in table.ground
+        assert not table.ground & table.movable
+        assert table.deformable <= table.movable and table.moving <= table.movable
+    assert [CARLA.names[i] for i in sorted(CARLA.ground)] == (
+        ["RoadLine", "Road", "Sidewalk", "Ground", "Bridge", "RailTrack", "Water", "Terrain"]
+    )
+    assert (CARLA.names[CARLA.geometry_id], SEMANTICKITTI.names[SEMANTICKITTI.geometry_id]) == ("Other", "other-object")
 
 
 def test_palettes_have_a_colour_for_every_channel():

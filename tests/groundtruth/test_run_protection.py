@@ -148,9 +148,7 @@ def test_the_last_digits_of_poses_may_differ(made):
 
 def test_a_sequence_in_another_frame_or_of_other_classes_stops_the_run(made):
     (made / "cartesian/carlasc.json").write_text('{"frame": "kitti"}')
-    with pytest.raises(
-        ConflictError, match="carlasc.json: expected the frame carlasc and the classes carla, found kitti"
-    ):
+    with pytest.raises(ConflictError, match="carlasc.json: expected the axes left and the classes carla, found right"):
         regrid(made, None, SMALL, workers=1)
 
 

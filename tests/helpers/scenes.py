@@ -13,7 +13,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import write_json
 from carlasc.storage.folders.folder import FolderSink
-from carlasc.storage.protocol import Metadata
+from carlasc.storage.metadata import Metadata
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SENSOR_HEIGHT_M = 1.8
@@ -151,7 +151,7 @@ def write_drive(
     writer.write_document(layout.POSES, layout.encode_poses(poses))
     writer.write_document(layout.TIMES, layout.encode_times(np.arange(len(poses)) * layout.FRAME_PERIOD_S))
     if frame != "carlasc":
-        writer.write_document(layout.METADATA, Metadata(frame=frame).to_json())
+        writer.write_document(layout.METADATA, Metadata("right" if frame == "kitti" else "left").to_json())
     if spec is not None:
         write_json(folder / "evaluation" / layout.PARAMS, spec.to_params())
     return folder

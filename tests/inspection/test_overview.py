@@ -41,7 +41,7 @@ def test_a_data_set_is_described_from_its_splits_to_its_grids(data: Path) -> Non
     assert (heavy.frames, heavy.first, heavy.last, heavy.gaps) == (2, 0, 2, 1)
     assert light.fields == {"bev": 3, "flow": 3, "labels": 3, "points": 3}
     assert set(light.documents) == {"poses.txt", "times.txt"}
-    assert (heavy.sensor, heavy.source, heavy.frame, heavy.classes) == ("HDL-64E", "elsewhere", "carlasc", "carla")
+    assert (heavy.sensor, heavy.source, heavy.axes, heavy.classes) == ("HDL-64E", "elsewhere", "left", "carla")
 
 
 def test_grids_are_told_with_their_geometry_and_how_they_were_made(data: Path) -> None:

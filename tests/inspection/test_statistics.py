@@ -118,7 +118,7 @@ def test_a_bad_frame_is_listed_and_the_others_are_counted(data: tuple[Path, dict
 
 def test_wide_class_ids_are_counted(tmp_path: Path) -> None:
     writer = FolderSink(tmp_path).sequence("cartesian")
-    writer.write_document(layout.METADATA, Metadata(frame="kitti", classes=SEMANTICKITTI).to_json())
+    writer.write_document(layout.METADATA, Metadata("right", classes=SEMANTICKITTI).to_json())
     writer.write("points", 0, np.zeros((3, 4), np.float32))
     writer.write("labels", 0, np.array([259, 259, 40], np.uint32))
     result = stats(tmp_path)

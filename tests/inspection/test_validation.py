@@ -478,5 +478,5 @@ def test_a_grid_of_unknown_classes_is_one_finding_and_the_rest_is_still_checked(
     path = copy / "evaluation/params.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"carlasc": {"classes": "lab"}}))
     result = found(validate(copy))
-    assert "params.json" in result["params"] and "class table 'lab'" in result["params"]
+    assert "params.json" in result["params"] and "found 'lab'" in result["params"]
     assert "class-ids" not in result

@@ -33,7 +33,6 @@ from carlasc.storage.protocol import Sequence
 
 BLOCK = 25  # frames that share their tracks; blocks have fixed bounds, so a grid does not depend on which frames a run makes
 _PARTS = 30  # scans picked by distance are at least this part of `window_m` apart
-_GEOMETRY = {"carla": "Other", "semantickitti": "other-object"}  # what points count as where nothing has a label
 
 
 @dataclass(frozen=True)
@@ -239,9 +238,7 @@ class ScanFeed:
         scan = self.sequence.scan(frame)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
-            name = _GEOMETRY.get(self.classes.name)
-            only = self.classes.id_of(name) if name else max(self.classes.names)
-            scan = Scan(scan.points, np.full(len(scan), only, np.uint32))
+            scan = Scan(scan.points, np.full(len(scan), self.classes.geometry_id, np.uint32))
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
         distance = np.sqrt(np.square(scan.points).sum(axis=1))

@@ -76,7 +76,7 @@ class Shot:
     @property
     def left_handed(self) -> bool:
         """Whether y is on the right."""
-        return self.data.sequence.metadata.frame == "carlasc"
+        return self.data.sequence.metadata.axes == "left"
 
     def scene(self, kind: str, frame: int) -> Scene:
         """Return what is drawn of a frame."""

@@ -1,0 +1,97 @@
+"""What carlasc.json says of a sequence, and the version of the files that carlasc adds. See `docs/format.md#carlasc-json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.tables import CARLA, table_from_json, table_to_json
+from carlasc.errors import FormatError
+from carlasc.storage.files import parse_json, to_json
+
+FORMAT = 2
+"""Version of carlasc.json. Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`."""
+
+Axes = Literal["left", "right"]
+_AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # by the `frame` of version 1
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """The content of carlasc.json; the defaults are what its absence means.
+
+    Attributes:
+        axes: "left" (left-handed, y to the right: CarlaSC, CARLA) or "right" (right-handed, y to the left: SemanticKITTI, ROS).
+        classes: class table of the labels.
+        sensor: what took the scans, in words.
+        min_range_m: points nearer than this are left out of grids (the roof of the own car), metres.
+        max_range_m: points farther than this are left out of grids, metres.
+        source: what the sequence was made from.
+        extra: further keys, kept as they are.
+    """
+
+    axes: Axes = "left"
+    classes: ClassTable = CARLA
+    sensor: str | None = None
+    min_range_m: float | None = None
+    max_range_m: float | None = None
+    source: str | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, data: bytes, where: str) -> Metadata:
+        """Read carlasc.json, of this version or an older one; `where` is the file named in errors.
+
+        Raises:
+            FormatError: it is no JSON object, of a newer version, or holds unknown axes or an unknown or damaged class table.
+        """
+        values = parse_json(data, where)
+        check_format(values.pop("format", 1), where)
+        ranges: dict[str, Any] = {name: values.pop(name, None) for name in ("min_range_m", "max_range_m")}
+        for name, value in ranges.items():
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or value < 0):
+                raise FormatError(where, expected=f"a number of metres in {name}", found=repr(value))
+        return cls(
+            _read_axes(values, where),
+            table_from_json(values.pop("classes", CARLA.name), where),
+            values.pop("sensor", None),
+            **ranges,
+            source=values.pop("source", None),
+            extra=values,
+        )
+
+    def to_json(self) -> bytes:
+        """Return the bytes of carlasc.json. A class table that carlasc does not have by name is written whole."""
+        values: dict[str, Any] = {"format": FORMAT, "axes": self.axes, "classes": table_to_json(self.classes)}
+        values |= {"sensor": self.sensor, "min_range_m": self.min_range_m, "max_range_m": self.max_range_m}
+        values |= {"source": self.source}
+        return to_json({key: value for key, value in values.items() if value is not None} | dict(self.extra))
+
+
+def check_format(version: object, where: str) -> None:
+    """Check that this version of carlasc reads files of a version of the format.
+
+    Raises:
+        FormatError: it is no version, or a newer one.
+    """
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise FormatError(where, expected="a whole number above 0 in format", found=repr(version))
+    if version > FORMAT:
+        raise FormatError(
+            where, expected=f"format {FORMAT} or older", found=f"format {version}", advice="upgrade carlasc to read it"
+        )
+
+
+def _read_axes(values: dict[str, Any], where: str) -> Axes:
+    """Take `axes` out of carlasc.json, or `frame`, which stood for it in version 1."""
+    frame, axes = values.pop("frame", None), values.pop("axes", None)
+    if frame is not None and frame not in _AXES:
+        raise FormatError(where, expected=f"{' or '.join(_AXES)} in frame", found=repr(frame))
+    if axes is not None and axes not in get_args(Axes):
+        raise FormatError(where, expected=f"{' or '.join(get_args(Axes))} in axes", found=repr(axes))
+    meant: Axes | None = None if frame is None else _AXES[frame]
+    if axes is not None and meant is not None and axes != meant:
+        raise FormatError(where, expected=f"the axes {meant}, as frame {frame} says", found=axes)
+    return axes or meant or "left"

@@ -1,0 +1,89 @@
+"""Data and stores that carlasc 0.1.0 wrote, before carlasc.json had a format version: they must stay readable."""
+
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import carlasc
+from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI
+from carlasc.storage import layout
+
+ENDINGS = ("zarr", "h5", "parquet")
+KITTI = "Val/KITTI_08/cartesian"
+SEQUENCES = ("Test/Town10_Medium/cylindrical", "Train/Town01_Light/cartesian", KITTI, "Val/Town07_Heavy/cartesian")
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("before")
+    with tarfile.open(Path(__file__).parents[1] / "data/before/0.1.0.tar.xz") as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+def stored(folder: Path, field: layout.Field, frame: int) -> np.ndarray:
+    """Return a frame's numbers as they are in the published file, without carlasc's own code."""
+    file = folder / field.file(frame)
+    if field.suffix == ".votes.npz":
+        with np.load(file) as archive:
+            return np.stack([archive[name].astype(np.int64) for name in ("voxel", "label", "votes")])
+    return np.fromfile(file, field.dtype)
+
+
+@pytest.mark.parametrize("name", ["published", *(f"packed.{ending}" for ending in ENDINGS)])
+def test_every_field_of_every_frame_is_read(before, name):
+    if name.endswith(("zarr", "h5", "parquet")):
+        pytest.importorskip({"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[name.rpartition(".")[2]])
+    sequences = carlasc.open(before / name).sequences()
+    assert tuple(sequences) == SEQUENCES
+    read = 0
+    for path, sequence in sequences.items():
+        folder = before / "published" / path
+        fields = [layout.field_named(field) for field in sequence.fields()]
+        files = sum(len(list(folder.glob(f"{field.folder}/[0-9]*{field.suffix}"))) for field in fields)
+        assert files == sum(len(sequence.frames(field.name)) for field in fields)
+        for field in fields:
+            for frame in sequence.frames(field.name).tolist():
+                found, wanted = sequence.read(field.name, frame), stored(folder, field, frame)
+                if field.suffix == ".votes.npz":
+                    found = np.stack([found[column].astype(np.int64) for column in ("voxel", "label", "votes")])
+                assert np.array_equal(found.reshape(wanted.shape), wanted), (path, field.name, frame)
+                read += 1
+        assert {document: sequence.read_document(document) for document in sequence.documents()} == {
+            document: (folder / document).read_bytes() for document in sequence.documents()
+        }
+    assert read == 50
+
+
+@pytest.mark.parametrize("name", ["published", *(f"packed.{ending}" for ending in ENDINGS)])
+def test_the_key_frame_and_the_names_of_class_tables_are_read(before, name):
+    if name.endswith(("zarr", "h5", "parquet")):
+        pytest.importorskip({"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[name.rpartition(".")[2]])
+    sequences = carlasc.open(before / name).sequences()
+    kitti = sequences[KITTI].metadata
+    assert (kitti.axes, kitti.classes, kitti.sensor) == ("right", SEMANTICKITTI, "a LiDAR")
+    assert (kitti.min_range_m, kitti.max_range_m, kitti.source, kitti.extra) == (2.5, 70, "kitti x", {"poses": "file"})
+    assert sequences[KITTI].classes_of("prediction") is CARLASC11
+    assert sequences[KITTI].predicted_by("prediction") == "lmscnet_ss"
+    assert sequences[KITTI].classes_of("evaluation") is SEMANTICKITTI
+    whole = sequences[SEQUENCES[1]].metadata
+    assert (whole.axes, whole.classes, whole.sensor) == ("right", CARLA, "a")
+    assert sequences[SEQUENCES[3]].metadata.axes == "left"
+
+
+def test_a_grid_made_of_a_capture_is_read(before):
+    (sequence,) = carlasc.open(before / "capture").sequences().values()
+    folder = before / "capture/cartesian"
+    spec = sequence.grids["small"]
+    assert spec == carlasc.GridSpec.published().with_size((16, 16, 4))
+    for frame in (0, 1):
+        grid = sequence.grid("small", frame)
+        labels = np.fromfile(folder / f"small/{frame:06d}.label", "<u4")
+        counts = np.fromfile(folder / f"small/{frame:06d}.bin", "<f4")
+        assert np.array_equal(grid.labels.reshape(-1), labels) and np.array_equal(grid.counts.reshape(-1), counts)
+        votes = sequence.read("small/votes", frame)
+        assert votes["votes"].sum() == counts.sum() > 0
+    assert json.loads((folder / "small/params.json").read_text())["carlasc"]["vote"] == "sensor"
