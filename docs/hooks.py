@@ -15,6 +15,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
 from typer.models import ArgumentInfo, ParameterInfo
 
 from carlasc import cli
@@ -117,9 +118,9 @@ def _layout() -> str:
     rows = ["| file | field | what it holds |", "|---|---|---|"]
     grid = [layout.field_named(f"{layout.EVALUATION}/{part}") for part in layout.GRID_FIELDS]
     for field in (*layout.SCAN_FIELDS.values(), *grid):
-        shape = "(X, Y, Z)" if field.name.endswith(("/labels", "/counts")) else "(N,)"
-        shape = shape if field.columns is None else f"(N, {field.columns})"
-        kind = {"<f4": f"float32 {shape}", "<u4": f"uint32 {shape}", "u1": "bytes", "": "npz"}[field.dtype]
+        shape = "(X, Y, Z)" if field.per == "voxel" else "(N,)" if field.columns is None else f"(N, {field.columns})"
+        special = {"picture": "bytes", "votes": "npz"}
+        kind = special[field.kind] if field.kind in special else f"{np.dtype(field.dtype).name} {shape}"
         unit = f", {field.unit}" if field.unit in ("m", "m/s") else ""
         ours = "" if field.published else " *(ours)*"
         rows.append(f"| `{field.file(0)}` | `{field.name}` | {kind}{unit}: {_escape(field.meaning)}{ours} |")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from carlasc.converting.protocol import FrameContent, FrameHandle
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.errors import CarlascError, FormatError, StorageError
+from carlasc.storage import layout
 from carlasc.storage.protocol import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"  # the other data set's own voxel files, as they were: for the way back
@@ -158,6 +159,9 @@ def make_fields(content: FrameContent, job: FrameJob, target: Target) -> tuple[d
             fields["flow"] = flow * _MIRROR_VECTOR if target.mirrored else flow
             moving = np.isin(np.asarray(content.labels), sorted(target.source.moving))
             without = int(np.count_nonzero(moving & ~np.isin(content.instances, sorted(job.velocities))))
+    for name, array in content.others.items():
+        mirrored = target.mirrored and layout.field_named(name).kind == "vector"
+        fields[name] = array * _MIRROR_VECTOR if mirrored else array
     points = content.points
     if target.mirrored:
         points = points * _MIRROR_POINT

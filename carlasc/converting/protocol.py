@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -36,11 +36,13 @@ class FrameContent:
         labels: (N,) class ids of the data set, 0 unlabelled; None where there are none.
         instances: (N,) uint32 actor of each point, 0 none, the same number for the same actor all over the recording, whether it
             moves or not; None where there are none.
+        others: further fields of the layout with a row per point, by name; vectors right-handed. They are written as they are.
     """
 
     points: NDArray[np.float32]
     labels: NDArray[np.unsignedinteger] | None = None
     instances: NDArray[np.uint32] | None = None
+    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

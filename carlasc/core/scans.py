@@ -1,8 +1,9 @@
-"""A LiDAR scan with what is known of each of its points."""
+"""A LiDAR scan, and the labels, flow and other values of its points."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from carlasc.errors import FormatError
 
 @dataclass(frozen=True)
 class Scan:
-    """One sweep of one sensor, in that sensor's frame.
+    """One sweep of one sensor, in the frame of that sensor.
 
     Attributes:
         points: (N, 3) float32, metres, sensor frame.
@@ -21,9 +22,10 @@ class Scan:
         flow: (N, 3) float32 m/s, velocity of the actor hit, sensor frame, ego motion removed; or None.
         instances: (N,) uint32 actor ids, 0 is none; or None.
         remission: (N,) float32, the 4th column of the file (zero in CarlaSC); or None.
+        others: further fields of the layout with a row per point, by name.
 
     Raises:
-        FormatError: shapes do not fit each other.
+        FormatError: the shapes do not fit each other.
     """
 
     points: NDArray[np.float32]
@@ -31,24 +33,29 @@ class Scan:
     flow: NDArray[np.float32] | None = None
     instances: NDArray[np.uint32] | None = None
     remission: NDArray[np.float32] | None = None
+    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise FormatError("scan points", expected="shape (N, 3)", found=f"{self.points.shape}")
+            raise FormatError("scan points", expected="shape (N, 3)", found=str(self.points.shape))
         count = len(self.points)
         expected = {"labels": (count,), "flow": (count, 3), "instances": (count,), "remission": (count,)}
         for name, shape in expected.items():
             array = getattr(self, name)
             if array is not None and array.shape != shape:
-                raise FormatError(f"scan {name}", expected=f"shape {shape} for {count} points", found=f"{array.shape}")
+                raise FormatError(f"scan {name}", expected=f"shape {shape} for {count} points", found=str(array.shape))
+        for name, array in self.others.items():
+            if len(array) != count:
+                raise FormatError(f"scan {name}", expected=f"{count} rows for {count} points", found=str(len(array)))
 
     def __len__(self) -> int:
         return len(self.points)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
-        """Return the scan of the points chosen by a mask or by indices, every field alike."""
-        others: tuple[Any, ...] = (self.labels, self.flow, self.instances, self.remission)
-        return Scan(self.points[keep], *(None if field is None else field[keep] for field in others))
+        """Return the points chosen by a mask or by indices, with all of their fields."""
+        fields: tuple[Any, ...] = (self.labels, self.flow, self.instances, self.remission)
+        others = {name: array[keep] for name, array in self.others.items()}
+        return Scan(self.points[keep], *(None if values is None else values[keep] for values in fields), others)
 
 
 def check_finite(points: NDArray[np.floating], name: str) -> None:

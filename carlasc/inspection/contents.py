@@ -17,7 +17,6 @@ from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence
 
 _FASTEST_M_S = 100.0
-_PER_POINT = ("labels", "flow", "instances")
 
 
 def check_documents(sequence: Sequence) -> Iterator[Finding]:
@@ -85,9 +84,9 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
             severity, "frame-gaps", sequence.path, sequence.location, "frames that follow each other", found, advice
         )
     if "points" in fields:
-        for name in (*_PER_POINT, "bev"):
-            if name in fields:
-                yield from _compare_frames(sequence, name, "points", "note" if name == "bev" else "error")
+        for name, field in layout.SCAN_FIELDS.items():
+            if name in fields and name != "points":
+                yield from _compare_frames(sequence, name, "points", "error" if field.per == "point" else "note")
     for grid in sorted({name.rpartition("/")[0] for name in fields if "/" in name}):
         parts = [part for part in ("labels", "counts", "votes") if f"{grid}/{part}" in fields]
         if "labels" not in parts:
@@ -115,8 +114,8 @@ def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Ite
             count = len(array)
             if count == 0:
                 yield Finding("warning", "empty-scan", sequence.path, where, "points", "an empty scan")
-        elif name in _PER_POINT and count is not None and len(array) != count:
-            expected = f"{count} rows, one a point of {_file(sequence, 'points', frame)}"
+        elif layout.field_named(name).per == "point" and count is not None and len(array) != count:
+            expected = f"{count} rows, one per point of {_file(sequence, 'points', frame)}"
             yield Finding(
                 "error", "point-counts", sequence.path, where, expected, f"{len(array)}", "copy or make both again"
             )
@@ -125,27 +124,27 @@ def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Ite
 def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
     """Check what is in a frame's files; those that cannot be read are `check_shapes`'s to report."""
     arrays = _read_all(sequence, frame)
-    for name in ("points", "flow"):
-        if name in arrays:
-            rows = np.isfinite(arrays[name]).all(axis=1)
-            if not rows.all():
-                found = f"NaN or infinity in {int((~rows).sum())} rows, the first {int(np.argmin(rows))}"
-                yield Finding(
-                    "error", "not-finite", sequence.path, _file(sequence, name, frame), "finite numbers", found
-                )
-            elif name == "flow" and len(rows) and float(np.abs(arrays[name]).max()) > _FASTEST_M_S:
-                found = f"{float(np.abs(arrays[name]).max()):.0f} m/s"
-                expected = f"velocities below {_FASTEST_M_S:.0f} m/s"
-                yield Finding("warning", "flow", sequence.path, _file(sequence, name, frame), expected, found)
-    if "labels" in arrays:
-        yield from _check_classes(
-            sequence, arrays["labels"], sequence.metadata.classes, _file(sequence, "labels", frame)
-        )
-    if "bev" in arrays and arrays["bev"][:2].tobytes() != b"\xff\xd8":
-        yield Finding("warning", "bev", sequence.path, _file(sequence, "bev", frame), "a JPEG picture", "other bytes")
+    for name in sorted(layout.SCAN_FIELDS.keys() & arrays.keys()):
+        kind, where = layout.SCAN_FIELDS[name].kind, _file(sequence, name, frame)
+        if arrays[name].dtype.kind == "f":
+            yield from _check_numbers(sequence, name, arrays[name], where)
+        elif kind == "class":
+            yield from _check_classes(sequence, arrays[name], sequence.metadata.classes, where)
+        elif kind == "picture" and arrays[name][:2].tobytes() != b"\xff\xd8":
+            yield Finding("warning", name, sequence.path, where, "a JPEG picture", "other bytes")
     for grid in sequence.grids:
         if f"{grid}/labels" in arrays:
             yield from _check_grid(sequence, grid, frame, arrays)
+
+
+def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
+    rows = np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    if not rows.all():
+        found = f"NaN or infinity in {int((~rows).sum())} rows, the first {int(np.argmin(rows))}"
+        yield Finding("error", "not-finite", sequence.path, where, "finite numbers", found)
+    elif name == "flow" and len(rows) and float(np.abs(array).max()) > _FASTEST_M_S:
+        found = f"{float(np.abs(array).max()):.0f} m/s"
+        yield Finding("warning", "flow", sequence.path, where, f"velocities below {_FASTEST_M_S:.0f} m/s", found)
 
 
 def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:

@@ -1,9 +1,9 @@
-"""The published layout as one table: field, file name, dtype, shape, unit. Nothing else knows a file name.
+"""The published layout as one table: field, file name, type, shape, unit. No other module knows a file name.
 
-    <split>/<sequence>/<coordinates>/velodyne/000000.bin ... (FORMAT section 1)
+    <split>/<sequence>/<coordinates>/velodyne/000000.bin, ...: see the format page, `docs/format.md#layout`
 
 Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid>/counts`, `<grid>/votes` for the grid in the
-folder `<grid>`. `poses` and `times` live in text files, one line a frame.
+folder `<grid>`. `poses` and `times` are in text files with one line per frame.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import zipfile
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,16 +33,26 @@ VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 
 
-@dataclass(frozen=True)
+Per = Literal["point", "voxel", "vote", "scan"]
+Kind = Literal["position", "vector", "class", "id", "value", "count", "votes", "picture"]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Field:
-    """What one file a frame holds.
+    """The content of one file per frame.
+
+    Everything that handles fields goes by `per` and `kind`, not by names: stores, packing, `info`, `validate`, converting.
 
     Attributes:
-        name: how a Source and a Sink call it.
+        name: what a Source and a Sink call it.
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
+        per: what one row of the file belongs to. The files of a scan have a row for each of its points, those of a grid a value for
+            each voxel ("voxel") or a row for each vote ("vote"); "scan" is a whole file for a scan.
+        kind: what the values are: "position" and "vector" (turn with the axes), "class" (ids of the class table), "id" (unsigned whole
+            numbers, such as actors), "value" (any number), "count", "votes" (a table), "picture" (the bytes of a file).
         dtype: NumPy type on disk, little-endian.
-        columns: values a row, None for a flat array.
+        names: name of each value of a row.
         unit: unit of the values.
         meaning: one line for the documentation.
         published: whether the data set's download has it.
@@ -51,11 +61,18 @@ class Field:
     name: str
     folder: str
     suffix: str
+    per: Per
+    kind: Kind
     dtype: str
-    columns: int | None
+    names: tuple[str, ...]
     unit: str
     meaning: str
     published: bool = True
+
+    @property
+    def columns(self) -> int | None:
+        """Number of values per row; None for a flat array."""
+        return len(self.names) if self.kind in ("position", "vector") else None
 
     def file(self, frame: int) -> str:
         """Return the path of a frame's file under `<coordinates>/`."""
@@ -72,18 +89,18 @@ class Field:
         Raises:
             FormatError: the size does not fit.
         """
-        if self.suffix == ".votes.npz":
+        if self.kind == "votes":
             return _decode_votes(data, where)
         dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
         size = len(data)
         if shape is not None and size != dtype.itemsize * int(np.prod(shape)):
             expected = f"{dtype.itemsize * int(np.prod(shape))} bytes ({' x '.join(map(str, shape))} {dtype.name})"
-            raise FormatError(where, expected=f"{expected}", found=f"{size}", advice="cut short, or of another grid")
+            raise FormatError(where, expected=expected, found=str(size), advice="cut short, or of another grid")
         if size % row:
             raise FormatError(
                 where,
-                expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} a row)",
-                found=f"{size}",
+                expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} per row)",
+                found=str(size),
                 advice="cut short?",
             )
         array = np.frombuffer(data, dtype)
@@ -98,7 +115,7 @@ class Field:
             FormatError: the array's shape or values do not fit the field.
         """
         self.check(array, where)
-        if self.suffix == ".votes.npz":
+        if self.kind == "votes":
             return _encode_votes(array)
         return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
 
@@ -108,71 +125,69 @@ class Field:
         Raises:
             FormatError: its shape or type does not fit; `where` is the file named there.
         """
-        if self.suffix == ".votes.npz":
+        if self.kind == "votes":
             if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
-                raise FormatError(where, expected="a table of voxel, label and votes", found=f"{array.dtype}")
+                raise FormatError(where, expected="a table of voxel, label and votes", found=str(array.dtype))
             return
         if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
             raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
         dtype = np.dtype(self.dtype)
         if dtype.kind == "u" and array.dtype.kind not in "ub":
-            raise FormatError(where, expected="unsigned integers", found=f"{array.dtype}")
+            raise FormatError(where, expected="unsigned integers", found=str(array.dtype))
         if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
-            raise FormatError(where, expected=f"at most {dtype.name}", found=f"{array.dtype}")
+            raise FormatError(where, expected=f"at most {dtype.name}", found=str(array.dtype))
 
 
 SCAN_FIELDS: dict[str, Field] = {
     field.name: field
     for field in (
         Field(
-            "points",
-            "velodyne",
-            ".bin",
-            "<f4",
-            4,
-            "m",
-            "x, y, z in the sensor frame; 4th column a zero placeholder (KITTI: remission)",
-        ),
-        Field("labels", "labels", ".label", "<u4", None, "class", "class of each point; 0 is unlabelled"),
-        Field(
-            "flow",
-            "predictions",
-            ".bin",
-            "<f4",
-            3,
-            "m/s",
-            "velocity of the actor hit, sensor frame, ego motion removed",
+            name="points", folder="velodyne", suffix=".bin", per="point", kind="position",
+            dtype="<f4", names=("x", "y", "z", "fourth"), unit="m",
+            meaning="x, y, z in the sensor frame; 4th column a zero placeholder (KITTI: remission)",
         ),
         Field(
-            "instances",
-            "instances",
-            ".label",
-            "<u4",
-            None,
-            "actor",
-            "actor of each point, 0 none, consistent over a sequence",
-            False,
+            name="labels", folder="labels", suffix=".label", per="point", kind="class",
+            dtype="<u4", names=("label",), unit="class",
+            meaning="class of each point; 0 is unlabelled",
         ),
-        Field("bev", "bev", ".jpg", "u1", None, "bytes", "bird's-eye camera picture, as its JPEG bytes"),
+        Field(
+            name="flow", folder="predictions", suffix=".bin", per="point", kind="vector",
+            dtype="<f4", names=("vx", "vy", "vz"), unit="m/s",
+            meaning="velocity of the actor hit, sensor frame, ego motion removed",
+        ),
+        Field(
+            name="instances", folder="instances", suffix=".label", per="point", kind="id",
+            dtype="<u4", names=("actor",), unit="actor",
+            meaning="actor of each point, 0 none, consistent over a sequence", published=False,
+        ),
+        Field(
+            name="bev", folder="bev", suffix=".jpg", per="scan", kind="picture",
+            dtype="u1", names=("jpeg",), unit="bytes",
+            meaning="bird's-eye camera picture, as its JPEG bytes",
+        ),
     )
-}
+}  # fmt: skip
 _GRID_FIELDS: dict[str, Field] = {
     field.name: field
     for field in (
-        Field("labels", "", ".label", "<u4", None, "class", "class of each voxel; 0 is free, also where unknown"),
-        Field("counts", "", ".bin", "<f4", None, "votes", "votes of each voxel; 0 means unknown: never evaluated"),
         Field(
-            "votes",
-            "",
-            ".votes.npz",
-            "",
-            None,
-            "votes",
-            "votes by class: voxel (flat index), label, votes; only non-zero ones",
-            False,
+            name="labels", folder="", suffix=".label", per="voxel", kind="class",
+            dtype="<u4", names=("label",), unit="class",
+            meaning="class of each voxel; 0 is free, also where unknown",
+        ),
+        Field(
+            name="counts", folder="", suffix=".bin", per="voxel", kind="count",
+            dtype="<f4", names=("votes",), unit="votes",
+            meaning="votes of each voxel; 0 means unknown: never evaluated",
+        ),
+        Field(
+            name="votes", folder="", suffix=".votes.npz", per="vote", kind="votes",
+            dtype="", names=("voxel", "label", "votes"), unit="votes",
+            meaning="votes by class: voxel (flat index), label, votes; only non-zero ones", published=False,
         ),
     )
-}
+}  # fmt: skip
 GRID_FIELDS = tuple(_GRID_FIELDS)
 LINE_FIELDS = ("poses", "times")
 
@@ -189,8 +204,20 @@ def field_named(name: str) -> Field:
     if grid and part in _GRID_FIELDS:
         return replace(_GRID_FIELDS[part], name=name, folder=grid)
     raise FormatError(
-        f"field {name!r}: expected one of {', '.join(SCAN_FIELDS)}, or <grid>/ and one of {', '.join(_GRID_FIELDS)}"
+        f"field {name!r}",
+        expected=f"one of {', '.join(SCAN_FIELDS)}, or <grid>/ and one of {', '.join(_GRID_FIELDS)}",
+        found="none of them",
     )
+
+
+def point_fields() -> tuple[str, ...]:
+    """Return the names of the fields with a row per point, without `points` itself."""
+    return tuple(name for name, field in SCAN_FIELDS.items() if field.per == "point" and field.kind != "position")
+
+
+def scan_folders() -> frozenset[str]:
+    """Return the folders of the scans' fields, under `<coordinates>/`."""
+    return frozenset(field.folder for field in SCAN_FIELDS.values())
 
 
 def params_file(grid: str) -> str:
@@ -253,11 +280,11 @@ def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
         rows = [list(map(float, line.split())) for line in data.decode().splitlines() if line.strip()]
     except (UnicodeDecodeError, ValueError) as error:
         raise FormatError(
-            where, expected=f"{columns} numbers a line", found="something else", advice=f"{error}"
+            where, expected=f"{columns} numbers per line", found="something else", advice=str(error)
         ) from error
     for number, row in enumerate(rows, 1):
         if len(row) != columns:
-            raise FormatError(where, expected=f"{columns} numbers a line", found=f"{len(row)} in line {number}")
+            raise FormatError(where, expected=f"{columns} numbers per line", found=f"{len(row)} in line {number}")
     return np.array(rows, np.float64).reshape(-1, columns)
 
 
@@ -267,7 +294,7 @@ def _decode_votes(data: bytes | memoryview, where: str) -> NDArray[Any]:
             columns = {name: archive[name] for name in ("voxel", "label", "votes")}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(
-            where, expected="an .npz of voxel, label and votes", found="something else", advice=f"{error}"
+            where, expected="an .npz of voxel, label and votes", found="something else", advice=str(error)
         ) from error
     votes = np.empty(len(columns["voxel"]), VOTES_DTYPE if columns["label"].dtype.itemsize == 1 else WIDE_VOTES_DTYPE)
     for name, column in columns.items():

@@ -207,14 +207,16 @@ class Sequence(ABC):
             np.concatenate([np.empty(0, np.int64), *(self.frames(field) for field in sorted(self.fields()))])
         )
 
-    def scan(self, frame: int, fields: Iterable[str] = ("labels", "flow", "instances")) -> Scan:
-        """Read a frame's points with those of `fields` that the sequence has."""
+    def scan(self, frame: int, fields: Iterable[str] | None = None) -> Scan:
+        """Read a frame's points with those of `fields` that the sequence has; None reads every field with a row per point."""
+        wanted = layout.point_fields() if fields is None else fields
         points = self.read("points", frame)
-        others = {name: self.read(name, frame) for name in fields if name in self.fields() and name != "remission"}
+        read = {name: self.read(name, frame) for name in wanted if name in self.fields() and name != "remission"}
+        own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
         try:
-            return Scan(points[:, :3], remission=points[:, 3], **others)
+            return Scan(points[:, :3], remission=points[:, 3], **own, others=read)
         except FormatError as error:
-            raise FormatError(f"{self.location}: frame {frame}: {error}") from error
+            raise error.within(f"{self.location}: frame {frame}") from error
 
     def grid(self, name: str, frame: int) -> Grid:
         """Read a grid of a frame: labels, and counts where there are any."""

@@ -30,7 +30,7 @@ def check_name(name: str) -> str:
     Raises:
         ArgumentError: it is no plain folder name, or one that the layout uses for something else.
     """
-    taken = {field.folder for field in layout.SCAN_FIELDS.values()} | {layout.POSES, layout.TIMES, layout.METADATA}
+    taken = layout.scan_folders() | {layout.POSES, layout.TIMES, layout.METADATA}
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*", name):
         raise ArgumentError("name", expected="letters, digits and _ . + -", found=f"{name!r}")
     if name in taken:

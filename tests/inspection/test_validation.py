@@ -410,7 +410,7 @@ def test_a_jump_is_named_with_its_frames(copy: Path) -> None:
 def test_a_line_that_is_no_pose_is_named(copy: Path) -> None:
     lines = (copy / layout.POSES).read_text().splitlines(keepends=True)
     (copy / layout.POSES).write_text("".join([*lines[:4], "1 2 3\n", *lines[5:]]))
-    assert "12 numbers a line, found 3 in line 5" in found(validate(copy))["poses"]
+    assert "12 numbers per line, found 3 in line 5" in found(validate(copy))["poses"]
 
 
 def test_times_that_do_not_rise_are_named(copy: Path) -> None:

@@ -72,7 +72,7 @@ def test_file_names_are_those_of_the_format():
 
 
 def test_a_file_cut_short_is_refused_with_both_sizes():
-    with pytest.raises(FormatError, match=r"a.bin: expected a multiple of 16 bytes \(4 float32 a row\), found 17"):
+    with pytest.raises(FormatError, match=r"a.bin: expected a multiple of 16 bytes \(4 float32 per row\), found 17"):
         layout.field_named("points").decode(bytes(17), "a.bin")
     with pytest.raises(FormatError, match=r"expected 96 bytes \(2 x 3 x 4 uint32\), found 92"):
         layout.field_named("evaluation/labels").decode(bytes(92), "a.label", (2, 3, 4))
@@ -88,7 +88,7 @@ def test_arrays_that_do_not_fit_are_refused():
 
 
 def test_broken_lines_are_named():
-    with pytest.raises(FormatError, match="poses.txt: expected 12 numbers a line, found 11 in line 2"):
+    with pytest.raises(FormatError, match="poses.txt: expected 12 numbers per line, found 11 in line 2"):
         layout.decode_poses(b"1 " * 12 + b"\n" + b"1 " * 11, "poses.txt")
-    with pytest.raises(FormatError, match="times.txt: expected 1 numbers a line"):
+    with pytest.raises(FormatError, match="times.txt: expected 1 numbers per line"):
         layout.decode_times(b"zero\n", "times.txt")

@@ -14,8 +14,6 @@ from carlasc.storage import layout
 from carlasc.storage.folders.trees import Tree
 from carlasc.storage.protocol import Sequence, Source, identity_of
 
-_SCAN_FOLDERS = frozenset(field.folder for field in layout.SCAN_FIELDS.values())
-_MARKS = _SCAN_FOLDERS | {layout.EVALUATION, layout.POSES}
 _DEPTH = 4  # <root>/<split>/<sequence>/<coordinates>, and one folder that a zip may have put around it
 _CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")
 
@@ -51,7 +49,7 @@ class PublishedSource(Source):
                 "expected a sequence or a folder above it, found a raw capture: make grids of it first (carlasc regrid)"
             )
         return (
-            f"expected a data set, a split, a sequence or its cartesian/ or cylindrical/ folder, found none of {', '.join(sorted(_MARKS))}"
+            f"expected a data set, a split, a sequence or its cartesian/ or cylindrical/ folder, found none of {', '.join(sorted(_marks()))}"
             " down to four levels: give the folder that holds Train, Val and Test, or one inside it"
         )
 
@@ -74,7 +72,7 @@ class PublishedSequence(Sequence):
         """The fields whose folders are there: one look at the sequence's folder and one for a file in each of its grids'."""
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
         fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
-        for grid in sorted(folders - _SCAN_FOLDERS):
+        for grid in sorted(folders - layout.scan_folders()):
             if self.tree.is_file(self._prefix + layout.params_file(grid)):
                 fields |= {f"{grid}/{part}": layout.field_named(f"{grid}/{part}") for part in layout.GRID_FIELDS}
         return fields
@@ -125,7 +123,7 @@ class PublishedSequence(Sequence):
         return self._listing[field]
 
     def _shape(self, entry: layout.Field) -> tuple[int, int, int] | None:
-        return self.grids[entry.folder].size if entry.name.endswith(("/labels", "/counts")) else None
+        return self.grids[entry.folder].size if entry.per == "voxel" else None
 
     def documents(self) -> tuple[str, ...]:
         """Return the text files that are there."""
@@ -150,14 +148,19 @@ class PublishedSequence(Sequence):
             suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}
             for name in self.tree.entries(self._prefix + folder):
                 frames = [number for suffix in suffixes if (number := layout.frame_of(name, suffix)) is not None]
-                if not frames and not (name == layout.PARAMS and folder not in _SCAN_FOLDERS):
+                if not frames and not (name == layout.PARAMS and folder not in layout.scan_folders()):
                     unknown.append(f"{folder}/{name}")
         return tuple(sorted(unknown))
 
 
+def _marks() -> frozenset[str]:
+    """Return the names that make a folder the `<coordinates>` folder of a sequence."""
+    return layout.scan_folders() | {layout.EVALUATION, layout.POSES}
+
+
 def _find_sequences(tree: Tree, path: str, depth: int) -> Iterator[str]:
     children = {name: is_folder for name, is_folder in tree.entries(path).items() if not name.startswith(".")}
-    if _MARKS & set(children) or any(name.startswith(f"{layout.EVALUATION}_") for name in children):
+    if _marks() & set(children) or any(name.startswith(f"{layout.EVALUATION}_") for name in children):
         yield path
         return
     if depth == 0:

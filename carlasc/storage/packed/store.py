@@ -149,12 +149,12 @@ class Points(Packing):
 
 
 class Values(Packing):
-    """A flat array of unsigned integers, as `values` of the narrowest type that holds them all."""
+    """A flat array of numbers, as `values` of the narrowest type that holds them all."""
 
     kind = "values"
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
-        incompressible = self.entry.name == "bev"
+        incompressible = self.entry.kind == "picture"
         encoding = Encoding(level=1) if incompressible else Encoding(shuffle=SHUFFLE)
         return (Column("values", "u1", encoding, self.entry.unit),)
 
@@ -163,9 +163,9 @@ class Values(Packing):
         return {"values": narrow(array)}
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return (N,) unsigned integers."""
+        """Return (N,) values in the field's type, or classes in the narrowest one."""
         values = columns["values"]
-        return values.astype(np.uint32) if self.entry.name == "instances" else values
+        return values if self.entry.kind in ("class", "picture") else values.astype(self.entry.dtype, copy=False)
 
 
 class Flow(Packing):
@@ -200,7 +200,7 @@ class Cells(Packing):
     kind = "grid"
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
-        shuffle = BITSHUFFLE if self.entry.name.endswith("/counts") else NO_SHUFFLE
+        shuffle = BITSHUFFLE if self.entry.kind == "count" else NO_SHUFFLE
         return (Column("values", "u1", Encoding(level=8, shuffle=shuffle), self.entry.unit),)
 
     def split(self, array: NDArray[Any]) -> Columns:
@@ -273,13 +273,12 @@ def packing_of(
     """Return how a field is packed: by `options` when it is written, by the store's `attributes` when it is read."""
     options = options or Options()
     if attributes is None:
-        attributes = {"scale_m": options.lossy_mm / 1000} if entry.name == "points" and options.lossy_mm else {}
-    if "/" in entry.name:
-        return (Votes if entry.name.endswith("/votes") else Cells)(entry, options, attributes)
-    return _SCANS.get(entry.name, Values)(entry, options, attributes)
+        attributes = {"scale_m": options.lossy_mm / 1000} if entry.kind == "position" and options.lossy_mm else {}
+    kind: Callable[..., Packing] = Cells if entry.per == "voxel" else _BY_KIND.get(entry.kind, Values)
+    return kind(entry, options, attributes)
 
 
-_SCANS: dict[str, Callable[..., Packing]] = {"points": Points, "flow": Flow}
+_BY_KIND: dict[layout.Kind, Callable[..., Packing]] = {"position": Points, "vector": Flow, "votes": Votes}
 
 
 def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:

@@ -72,28 +72,32 @@ class PointsTable(TableField):
         return points
 
 
-class FlowTable(TableField):
-    """`vx`, `vy`, `vz`."""
+class VectorTable(TableField):
+    """A column per axis: `vx`, `vy`, `vz`."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
 
     def columns(self, attributes: Attributes) -> dict[str, str]:
         """Return a column an axis."""
-        return dict.fromkeys(("vx", "vy", "vz"), "float32")
+        return dict.fromkeys(self.names, "float32")
 
     def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
         """Return a column an axis."""
-        return {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(("vx", "vy", "vz"))}
+        return {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(self.names)}
 
     def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
         """Return (N, 3) float32."""
-        return np.stack([columns["vx"], columns["vy"], columns["vz"]], axis=1)
+        return np.stack([columns[name] for name in self.names], axis=1)
 
 
 class ValuesTable(TableField):
-    """One column of integers or counts in their published type; a grid's voxels in C order."""
+    """One column of numbers in their published type; a grid's voxels in C order."""
 
-    def __init__(self, name: str, dtype: str) -> None:
-        self.name = name
-        self.dtype = dtype
+    def __init__(self, entry: layout.Field) -> None:
+        (self.name,) = entry.names
+        self.dtype = np.dtype(entry.dtype).name
+        self.narrow = entry.kind == "class"
 
     def columns(self, attributes: Attributes) -> dict[str, str]:
         """Return the one column."""
@@ -106,7 +110,7 @@ class ValuesTable(TableField):
     def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
         """Return the flat values, labels as narrow as they may be."""
         values = columns[self.name]
-        return narrow(values) if self.name == "label" else values
+        return narrow(values) if self.narrow else values
 
 
 class PictureTable(TableField):
@@ -155,28 +159,24 @@ class VotesTable(TableField):
         return votes
 
 
-_SCANS: dict[str, TableField] = {
-    "points": PointsTable(),
-    "flow": FlowTable(),
-    "labels": ValuesTable("label", "uint32"),
-    "instances": ValuesTable("actor", "uint32"),
-    "bev": PictureTable(),
-}
-_GRIDS: dict[str, TableField] = {
-    "labels": ValuesTable("label", "uint32"),
-    "counts": ValuesTable("votes", "float32"),
-    "votes": VotesTable(),
-}
-
-
 def table_field(name: str) -> TableField:
     """Return how a field stands in a table.
 
     Raises:
         FormatError: the layout has no such field.
     """
-    layout.field_named(name)
-    return _GRIDS[name.rpartition("/")[2]] if "/" in name else _SCANS[name]
+    entry = layout.field_named(name)
+    match entry.kind:
+        case "position":
+            return PointsTable()
+        case "vector":
+            return VectorTable(entry.names)
+        case "picture":
+            return PictureTable()
+        case "votes":
+            return VotesTable()
+        case _:
+            return ValuesTable(entry)
 
 
 def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:

@@ -207,15 +207,15 @@ class _TableWriter:
             "field": self.field,
             "unit": entry.unit,
         } | self.kind.describe(array, self.scale)
-        types = self.kind.columns(self.attributes)
+        types, is_picture = self.kind.columns(self.attributes), entry.kind == "picture"
         self._schema = pa.schema(
             [("frame", pa.int64())] + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
         split = {name: "BYTE_STREAM_SPLIT" for name in types if name in self.kind.split_bytes}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._writer = parquet.ParquetWriter(
-            self.path, self._schema, compression="none" if self.field == "bev" else "zstd", compression_level=None if self.field == "bev" else _LEVEL,
-            use_dictionary=[name for name in ("frame", *types) if name not in split and self.field != "bev"], column_encoding=split or None,
+            self.path, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
+            use_dictionary=[name for name in ("frame", *types) if name not in split and not is_picture], column_encoding=split or None,
             data_page_size=_PAGE, dictionary_pagesize_limit=_PAGE, write_page_checksum=True, write_statistics=["frame"],
         )  # fmt: skip
 

@@ -172,7 +172,7 @@ def _open_file(path: Path) -> Input:
     """A file of one frame: its folder is a grid's or one of a scan's fields."""
     folder = path.absolute().parent
     frame = layout.frame_of(path.name, path.suffix)
-    is_scan = folder.name in {field.folder for field in layout.SCAN_FIELDS.values()}
+    is_scan = folder.name in layout.scan_folders()
     if frame is None or not (is_scan or (folder / layout.PARAMS).is_file()):
         raise FormatError(
             f"{path}: expected a frame of six digits with {layout.PARAMS} beside it, or in one of a scan's folders: the grid's geometry is not known"
