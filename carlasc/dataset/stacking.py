@@ -15,16 +15,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import AZIMUTH_ERROR, Cells, cached, fast_azimuth, find_voxel, fingerprint
 from carlasc.core.grids import GridSpec
 
 _BLOCK = 128  # points at once: their columns and cells take 6 KB of the first-level cache, and half a page of the file
-_DEGREE = 11
-_ARCTAN = tuple(  # of s: arctan(sqrt(s)) / sqrt(s) on 0..1, off by less than 1e-9
-    np.polynomial.chebyshev.Chebyshev.interpolate(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), _DEGREE, [0, 1])
-    .convert(kind=np.polynomial.Polynomial)
-    .coef.tolist()
-)
-_ARCTAN_ERROR = 1e-9
 
 
 def stack_scans(
@@ -50,7 +44,7 @@ def stack_scans(
         (T, X, Y, Z) uint8 0 or 1, or uint16 points a voxel.
     """
     stack = np.zeros((len(scans), *spec.size), np.uint8 if what == "occupancy" else np.uint16)
-    geometry = _geometry(spec)
+    cells, geometry = Cells.of(spec), _geometry(spec)
     ranges = (min_range_m or 0.0, math.inf if max_range_m is None else float(max_range_m))
     rows = grid_T_scans[:, :3].reshape(-1, 12).tolist()
     for grid, points, row in zip(stack.reshape(len(scans), -1), scans, rows, strict=True):
@@ -58,9 +52,9 @@ def stack_scans(
             planes = points[:, :3].T
             if planes.flags.aligned and planes.strides[1] == planes.itemsize and points.dtype == np.float32:
                 x, y, z = map(_read_only, planes)
-                _bin_planes(x, y, z, tuple(row), geometry, ranges, grid)
+                _bin_planes(x, y, z, tuple(row), cells, geometry, ranges, grid)
             else:
-                _bin_rows(_as_words(points), tuple(row), geometry, ranges, grid)
+                _bin_rows(_as_words(points), tuple(row), cells, geometry, ranges, grid)
     return stack
 
 
@@ -72,11 +66,12 @@ def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype
 
 
 def _geometry(spec: GridSpec) -> tuple[Any, ...]:
+    """Return what the quick arithmetic takes: lower bounds, cells per metre or radian, sizes, and how many cells it may be off."""
     voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
-    cylindrical = spec.coordinates == "cylindrical"
-    # How many cells a quick coordinate may be off: its rounding, that of voxel_size * size against the bounds, and the azimuth's error.
-    doubt = 1e-6 + 1e-7 * max(sizes) + (_ARCTAN_ERROR / float(voxel[1]) if cylindrical else 0.0)
-    return spec.lower, spec.upper, tuple(voxel), tuple(1.0 / voxel), sizes, cylindrical, doubt
+    # Rounding, the difference of voxel_size * size from the bounds, and the error of the azimuth.
+    doubt = 1e-6 + 1e-7 * max(sizes)
+    doubt += AZIMUTH_ERROR / float(voxel[1]) if spec.coordinates == "cylindrical" else 0.0
+    return spec.lower, tuple(1.0 / voxel), sizes, doubt
 
 
 def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
@@ -136,22 +131,14 @@ def _move(x, y, z, count, rows):  # type: ignore[no-untyped-def]
 
 @_step
 def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore[no-untyped-def]
-    """Write the radius, and the azimuth to within _ARCTAN_ERROR: `arctan2` itself does not vectorise."""
-    c0, c1, c2, c3, c4, c5, c6, c7, c8, c9, c10, c11 = _ARCTAN
+    """Write the radius, and the azimuth within AZIMUTH_ERROR: `arctan2` itself does not vectorise."""
     for n in range(count):
-        a, b = np.abs(x[n]), np.abs(y[n])
-        long, short = (a, b) if a > b else (b, a)
-        t = short / long
-        s = t * t
-        high = c6 + s * (c7 + s * (c8 + s * (c9 + s * (c10 + s * c11))))
-        angle = t * (c0 + s * (c1 + s * (c2 + s * (c3 + s * (c4 + s * (c5 + s * high))))))
-        angle = np.pi / 2 - angle if b > a else angle
-        angle = np.pi - angle if x[n] < 0 else angle
-        angle = -angle if y[n] < 0 else angle
+        squared = x[n] * x[n] + y[n] * y[n]
+        angle = fast_azimuth(x[n], y[n])
         turned = angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
         angle = turned if (turned >= lower) & (turned < upper) else angle
-        azimuth[n] = angle if long > 0 else lower  # at the origin: on an edge, so looked at again
-        radius[n] = np.sqrt(a * a + b * b)
+        azimuth[n] = angle if squared > 0 else lower  # at the origin: on an edge, so looked at again
+        radius[n] = np.sqrt(squared)
 
 
 @_step
@@ -160,7 +147,7 @@ def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def
 
     Three divisions a point would take half the time. So multiply, and doubt what comes near to a cell's edge.
     """
-    (l0, l1, l2), _, _, (w0, w1, w2), (s0, s1, s2), _, doubt = geometry
+    (l0, l1, l2), (w0, w1, w2), (s0, s1, s2), doubt = geometry
     clear = 0.5 - doubt
     doubtful = 0
     for n in range(count):
@@ -172,23 +159,6 @@ def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def
         cell = (i * s1 + j) * s2 + k if inside else -1.0
         cells[n] = np.int32(-2.0 if edge else cell)
     return doubtful
-
-
-@_step
-def _find_cell(x, y, z, geometry):  # type: ignore[no-untyped-def]
-    """Return the flat index of the voxel of one Cartesian point, -1 outside: the rules of `GridSpec` to the letter."""
-    (l0, l1, l2), (u0, u1, u2), (v0, v1, v2), _, (s0, s1, s2), cylindrical, _ = geometry
-    if cylindrical:
-        azimuth = np.arctan2(y, x)
-        turned = azimuth + 2 * np.pi if azimuth < l1 else (azimuth - 2 * np.pi if azimuth >= u1 else azimuth)
-        x = np.sqrt(x * x + y * y)
-        y = turned if l1 <= turned < u1 else azimuth
-    if not (l0 <= x < u0 and l1 <= y < u1 and l2 <= z < u2):
-        return np.int32(-1)
-    i = min(np.floor((x - l0) / v0), s0 - 1.0)
-    j = min(np.floor((y - l1) / v1), s1 - 1.0)
-    k = min(np.floor((z - l2) / v2), s2 - 1.0)
-    return np.int32((i * s1 + j) * s2 + k)
 
 
 @_step
@@ -205,42 +175,52 @@ def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
 
 
 @_step
-def _bin_block(x, y, z, radius, azimuth, cells, count, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+def _bin_block(x, y, z, radius, azimuth, found, count, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
     near, far = ranges
     if near > 0.0 or far < np.inf:
         _leave_out(x, y, z, count, near * near, far * far)
     _move(x, y, z, count, rows)
-    if geometry[5]:
-        _to_cylindrical(x, y, count, geometry[0][1], geometry[1][1], radius, azimuth)
-        doubtful = _find_cells(radius, azimuth, z, count, geometry, cells)
+    if cells.cylindrical:
+        _to_cylindrical(x, y, count, cells.lower[1], cells.upper[1], radius, azimuth)
+        doubtful = _find_cells(radius, azimuth, z, count, geometry, found)
     else:
-        doubtful = _find_cells(x, y, z, count, geometry, cells)
+        doubtful = _find_cells(x, y, z, count, geometry, found)
     for n in range(count if doubtful else 0):
-        if cells[n] == -2:
-            cells[n] = _find_cell(x[n], y[n], z[n], geometry)
-    _mark(cells, count, grid)
+        if found[n] == -2:
+            voxel = find_voxel(x[n], y[n], z[n], cells)
+            found[n] = voxel if voxel < len(grid) else -1
+    _mark(found, count, grid)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def _bin_rows(words, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
-    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
-    cells = np.empty(_BLOCK, np.int32)
-    for start in range(0, len(words), 2 * _BLOCK):
-        block = words[start : start + 2 * _BLOCK]
-        _split_columns(block, x, y, z)
-        _bin_block(x, y, z, radius, azimuth, cells, len(block) // 2, rows, geometry, ranges, grid)
+def _compile(sources: int):  # type: ignore[no-untyped-def]
+    """Return the two functions below. They close over `sources`, so that a change of the cell rule compiles them again."""
+
+    @cached
+    def bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+        _ = sources
+        x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+        radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+        found = np.empty(_BLOCK, np.int32)
+        for start in range(0, len(words), 2 * _BLOCK):
+            block = words[start : start + 2 * _BLOCK]
+            _split_columns(block, x, y, z)
+            _bin_block(x, y, z, radius, azimuth, found, len(block) // 2, rows, cells, geometry, ranges, grid)
+
+    @cached
+    def bin_planes(xs, ys, zs, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+        _ = sources
+        x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+        radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+        found = np.empty(_BLOCK, np.int32)
+        for start in range(0, len(xs), _BLOCK):
+            xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
+            _copy_columns(xb, yb, zb, x, y, z)
+            _bin_block(x, y, z, radius, azimuth, found, len(xb), rows, cells, geometry, ranges, grid)
+
+    return bin_rows, bin_planes
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def _bin_planes(xs, ys, zs, rows, geometry, ranges, grid):  # type: ignore[no-untyped-def]
-    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
-    cells = np.empty(_BLOCK, np.int32)
-    for start in range(0, len(xs), _BLOCK):
-        xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
-        _copy_columns(xb, yb, zb, x, y, z)
-        _bin_block(x, y, z, radius, azimuth, cells, len(xb), rows, geometry, ranges, grid)
+_bin_rows, _bin_planes = _compile(fingerprint(__file__))
 
 
 @numba.njit(nogil=True, cache=True)

@@ -79,7 +79,8 @@ class Ballot:
         free_step_m: float = 1.5,
         regions: NDArray[np.uint16] | None = None,
     ) -> None:
-        from carlasc.groundtruth.voting import kernel, rule
+        from carlasc.core.cells import Cells
+        from carlasc.groundtruth.voting import kernel
 
         if vote not in ("sensor", "sample", "point"):
             raise ArgumentError("vote rule", expected="sensor, sample or point", found=f"{vote!r}")
@@ -92,7 +93,7 @@ class Ballot:
         self.spec, self.classes, self.vote, self.free_step_m = spec, classes, vote, float(free_step_m)
         self.num_observations = 0
         free_once = vote != "sample"
-        self._cells = rule.Cells.of(spec)
+        self._cells = Cells.of(spec)
         self._tally = kernel.Tally(
             vote == "sensor",
             free_once,
@@ -111,7 +112,8 @@ class Ballot:
             FormatError: a label is not below the class table's number of channels; no vote was added.
             ArgumentError: it votes in a region, and the ballot has none.
         """
-        from carlasc.groundtruth.voting import kernel, rays, rule
+        from carlasc.core.cells import as_pose
+        from carlasc.groundtruth.voting import kernel, rays
 
         self.classes.check(observation.labels, "observation labels")
         hit_region, free_region = (
@@ -122,7 +124,7 @@ class Ballot:
             raise ArgumentError("observation: expected a ballot with regions for one that votes in a region")
         labels = np.require(observation.labels, np.uint16, ["C", "A", "W"])
         self._make_room(len(observation))
-        pose = rule.as_pose(observation.grid_T_sensor)
+        pose = as_pose(observation.grid_T_sensor)
         kernel.vote(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
             labels,

@@ -7,13 +7,13 @@ placed by rule.py. Free votes are kept densely, occupied ones as chains of candi
 from __future__ import annotations
 
 import math
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import Cells, Pose, cached, fingerprint, inlined, jit, transform
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
     DOUBTFUL,
@@ -30,7 +30,7 @@ from carlasc.groundtruth.voting.rays import (
     place_cylindrical,
     place_points,
 )
-from carlasc.groundtruth.voting.rule import Cells, Pose, cached, inlined, jit, sample_voxel, transform, unit_ray
+from carlasc.groundtruth.voting.rule import sample_voxel, unit_ray
 
 BLOCK = 256  # rays: their coordinates stay in the first cache
 NONE = -1  # end of a voxel's chain of candidates
@@ -265,4 +265,4 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
 
 
 _SOURCES = ("rule.py", "rays.py", "kernel.py")
-vote = _compile_vote(zlib.crc32(b"".join((Path(__file__).parent / name).read_bytes() for name in _SOURCES)))
+vote = _compile_vote(fingerprint(*(Path(__file__).parent / name for name in _SOURCES)))

@@ -14,18 +14,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.groundtruth.voting.rule import (
+from carlasc.core.cells import (
+    AZIMUTH_ERROR,
     Cells,
     Pose,
     Real,
     Triple,
-    before_sensor,
+    fast_azimuth,
     fused,
     inlined,
     jit,
     transform,
-    unit_ray,
 )
+from carlasc.groundtruth.voting.rule import before_sensor, unit_ray
 
 DOUBTFUL = -1  # index of a sample too near a cell's edge to be sure of
 
@@ -38,18 +39,6 @@ CHUNK = 8  # samples of a ray placed at once: the width of a vector
 MARGIN = 1e-7  # cells
 _ROUNDING = 2.0**-48  # bound on the relative error of a coordinate: 16 times what its dozen operations can do
 _NEAR_AXIS = 256.0  # azimuths are trusted to the margin this many times nearer to the axis than a cell is deep
-
-# atan(t) / t as a polynomial of t^2, |t| <= tan(pi / 8): Chebyshev interpolation, off by less than 3e-10.
-_ATAN = (
-    0.9999999993712274,
-    -0.33333306893036774,
-    0.1999818304075261,
-    -0.1423953266624381,
-    0.10569828793087244,
-    -0.060263052137509994,
-)
-_ATAN_ERROR = 3e-10  # radians
-_TAN_PI_8 = math.tan(math.pi / 8)
 
 
 class View(NamedTuple):
@@ -88,7 +77,7 @@ class View(NamedTuple):
         voxel = np.array(cells.voxel_size)
         # The published size of a cell is a float32 difference over n, so n cells may end a little off the upper bound.
         ends = (upper - lower) / voxel
-        margin = MARGIN + np.abs(ends - size).max() + (_ATAN_ERROR / voxel[1] if cells.cylindrical else 0.0)
+        margin = MARGIN + np.abs(ends - size).max() + (AZIMUTH_ERROR / voxel[1] if cells.cylindrical else 0.0)
         low, high = np.full(3, -MARGIN / 2), np.maximum(ends, size) + MARGIN / 2
         scale, origin, finest = 1 / voxel, lower.copy(), voxel.min()
         if cells.cylindrical:
@@ -208,7 +197,7 @@ def place_cartesian(u: float, v: float, w: float, view: View) -> np.int32:
 def place_cylindrical(x: float, y: float, w: float, view: View) -> np.int32:
     """Return the same for a sample given in metres across and cells upwards."""
     radius = np.sqrt(x * x + y * y)
-    v = azimuth(x, y) * view.scale[1] - view.offset[1]
+    v = fast_azimuth(x, y) * view.scale[1] - view.offset[1]
     off = from_middle(v)
     off = off if radius > view.axis else 1.0
     v = v + view.turn if v < 0.0 else (v - view.turn if v >= view.top[1] else v)
@@ -232,24 +221,3 @@ def settle(u: float, v: float, w: float, off: float, view: View) -> np.int32:
 def from_middle(cell: float) -> float:
     """Return the distance of a coordinate, in cells, from the middle of its cell."""
     return abs(cell - np.floor(cell) - 0.5)
-
-
-@fused
-def azimuth(x: float, y: float) -> float:
-    """Return atan2(y, x) within 3e-10 radians, without a branch; NaN at the origin."""
-    across, along = abs(y), abs(x)
-    steep = across > along
-    small, large = (along, across) if steep else (across, along)
-    wide = small > _TAN_PI_8 * large
-    t = ((small - large) if wide else small) / ((small + large) if wide else large)
-    w = t * t
-    angle = _ATAN[5]
-    angle = angle * w + _ATAN[4]
-    angle = angle * w + _ATAN[3]
-    angle = angle * w + _ATAN[2]
-    angle = angle * w + _ATAN[1]
-    angle = angle * w + _ATAN[0]
-    angle = angle * t + (math.pi / 4 if wide else 0.0)
-    angle = math.pi / 2 - angle if steep else angle
-    angle = math.pi - angle if x < 0.0 else angle
-    return -angle if y < 0.0 else angle

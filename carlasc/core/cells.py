@@ -1,0 +1,137 @@
+"""The cell of a point, compiled: the rule of `GridSpec.to_axes` and `GridSpec.index`, one point at a time.
+
+`find_voxel` is the rule to the letter. Loops over many points call it only for the few points that are too near an edge for the quick
+arithmetic that they use; `fast_azimuth` is the part of that arithmetic that a cylindrical grid needs. The functions are compiled into
+the loops that call them, in `carlasc.groundtruth.voting` and `carlasc.dataset.stacking`. Importing this module loads Numba.
+
+See the format page, `docs/format.md#cells`.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from carlasc.core.geometry import Transform
+from carlasc.core.grids import GridSpec
+
+Real = Any  # float32 or float64: compiled code keeps them apart, NumPy's stubs do not
+Triple = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""The upper 3 x 4 of a transform, row-major, as scalars."""
+
+jit = numba.njit(nogil=True, error_model="numpy")
+inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
+# Where margins cover the rounding, a product and a sum may become one operation.
+fused = numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})
+cached = numba.njit(nogil=True, error_model="numpy", cache=True)  # what Python calls; the rest is compiled into it
+
+
+class Cells(NamedTuple):
+    """A GridSpec as scalars, which compiled code keeps in registers."""
+
+    cylindrical: bool
+    size: tuple[int, int, int]
+    lower: Triple
+    upper: Triple
+    voxel_size: Triple
+
+    @classmethod
+    def of(cls, spec: GridSpec) -> Cells:
+        """Return the cells of a grid."""
+        x, y, z = spec.voxel_size.tolist()
+        return cls(spec.coordinates == "cylindrical", spec.size, spec.lower, spec.upper, (x, y, z))
+
+
+def as_pose(dst_T_src: Transform) -> Pose:
+    """Return a (4, 4) transform as scalars."""
+    pose: Pose = tuple(np.asarray(dst_T_src, np.float64)[:3].ravel().tolist())  # type: ignore[assignment]
+    return pose
+
+
+@inlined
+def transform(pose: Pose, x: Real, y: Real, z: Real) -> tuple[Real, Real, Real]:
+    """Return R @ p + t, summed from the left."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
+        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
+        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
+    )
+
+
+@jit
+def find_voxel(x: float, y: float, z: float, cells: Cells) -> int:
+    """Return the flat index of the voxel of a point in the grid's frame, the number of voxels if the point is outside.
+
+    Cells are half-open, the index is rounded down and clipped to the last cell. In a cylindrical grid an azimuth outside the bounds
+    is turned by 2 pi where that brings it inside.
+    """
+    first, second = x, y
+    if cells.cylindrical:
+        first, second = math.sqrt(x * x + y * y), math.atan2(y, x)
+        turned = second
+        if second < cells.lower[1]:
+            turned = second + 2 * math.pi
+        elif second >= cells.upper[1]:
+            turned = second - 2 * math.pi
+        if cells.lower[1] <= turned < cells.upper[1]:
+            second = turned
+    if not (
+        cells.lower[0] <= first < cells.upper[0]
+        and cells.lower[1] <= second < cells.upper[1]
+        and cells.lower[2] <= z < cells.upper[2]
+    ):
+        return cells.size[0] * cells.size[1] * cells.size[2]
+    i = min(int((first - cells.lower[0]) / cells.voxel_size[0]), cells.size[0] - 1)
+    j = min(int((second - cells.lower[1]) / cells.voxel_size[1]), cells.size[1] - 1)
+    k = min(int((z - cells.lower[2]) / cells.voxel_size[2]), cells.size[2] - 1)
+    return (i * cells.size[1] + j) * cells.size[2] + k
+
+
+# atan(t) / t as a polynomial of t^2, |t| <= tan(pi / 8): Chebyshev interpolation, off by less than 3e-10.
+_ATAN = (
+    0.9999999993712274,
+    -0.33333306893036774,
+    0.1999818304075261,
+    -0.1423953266624381,
+    0.10569828793087244,
+    -0.060263052137509994,
+)
+_TAN_PI_8 = math.tan(math.pi / 8)
+AZIMUTH_ERROR = 3e-10
+"""Greatest error of `fast_azimuth`, radians."""
+
+
+@fused
+def fast_azimuth(x: float, y: float) -> float:
+    """Return atan2(y, x) within AZIMUTH_ERROR, without a branch, so that loops vectorise; NaN at the origin."""
+    across, along = abs(y), abs(x)
+    steep = across > along
+    small, large = (along, across) if steep else (across, along)
+    wide = small > _TAN_PI_8 * large
+    t = ((small - large) if wide else small) / ((small + large) if wide else large)
+    w = t * t
+    angle = _ATAN[5]
+    angle = angle * w + _ATAN[4]
+    angle = angle * w + _ATAN[3]
+    angle = angle * w + _ATAN[2]
+    angle = angle * w + _ATAN[1]
+    angle = angle * w + _ATAN[0]
+    angle = angle * t + (math.pi / 4 if wide else 0.0)
+    angle = math.pi / 2 - angle if steep else angle
+    angle = math.pi - angle if x < 0.0 else angle
+    return -angle if y < 0.0 else angle
+
+
+def fingerprint(*files: str | Path) -> int:
+    """Return a number that changes with this file or one of the others.
+
+    Numba's cache of a function notices changes of that function's own file only. A cached function that closes over this number is
+    compiled again when a file changes whose functions are compiled into it.
+    """
+    return zlib.crc32(b"".join(Path(file).read_bytes() for file in (__file__, *files)))
