@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc import motion as motion
     from carlasc import running as running
     from carlasc import storage as storage
+    from carlasc import testing as testing
     from carlasc import viewing as viewing
     from carlasc.captures import record as record
     from carlasc.captures import simulate as simulate
@@ -72,6 +73,7 @@ _ROOMS = (
     "motion",
     "running",
     "storage",
+    "testing",
     "viewing",
 )
 _HOMES = {  # room -> its names that are also names of `carlasc`

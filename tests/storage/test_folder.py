@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 from helpers.sequences import write_dataset
-from storage.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import FolderSink, FolderSource, Sink, Source
+from carlasc.testing import SinkContract, SourceContract
+from carlasc.testing.data import SCANS, WHOLE
 
 
 class TestFolderSource(SourceContract):
@@ -80,7 +81,7 @@ def test_a_scan_cut_short_names_the_file_and_the_size(data: Path, tmp_path: Path
 
 
 def test_a_missing_poses_file_is_missed_only_when_it_is_asked_for(data: Path) -> None:
-    sequence = FolderSource(data).sequences()[BARE]
+    sequence = FolderSource(data).sequences()[SCANS]
     assert len(sequence.read("points", 0)) == 50
     with pytest.raises(MissingDataError, match=r"poses\.txt"):
         sequence.read_pose(0)

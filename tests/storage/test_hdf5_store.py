@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import scan
-from storage.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
@@ -13,6 +12,8 @@ from carlasc.storage import FolderSource, Sink, Source
 from carlasc.storage.packed.hdf5_store import HDF5Sink
 from carlasc.storage.packed.store import Options
 from carlasc.storage.packing import pack
+from carlasc.testing import SinkContract, SourceContract
+from carlasc.testing.data import SCANS, WHOLE
 
 h5py = pytest.importorskip("h5py")
 ENDING = ".h5"
@@ -61,10 +62,10 @@ def test_every_data_set_says_type_version_dtype_and_unit(store: Path) -> None:
 
 def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
     values = [np.arange(20), np.array([256, 3]), np.array([2]), np.array([70000, 0])]
-    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(BARE) as writer:
+    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(SCANS) as writer:
         for frame, labels in enumerate(values):
             writer.write("labels", frame, labels.astype(np.uint32))
-    sequence = carlasc.open(tmp_path / "x.h5").sequences()[BARE]
+    sequence = carlasc.open(tmp_path / "x.h5").sequences()[SCANS]
     for frame, labels in enumerate(values):
         assert sequence.read("labels", frame).tolist() == labels.tolist()
 
@@ -72,10 +73,10 @@ def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
 def test_a_scan_larger_than_the_first_takes_several_chunks(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     scans = [scan(rng, count)["points"] for count in (300, 40000, 300)]
-    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(BARE) as writer:
+    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(SCANS) as writer:
         for frame, points in enumerate(scans):
             writer.write("points", frame, points)
-    sequence = carlasc.open(tmp_path / "x.h5").sequences()[BARE]
+    sequence = carlasc.open(tmp_path / "x.h5").sequences()[SCANS]
     for points, found in zip(scans, sequence.read_many("points", range(3)), strict=True):
         assert np.array_equal(points, found)
 
@@ -114,7 +115,7 @@ def test_another_hdf5_file_is_refused(tmp_path: Path) -> None:
 
 def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
     sink = HDF5Sink(tmp_path / "x.h5")
-    sink.sequence(BARE).close()
+    sink.sequence(SCANS).close()
     assert not (tmp_path / "x.h5").exists()
     sink._store._file.close()  # type: ignore[attr-defined]
     with pytest.raises(FormatError):

@@ -6,7 +6,8 @@ from hypothesis.extra.numpy import arrays
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.storage import layout
+from carlasc.storage import FolderSource, layout
+from carlasc.testing import write_dataset
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -92,3 +93,9 @@ def test_broken_lines_are_named():
         layout.decode_poses(b"1 " * 12 + b"\n" + b"1 " * 11, "poses.txt")
     with pytest.raises(FormatError, match="times.txt: expected 1 numbers per line"):
         layout.decode_times(b"zero\n", "times.txt")
+
+
+def test_the_data_set_of_the_contract_tests_has_every_field(tmp_path):
+    sequences = FolderSource(write_dataset(tmp_path)).sequences().values()
+    names = {name.rpartition("/")[2] for sequence in sequences for name in sequence.fields()}
+    assert names == {*layout.SCAN_FIELDS, *layout.GRID_FIELDS}

@@ -13,13 +13,14 @@ import fsspec
 import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
-from storage.contract import WHOLE, SourceContract
 from storage.test_zipped import write_zip
 
 import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
 from carlasc.storage import Source
 from carlasc.storage.packing import pack
+from carlasc.testing import SourceContract
+from carlasc.testing.data import WHOLE
 
 
 class RangeHandler(SimpleHTTPRequestHandler):

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import FRAMES
-from storage.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
@@ -14,6 +13,8 @@ from carlasc.storage import FolderSource, Sink, Source
 from carlasc.storage.packed.store import Options
 from carlasc.storage.packed.tablewriter import ParquetSink
 from carlasc.storage.packing import pack
+from carlasc.testing import SinkContract, SourceContract
+from carlasc.testing.data import SCANS, WHOLE
 
 parquet = pytest.importorskip("pyarrow.parquet")
 ENDING = ".parquet"
@@ -67,9 +68,9 @@ def test_negative_zeros_and_nan_payloads_survive(tmp_path: Path) -> None:
     flow[::2] = -0.0
     flow.view(np.uint32)[3] = 0x7FC00123
     flow.view(np.uint32)[5] = 0x7FC00456
-    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
         writer.write("flow", 0, flow)
-    found = carlasc.open(tmp_path / "x.parquet").sequences()[BARE].read("flow", 0)
+    found = carlasc.open(tmp_path / "x.parquet").sequences()[SCANS].read("flow", 0)
     assert np.array_equal(found.view(np.uint32), flow.view(np.uint32))
 
 
@@ -111,14 +112,14 @@ def test_one_table_alone_says_to_give_the_folder(packed: Path) -> None:
 
 
 def test_a_second_run_keeps_finished_sequences(tmp_path: Path) -> None:
-    with ParquetSink(tmp_path / "x.parquet").sequence(BARE) as writer:
+    with ParquetSink(tmp_path / "x.parquet").sequence(SCANS) as writer:
         writer.write("labels", 0, np.arange(3, dtype=np.uint32))
     ParquetSink(tmp_path / "x.parquet").sequence(WHOLE).write_document("times.txt", b"0\n")
     assert not (tmp_path / "x.parquet").exists()
     sink = ParquetSink(tmp_path / "x.parquet")
-    assert sink.finished(BARE)
+    assert sink.finished(SCANS)
     assert not sink.finished(WHOLE)
-    assert not ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)).finished(BARE)
+    assert not ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)).finished(SCANS)
 
 
 def test_pcodec_is_refused(tmp_path: Path) -> None:

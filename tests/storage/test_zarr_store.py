@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import files_of, scan
-from storage.contract import BARE, WHOLE, SinkContract, SourceContract
 
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
@@ -15,6 +14,8 @@ from carlasc.storage import FolderSource, Sink, Source, layout
 from carlasc.storage.packed.store import Options
 from carlasc.storage.packed.zarr_store import ZarrSink
 from carlasc.storage.packing import pack
+from carlasc.testing import SinkContract, SourceContract
+from carlasc.testing.data import SCANS, WHOLE
 
 zarr = pytest.importorskip("zarr")
 ENDING = ".zarr"
@@ -98,10 +99,10 @@ def test_labels_and_counts_shrink_to_a_byte_and_other_counts_stay(store: Path) -
 
 def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
     values = [np.array([1, 255]), np.array([256, 3]), np.array([2]), np.array([70000, 0]), np.array([4, 5])]
-    with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(BARE) as writer:
+    with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(SCANS) as writer:
         for frame, labels in enumerate(values):
             writer.write("labels", frame, labels.astype(np.uint32))
-    sequence = carlasc.open(tmp_path / "x.zarr").sequences()[BARE]
+    sequence = carlasc.open(tmp_path / "x.zarr").sequences()[SCANS]
     for frame, labels in enumerate(values):
         assert sequence.read("labels", frame).tolist() == labels.tolist()
     assert sequence.read("labels", 0).dtype == np.uint32
@@ -111,11 +112,11 @@ def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
 def test_a_scan_larger_than_the_first_takes_several_chunks(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     scans = [scan(rng, count) for count in (300, 1000, 40000, 300)]
-    with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(BARE) as writer:
+    with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(SCANS) as writer:
         for frame, arrays in enumerate(scans):
             for name, array in arrays.items():
                 writer.write(name, frame, array)
-    sequence = carlasc.open(tmp_path / "x.zarr").sequences()[BARE]
+    sequence = carlasc.open(tmp_path / "x.zarr").sequences()[SCANS]
     for name in scans[0]:
         for arrays, array in zip(scans, sequence.read_many(name, range(4)), strict=True):
             assert np.array_equal(array, arrays[name])
@@ -174,7 +175,7 @@ def test_another_zarr_store_is_refused(tmp_path: Path) -> None:
 
 def test_an_unfinished_store_is_refused_under_either_name(published: Path, tmp_path: Path) -> None:
     sink = ZarrSink(tmp_path / "x.zarr")
-    sink.sequence(BARE).close()
+    sink.sequence(SCANS).close()
     assert not (tmp_path / "x.zarr").exists()
     with pytest.raises(carlasc.errors.MissingDataError, match=r"x\.zarr\.part: run the same command again"):
         carlasc.open(tmp_path / "x.zarr")
@@ -184,11 +185,11 @@ def test_an_unfinished_store_is_refused_under_either_name(published: Path, tmp_p
 
 def test_a_second_run_keeps_finished_sequences_unless_it_packs_differently(tmp_path: Path) -> None:
     points = np.ones((3, 4), np.float32)
-    with ZarrSink(tmp_path / "x.zarr").sequence(BARE) as writer:
+    with ZarrSink(tmp_path / "x.zarr").sequence(SCANS) as writer:
         writer.write("points", 0, points)
-    assert ZarrSink(tmp_path / "x.zarr").finished(BARE)
+    assert ZarrSink(tmp_path / "x.zarr").finished(SCANS)
     assert not ZarrSink(tmp_path / "x.zarr").finished(WHOLE)
-    assert not ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1)).finished(BARE)
+    assert not ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1)).finished(SCANS)
 
 
 def test_overwriting_takes_a_store_but_no_other_folder(store: Path, tmp_path: Path) -> None:
@@ -211,8 +212,8 @@ def test_senseless_quantisation_is_refused(millimetres: float) -> None:
 def test_votes_keep_the_width_of_their_labels(tmp_path: Path) -> None:
     wide = np.zeros(2, layout.WIDE_VOTES_DTYPE)
     wide["label"] = [3, 300]
-    with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(BARE) as writer:
+    with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(SCANS) as writer:
         writer.write("evaluation/votes", 0, wide)
-    votes = carlasc.open(tmp_path / "x.zarr").sequences()[BARE].read("evaluation/votes", 0)
+    votes = carlasc.open(tmp_path / "x.zarr").sequences()[SCANS].read("evaluation/votes", 0)
     assert votes.dtype == layout.WIDE_VOTES_DTYPE
     assert np.array_equal(votes, wide)

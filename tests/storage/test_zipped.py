@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
-from storage.contract import WHOLE, SourceContract
 
 import carlasc
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import Source
 from carlasc.storage.folders.trees import LocalTree
 from carlasc.storage.folders.zipped import ZipTree
+from carlasc.testing import SourceContract
+from carlasc.testing.data import WHOLE
 
 
 def write_zip(files: dict[str, bytes], path: Path, method: int = zipfile.ZIP_STORED, **flags: bool) -> Path:

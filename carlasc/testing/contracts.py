@@ -1,4 +1,6 @@
-"""What every Source and every Sink must hold: each store's tests subclass these."""
+"""The contract tests of a Source and of a Sink: subclass them, and pytest runs them on your store."""
+
+# ruff: noqa: D102 (the name of a test says what it tests)
 
 from __future__ import annotations
 
@@ -11,29 +13,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import FRAMES, published_bytes, write_dataset
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.storage import FolderSource, Sequence, Sink, Source, layout
-
-WHOLE = "Train/Town01_Light/cartesian"
-BARE = "Val/Town07_Heavy/cartesian"
-GRIDS = "Test/Town10_Medium/cylindrical"
+from carlasc.storage import FolderSource, Sequence, Sink, Source
+from carlasc.testing.data import FRAMES, GRIDS, SCANS, WHOLE, published_bytes, write_dataset
 
 
 def read_sum(sequence: Sequence) -> float:
-    """Sum a scan in another process, and start one more from there."""
+    """Return the sum of a scan's coordinates; run in other processes."""
     return float(sequence.read("points", FRAMES[-1])[:, :3].sum())
 
 
 class SourceContract:
-    """Reads what `write_dataset` wrote, however the store keeps it."""
+    """What a Source must do: it gives the sequences, fields, frames, values and text files that `write_dataset` wrote.
 
-    processes = ("fork", "spawn")  # ways to start processes that are worth a test: a spawn takes two seconds
+    A subclass defines `build`.
+
+    Attributes:
+        processes: ways to start processes in which the source is read as well ("spawn" takes two seconds); empty where it cannot pickle.
+    """
+
+    processes: tuple[str, ...] = ("fork", "spawn")
 
     def build(self, published: Path, folder: Path) -> Source:
-        """Return a source of the same sequences, made in `folder`."""
+        """Return a source of the sequences in `published`, a folder of published files; `folder` is empty and yours to write to."""
         raise NotImplementedError
 
     @pytest.fixture(scope="class")
@@ -52,9 +56,9 @@ class SourceContract:
         return dict(FolderSource(published).sequences())
 
     def test_finds_the_sequences_sorted_by_their_paths(self, source: Source) -> None:
-        assert list(source.sequences()) == sorted([WHOLE, BARE, GRIDS])
+        assert list(source.sequences()) == sorted([WHOLE, SCANS, GRIDS])
 
-    def test_tells_who_they_are(self, source: Source) -> None:
+    def test_sequences_have_their_split_name_and_coordinates(self, source: Source) -> None:
         found = {(s.split, s.name, s.coordinates) for s in source.sequences().values()}
         assert found == {
             ("Train", "Town01_Light", "cartesian"),
@@ -62,7 +66,7 @@ class SourceContract:
             ("Test", "Town10_Medium", "cylindrical"),
         }
 
-    @pytest.mark.parametrize("path", [WHOLE, BARE, GRIDS])
+    @pytest.mark.parametrize("path", [WHOLE, SCANS, GRIDS])
     def test_has_the_same_fields_frames_and_bits(
         self, source: Source, expected: dict[str, Sequence], path: str
     ) -> None:
@@ -77,7 +81,7 @@ class SourceContract:
                 assert published_bytes(name, alone) == published_bytes(name, wanted), (name, frame)
                 assert published_bytes(name, together) == published_bytes(name, wanted), (name, frame)
 
-    @pytest.mark.parametrize("path", [WHOLE, BARE, GRIDS])
+    @pytest.mark.parametrize("path", [WHOLE, SCANS, GRIDS])
     def test_has_the_same_text_files(self, source: Source, expected: dict[str, Sequence], path: str) -> None:
         sequence, reference = source.sequences()[path], expected[path]
         assert set(sequence.documents()) == set(reference.documents())
@@ -98,7 +102,9 @@ class SourceContract:
         for frame, array in zip(order, sequence.read_many("points", order), strict=True):
             assert np.array_equal(array, sequence.read("points", frame))
 
-    def test_coordinates_are_those_of_the_points_also_where_memory_is_used_again(self, source: Source) -> None:
+    def test_read_xyz_gives_the_coordinates_of_the_points_also_into_memory_of_earlier_calls(
+        self, source: Source
+    ) -> None:
         sequence = source.sequences()[WHOLE]
         spare: list[NDArray[np.float32]] = []
         for frames in ([0, 1, 2], [5, 2], [1, 0, 5]):
@@ -109,11 +115,11 @@ class SourceContract:
                 assert xyz[:, :3].tobytes() == points[:, :3].tobytes()
             spare = found
 
-    def test_no_frames_read_are_none(self, source: Source) -> None:
+    def test_reading_no_frames_gives_an_empty_list(self, source: Source) -> None:
         assert source.sequences()[WHOLE].read_many("points", []) == []
 
-    def test_an_absent_field_has_no_frames_and_is_an_error_to_read(self, source: Source) -> None:
-        sequence = source.sequences()[BARE]
+    def test_an_absent_field_has_no_frames_and_reading_it_is_an_error(self, source: Source) -> None:
+        sequence = source.sequences()[SCANS]
         assert len(sequence.frames("flow")) == 0
         with pytest.raises(MissingDataError, match="flow.*labels.*points"):
             sequence.read("flow", 0)
@@ -124,7 +130,7 @@ class SourceContract:
 
     def test_an_absent_text_file_is_an_error(self, source: Source) -> None:
         with pytest.raises(MissingDataError):
-            source.sequences()[BARE].read_document("poses.txt")
+            source.sequences()[SCANS].read_document("poses.txt")
 
     def test_pickles_before_and_after_reading(self, source: Source) -> None:
         sequence = source.sequences()[WHOLE]
@@ -137,13 +143,14 @@ class SourceContract:
     @pytest.mark.parametrize("method", ["fork", "spawn"])
     def test_reads_in_other_processes_after_reading_in_this_one(self, source: Source, method: str) -> None:
         if method not in self.processes:
-            pytest.skip("in the memory of this process only, or tried with another store of the kind")
+            pytest.skip("not among the ways to start processes that this store is tested with")
         sequence = source.sequences()[WHOLE]
         wanted = read_sum(sequence)
         with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(method)) as pool:
             assert list(pool.map(read_sum, [sequence] * 4)) == [wanted] * 4
         assert read_sum(sequence) == wanted
 
+    @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux to list the open files")
     def test_keeps_no_file_open(self, source: Source) -> None:
         sequence = source.sequences()[WHOLE]
         for name in sequence.fields():
@@ -154,16 +161,22 @@ class SourceContract:
 
 
 class SinkContract:
-    """Takes the sequences of `write_dataset`, however it keeps them."""
+    """What a Sink must do: it gives back what it took, and refuses what does not fit.
 
-    rising = True  # whether frames must come in rising order
+    A subclass defines `sink` and `read`.
+
+    Attributes:
+        rising: whether the frames of a field must come in rising order.
+    """
+
+    rising: bool = True
 
     def sink(self, out: Path) -> Sink:
-        """Return a sink that writes `out`."""
+        """Return a sink that writes to `out`, which does not exist yet."""
         raise NotImplementedError
 
     def read(self, out: Path) -> Source:
-        """Return a source of what was written."""
+        """Return a source that reads what the sink wrote to `out`."""
         raise NotImplementedError
 
     @pytest.fixture
@@ -202,51 +215,47 @@ class SinkContract:
                     got, wanted = found[path].read(name, frame), sequence.read(name, frame)
                     assert published_bytes(name, got) == published_bytes(name, wanted), (path, name, frame)
 
-    def test_has_only_what_was_written(self, given: Source, out: Path) -> None:
-        writer = self.sink(out).sequence(BARE)
+    def test_has_nothing_but_what_was_written(self, given: Source, out: Path) -> None:
+        writer = self.sink(out).sequence(SCANS)
         assert not writer.has("points", 0)
-        writer.write("points", 0, given.sequences()[BARE].read("points", 0))
+        writer.write("points", 0, given.sequences()[SCANS].read("points", 0))
         assert writer.has("points", 0)
         assert not writer.has("points", 1)
         assert not writer.has("labels", 0)
 
-    def test_text_files_come_back_before_it_is_closed(self, out: Path) -> None:
-        writer = self.sink(out).sequence(BARE)
+    def test_text_files_can_be_read_before_the_sink_is_closed(self, out: Path) -> None:
+        writer = self.sink(out).sequence(SCANS)
         assert writer.read_document("times.txt") is None
         writer.write_document("times.txt", b"0\n")
         assert writer.read_document("times.txt") == b"0\n"
 
     def test_refuses_an_array_that_does_not_fit(self, out: Path) -> None:
-        writer = self.sink(out).sequence(BARE)
+        writer = self.sink(out).sequence(SCANS)
         with pytest.raises(FormatError, match="N, 4"):
             writer.write("points", 0, np.zeros((5, 3), np.float32))
 
-    def test_refuses_a_field_that_the_layout_lacks(self, out: Path) -> None:
+    def test_refuses_a_field_that_is_not_in_the_layout(self, out: Path) -> None:
         with pytest.raises(FormatError, match="velocity"):
-            self.sink(out).sequence(BARE).write("velocity", 0, np.zeros((5, 3), np.float32))
+            self.sink(out).sequence(SCANS).write("velocity", 0, np.zeros((5, 3), np.float32))
 
     def test_empty_arrays_keep_their_shape(self, out: Path) -> None:
-        with self.sink(out) as sink, sink.sequence(BARE) as writer:
+        with self.sink(out) as sink, sink.sequence(SCANS) as writer:
             writer.write("points", 0, np.zeros((0, 4), np.float32))
             writer.write("flow", 0, np.zeros((0, 3), np.float32))
             writer.write("labels", 0, np.zeros(0, np.uint32))
-        sequence = self.read(out).sequences()[BARE]
+        sequence = self.read(out).sequences()[SCANS]
         assert sequence.read("points", 0).shape == (0, 4)
         assert sequence.read("flow", 0).shape == (0, 3)
         assert sequence.read("labels", 0).shape == (0,)
 
-    def test_refuses_frames_out_of_order_or_takes_them(self, given: Source, out: Path) -> None:
-        labels = given.sequences()[BARE].read("labels", 0)
-        with self.sink(out) as sink, sink.sequence(BARE) as writer:
+    def test_refuses_or_takes_frames_out_of_order(self, given: Source, out: Path) -> None:
+        labels = given.sequences()[SCANS].read("labels", 0)
+        with self.sink(out) as sink, sink.sequence(SCANS) as writer:
             writer.write("labels", 5, labels)
             if self.rising:
                 with pytest.raises(FormatError, match="rising"):
                     writer.write("labels", 4, labels)
             else:
                 writer.write("labels", 4, labels)
-        frames = self.read(out).sequences()[BARE].frames("labels").tolist()
+        frames = self.read(out).sequences()[SCANS].frames("labels").tolist()
         assert frames == ([5] if self.rising else [4, 5])
-
-    def test_the_layout_names_every_field(self, given: Source) -> None:
-        names = {name for sequence in given.sequences().values() for name in sequence.fields()}
-        assert {n.rpartition("/")[2] for n in names} >= {*layout.SCAN_FIELDS, *layout.GRID_FIELDS}

@@ -1,0 +1,106 @@
+"""A small data set with what stores get wrong: gaps in the frames, empty scans, missing fields, grids of several shapes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.storage import layout
+from carlasc.storage.folders.folder import FolderSink
+
+FRAMES = (0, 1, 2, 5)
+"""Frames of the sequence WHOLE."""
+SIZE, SECOND = (4, 6, 2), (8, 4, 3)
+"""Sizes of the two grids."""
+
+WHOLE = "Train/Town01_Light/cartesian"
+SCANS = "Val/Town07_Heavy/cartesian"
+GRIDS = "Test/Town10_Medium/cylindrical"
+"""Paths of the three sequences: one with every field, one of scans without poses, one of grids without scans."""
+
+
+def params(size: tuple[int, int, int], coordinates: str = "cartesian") -> bytes:
+    """Return the bytes of the params.json of a grid."""
+    bounds = {"min_bound": [0.0 if coordinates == "cylindrical" else -25.6, -3.0, -2.0], "max_bound": [25.6, 3.0, 1.0]}
+    return json.dumps(
+        {"grid_size": [float(n) for n in size], **bounds, "num_channels": 25, "coordinates": coordinates}
+    ).encode()
+
+
+def scan(rng: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
+    """Return the fields of a random scan: points, labels, flow and instances."""
+    points = np.zeros((count, 4), np.float32)
+    points[:, :3] = rng.normal(scale=10, size=(count, 3))
+    velocities = np.concatenate([np.zeros((1, 3)), rng.normal(size=(3, 3))]).astype(np.float32)
+    actors = rng.integers(0, 4, count)
+    return {
+        "points": points,
+        "labels": rng.integers(0, 23, count).astype(np.uint32),
+        "flow": velocities[actors],
+        "instances": actors.astype(np.uint32),
+    }
+
+
+def grid(rng: np.random.Generator, size: tuple[int, int, int], whole: bool = True) -> dict[str, NDArray[Any]]:
+    """Return the labels and counts of a random grid; counts are whole numbers, or not."""
+    counts = rng.integers(0, 40, size).astype(np.float32)
+    return {"labels": rng.integers(0, 23, size).astype(np.uint32), "counts": counts if whole else counts / 3}
+
+
+def lines(count: int) -> tuple[bytes, bytes]:
+    """Return the bytes of poses.txt and times.txt of a straight drive."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.arange(count) * 0.7
+    return layout.encode_poses(poses), layout.encode_times(np.arange(count) * layout.FRAME_PERIOD_S)
+
+
+def write_dataset(root: Path, seed: int = 0) -> Path:
+    """Write the sequences WHOLE, SCANS and GRIDS as published files.
+
+    Args:
+        root: folder to write to.
+        seed: of the random numbers.
+
+    Returns:
+        `root`.
+    """
+    rng = np.random.default_rng(seed)
+    sink = FolderSink(root)
+    whole = sink.sequence(WHOLE)
+    for name, data in zip(("poses.txt", "times.txt"), lines(FRAMES[-1] + 1), strict=True):
+        whole.write_document(name, data)
+    whole.write_document("carlasc.json", b'{"format": 2, "axes": "right",  "sensor": "a"}\n')
+    whole.write_document("evaluation/params.json", params(SIZE))
+    whole.write_document("evaluation_8x4x3/params.json", params(SECOND))
+    for frame, count in zip(FRAMES, (0, 1, 777, 1001), strict=True):
+        for name, array in scan(rng, count).items():
+            whole.write(name, frame, array)
+        if frame != 1:  # a frame without grids
+            for part, array in grid(rng, SIZE).items():
+                whole.write(f"evaluation/{part}", frame, array)
+        for part, array in grid(rng, SECOND, whole=False).items():
+            whole.write(f"evaluation_8x4x3/{part}", frame, array)
+        whole.write("bev", frame, rng.integers(0, 256, 300 + frame).astype(np.uint8))
+    scans = sink.sequence(SCANS)
+    for frame in range(3):
+        some = scan(rng, 50 + frame)
+        scans.write("points", frame, some["points"])
+        scans.write("labels", frame, some["labels"])
+    grids = sink.sequence(GRIDS)
+    grids.write_document("evaluation/params.json", params(SIZE, "cylindrical"))
+    for frame in (3, 4):
+        for part, array in grid(rng, SIZE).items():
+            grids.write(f"evaluation/{part}", frame, array)
+    votes = np.zeros(5, layout.VOTES_DTYPE)
+    votes["voxel"], votes["label"], votes["votes"] = [0, 1, 7, 20, 47], [1, 2, 3, 22, 0], [1, 300, 65535, 2, 1]
+    grids.write("evaluation/votes", 4, votes)
+    return root
+
+
+def published_bytes(field: str, array: NDArray[Any]) -> bytes:
+    """Return the bytes of an array's published file: they must be equal, whatever type a store keeps the array in."""
+    return bytes(layout.field_named(field).encode(array, field))
