@@ -10,8 +10,8 @@ from storage.contract import BARE, WHOLE, SinkContract, SourceContract
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source
-from carlasc.storage.packed.hdf5_store import HDF5Sink
-from carlasc.storage.packed.store import Options
+from carlasc.storage.packed.arrays.hdf5_store import HDF5Sink
+from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack
 
 h5py = pytest.importorskip("h5py")
@@ -94,7 +94,7 @@ def test_a_corrupted_chunk_names_field_and_frame(store: Path) -> None:
 
 def test_a_truncated_file_is_one_clear_error(store: Path) -> None:
     store.write_bytes(store.read_bytes()[: store.stat().st_size // 2])
-    with pytest.raises(FormatError, match=r"x\.h5: cannot be read as HDF5.*cut short"):
+    with pytest.raises(FormatError, match=r"x\.h5: cannot be read as HDF5.*truncated"):
         carlasc.open(store)
 
 

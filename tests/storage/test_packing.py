@@ -159,10 +159,13 @@ def test_the_result_counts_bytes_a_field_and_names_what_stays_behind(data: Path,
     assert result.left_out == [f"{PATH}: notes.txt"]
     assert result.sequences == sorted(carlasc.open(root).sequences())
     assert result.frames == 4 + 3 + 2
-    assert result.published["points"] == sum(len(d) for n, d in files.items() if "velodyne" in n)
-    assert result.published["flow"] == sum(len(d) for n, d in files.items() if "predictions" in n)
-    assert result.published["documents"] == sum(len(d) for n, d in files.items() if n.endswith((".txt", ".json"))) - 4
-    assert sum(result.stored.values()) == sum(map(len, files_of(tmp_path / "x.zarr").values()))
+    assert result.published_bytes["points"] == sum(len(d) for n, d in files.items() if "velodyne" in n)
+    assert result.published_bytes["flow"] == sum(len(d) for n, d in files.items() if "predictions" in n)
+    assert (
+        result.published_bytes["documents"]
+        == sum(len(d) for n, d in files.items() if n.endswith((".txt", ".json"))) - 4
+    )
+    assert sum(result.stored_bytes.values()) == sum(map(len, files_of(tmp_path / "x.zarr").values()))
     assert steps[-1][0] == steps[-1][1] == len([n for n in files if n.endswith((".bin", ".label", ".jpg", ".npz"))])
 
 
@@ -170,7 +173,7 @@ def test_the_result_counts_bytes_a_field_and_names_what_stays_behind(data: Path,
 def test_a_place_that_is_taken_is_refused_unless_it_may_be_overwritten(data: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / f"x.{kind}"
     pack(data / "Val", out)
-    with pytest.raises(ConflictError, match="--overwrite"):
+    with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
         pack(data, out)
     assert len(carlasc.open(out).sequences()) == 1
     pack(data, out, overwrite=True)
@@ -182,7 +185,7 @@ def test_unpacking_refuses_a_folder_that_is_there_unless_it_may_write_into_it(da
     pack(data / "Val", tmp_path / "x.zarr")
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "mine.txt").write_text("mine")
-    with pytest.raises(ConflictError, match="--overwrite"):
+    with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
         unpack(tmp_path / "x.zarr", tmp_path / "files")
     unpack(tmp_path / "x.zarr", tmp_path / "files", overwrite=True)
     assert files_of(tmp_path / "files") == files_of(data / "Val") | {"mine.txt": b"mine"}
