@@ -48,7 +48,8 @@ def pack(
 def _print(result: PackResult) -> None:
     from rich.table import Table
 
-    table = Table(title=f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
+    typer.echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
+    table = Table()
     for heading in ("field", "published bytes", "packed bytes", "share"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
     for name in sorted({*result.published_bytes, *result.stored_bytes}):

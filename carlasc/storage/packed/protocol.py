@@ -261,9 +261,8 @@ def node_of(path: str, where: str) -> str:
     Raises:
         FormatError: the path leads out of the store.
     """
-    node = path.strip("/")
-    check_names([node], where)
-    return node or "sequence"
+    check_names([path], where)
+    return path.strip("/") or "sequence"
 
 
 def check_names(names: list[str], where: str) -> None:
