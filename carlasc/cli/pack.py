@@ -1,4 +1,4 @@
-"""`carlasc pack`: one store in the place of a million files."""
+"""`carlasc pack`: one store instead of a million files."""
 
 from __future__ import annotations
 
@@ -14,27 +14,30 @@ if TYPE_CHECKING:
 
 
 def pack(
-    src: Annotated[str, typer.Argument(metavar="SRC", help="Folder, zip or URL with one sequence or many.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Store to write: .zarr, .h5 or .parquet.")],
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Folder, zip or URL with one or more sequences.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Store to write; its ending says which kind: .zarr, .h5 or .parquet.")
+    ],
     small: Annotated[
-        bool, typer.Option("--small", help="PCodec for points (zarr): smaller, but fewer programs read it.")
+        bool,
+        typer.Option("--small", help="Pack points with PCodec (zarr only): smaller, but fewer programs can read it."),
     ] = False,
     lossy_mm: Annotated[
-        float | None, typer.Option(help="Quantise points to so many millimetres. Without it no bit is lost.")
+        float | None, typer.Option(help="Quantise points to this many millimetres. Without it, every bit is kept.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Threads that read ahead.", min=1)] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a store that is there.")] = False,
+    threads: Annotated[int, typer.Option(help="Number of threads that read ahead.", min=1)] = 2,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a store that exists at OUT.")] = False,
     json: Json = False,
 ) -> None:
-    """Pack all sequences of SRC into one store, several times smaller and faster to read; nothing is lost.
+    """Pack all sequences of SOURCE into one store, which is several times smaller. Nothing is lost.
 
-    A run that was cut off is finished by running the same command again.
+    If it is interrupted, run the same command again to finish it.
     """
     from carlasc.storage.packing import pack as pack_sequences
 
     with progress_bar("Packing", "files") as progress:
         result = pack_sequences(
-            src, out, small=small, lossy_mm=lossy_mm, overwrite=overwrite, workers=workers, progress=progress
+            source, out, small=small, lossy_mm=lossy_mm, overwrite=overwrite, threads=threads, progress=progress
         )
     if json:
         print_json(result)
@@ -45,15 +48,16 @@ def pack(
 def _print(result: PackResult) -> None:
     from rich.table import Table
 
-    table = Table(title=f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
-    for heading in ("field", "published", "packed", "share"):
+    typer.echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
+    table = Table()
+    for heading in ("field", "published bytes", "packed bytes", "share"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
-    for name in sorted({*result.published, *result.stored}):
-        before, after = result.published.get(name, 0), result.stored.get(name, 0)
+    for name in sorted({*result.published_bytes, *result.stored_bytes}):
+        before, after = result.published_bytes.get(name, 0), result.stored_bytes.get(name, 0)
         table.add_row(name, f"{before:,}", f"{after:,}", f"{after / before:.1%}" if before else "")
-    before, after = sum(result.published.values()), sum(result.stored.values())
+    before, after = sum(result.published_bytes.values()), sum(result.stored_bytes.values())
     table.add_row("total", f"{before:,}", f"{after:,}", f"{result.ratio:.1%}", style="bold")
     console().print(table)
     if result.left_out:
         more = f" and {len(result.left_out) - 5} more" if len(result.left_out) > 5 else ""
-        typer.echo(f"Left out, unknown to the layout: {', '.join(result.left_out[:5])}{more}")
+        typer.echo(f"Left out, because the layout does not know them: {', '.join(result.left_out[:5])}{more}")

@@ -1,4 +1,4 @@
-"""`carlasc unpack`: the published files again."""
+"""`carlasc unpack`: from a packed store to the published files again."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from carlasc.cli.common import Json, print_json, progress_bar
 
 
 def unpack(
-    src: Annotated[str, typer.Argument(metavar="SRC", help="Packed store (or a zip, or a URL).")],
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Packed store, zip or URL.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
-    workers: Annotated[int | None, typer.Option(help="Threads that read ahead.", min=1)] = None,
+    threads: Annotated[int, typer.Option(help="Number of threads that read ahead.", min=1)] = 2,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write into a folder that is there, over files of the same names.")
+        bool, typer.Option("--overwrite", help="Write into a folder that exists, and replace files of the same names.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Write all sequences of SRC as published files: the very bytes that were packed.
+    """Write all sequences of SOURCE as published files: the same bytes that were packed.
 
-    A run that was cut off is finished by running the same command again.
+    If it is interrupted, run the same command again to finish it.
     """
     from carlasc.storage.packing import unpack as unpack_sequences
 
     with progress_bar("Unpacking", "files") as progress:
-        result = unpack_sequences(src, out, overwrite=overwrite, workers=workers, progress=progress)
+        result = unpack_sequences(source, out, overwrite=overwrite, threads=threads, progress=progress)
     if json:
         print_json(result)
     else:
-        kept = f" ({result.kept} were there from an earlier run)" if result.kept else ""
+        kept = f" ({result.kept} were written by an earlier run)" if result.kept else ""
         typer.echo(f"{result.out}: {len(result.sequences)} sequences, {result.files} files written{kept}")

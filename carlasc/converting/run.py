@@ -201,10 +201,10 @@ def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
                 advice="convert to a folder, then pack it",
             )
         return
-    place, origin = sink.root.resolve(), source.resolve()
+    place, origin = sink.folder.resolve(), source.resolve()
     if place == origin or place.is_relative_to(origin):
         raise ConflictError(
-            sink.root,
+            sink.folder,
             expected=f"a place outside {source}",
             found="one inside it",
             advice="choose another, the source is never written to",

@@ -11,8 +11,8 @@ from carlasc.storage.folders.folder import FolderSource
 from carlasc.storage.folders.published import PublishedSource
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
 from carlasc.storage.folders.zipped import ZipTree
-from carlasc.storage.packed.arraywriter import TABLES_MARK, UNFINISHED_MARK
-from carlasc.storage.packed.store import Options, PackedSink
+from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK
+from carlasc.storage.packed.protocol import Options, PackedSink
 from carlasc.storage.protocol import Source
 
 _ZIP, _EMPTY_ZIP, _HDF5, _PARQUET = b"PK\x03\x04", b"PK\x05\x06", b"\x89HDF\r\n\x1a\n", b"PAR1"
@@ -69,15 +69,15 @@ def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
         DependencyError: a package is missing.
     """
     if path.suffix == ".zarr":
-        from carlasc.storage.packed.zarr_store import ZarrSink
+        from carlasc.storage.packed.arrays.zarr_store import ZarrSink
 
         return ZarrSink(path, options, overwrite)
     if path.suffix in (".h5", ".hdf5"):
-        from carlasc.storage.packed.hdf5_store import HDF5Sink
+        from carlasc.storage.packed.arrays.hdf5_store import HDF5Sink
 
         return HDF5Sink(path, options, overwrite)
     if path.suffix == ".parquet":
-        from carlasc.storage.packed.tablewriter import ParquetSink
+        from carlasc.storage.packed.tables.writing import ParquetSink
 
         return ParquetSink(path, options, overwrite)
     raise ArgumentError(
@@ -102,7 +102,7 @@ def _open_remote(tree: RemoteTree) -> Source:
 def _open_store(tree: Tree) -> Source | None:
     """Open a packed store that is a folder; None where the folder is none."""
     if tree.is_file("zarr.json"):
-        from carlasc.storage.packed.zarr_store import ZarrSource
+        from carlasc.storage.packed.arrays.zarr_store import ZarrSource
 
         return ZarrSource(tree)
     if tree.is_file(UNFINISHED_MARK):
@@ -113,7 +113,7 @@ def _open_store(tree: Tree) -> Source | None:
             advice="run the same command again",
         )
     if tree.is_file(TABLES_MARK):
-        from carlasc.storage.packed.tables import ParquetSource
+        from carlasc.storage.packed.tables.reading import ParquetSource
 
         return ParquetSource(tree)
     return None
@@ -131,7 +131,7 @@ def _open_file(tree: Tree, name: str) -> Source:
         inside = ZipTree(tree, name)
         return _open_store(inside) or PublishedSource(inside)
     if signature.startswith(_HDF5):
-        from carlasc.storage.packed.hdf5_store import HDF5Source
+        from carlasc.storage.packed.arrays.hdf5_store import HDF5Source
 
         return HDF5Source(tree, name)
     if signature.startswith(_PARQUET):

@@ -30,7 +30,7 @@ def make_zip(size: int) -> bytes:
 
 def test_a_split_is_fetched_and_unpacked(tmp_path: Path) -> None:
     with serve(Site({ZIP: make_zip(1000)})) as site:
-        arguments = ["download", "--split", "val", "--to", str(tmp_path), "--base-url", site.url]
+        arguments = ["download", str(tmp_path), "--split", "val", "--base-url", site.url]
         result = CliRunner().invoke(app, [*arguments, "--extract", "--json"])
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["archives"][0]["files"] == 1
@@ -41,12 +41,12 @@ def test_a_split_is_fetched_and_unpacked(tmp_path: Path) -> None:
     "arguments", [["--split", "dev"], [], ["--what", "fine", "--split", "val"], ["--split", "val", "--keep"]]
 )
 def test_wrong_usage_exits_2(tmp_path: Path, arguments: list[str]) -> None:
-    assert CliRunner().invoke(app, ["download", "--to", str(tmp_path), *arguments]).exit_code == 2
+    assert CliRunner().invoke(app, ["download", str(tmp_path), *arguments]).exit_code == 2
 
 
 def test_a_missing_zip_exits_1_with_one_line(tmp_path: Path) -> None:
     with serve(Site({})) as site:
-        arguments = ["download", "--split", "val", "--to", str(tmp_path), "--base-url", site.url]
+        arguments = ["download", str(tmp_path), "--split", "val", "--base-url", site.url]
         result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 1
     assert "status 404" in result.stderr
@@ -57,7 +57,7 @@ def test_ctrl_c_keeps_what_came_and_the_next_run_goes_on(tmp_path: Path) -> None
     content = make_zip(40 << 20)
     with serve(Site({ZIP: content})) as site:
         site.before = lambda number: time.sleep(0.5 if number > 2 else 0)
-        arguments = ["download", "--split", "val", "--to", str(tmp_path), "--base-url", site.url, "--connections", "1"]
+        arguments = ["download", str(tmp_path), "--split", "val", "--base-url", site.url, "--connections", "1"]
         listen = (
             "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background job ignores it
         )

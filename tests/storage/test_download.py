@@ -15,11 +15,10 @@ import pytest
 from helpers.http_server import Site, serve
 
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
-from carlasc.storage.downloads import archives, download, extraction
-from carlasc.storage.downloads.transfer import Settings
+from carlasc.storage.downloads import TransferSettings, archives, download, extraction
 
 VAL = "/val_cartesian.zip"
-QUICK = Settings(connections=3, block=20_000, wait_s=0.01)
+QUICK = TransferSettings(connections=3, block_bytes=20_000, wait_s=0.01)
 MEMBERS = {f"Val/Town07_Light/cartesian/velodyne/{i:06d}.bin": 9_000 + 16 * i for i in range(20)}
 
 
@@ -130,8 +129,8 @@ def test_a_file_that_keeps_changing_is_given_up_with_one_line(site: Site, tmp_pa
         site.files[VAL] = make_zip(number)
 
     site.before = change
-    with pytest.raises(FormatError, match="keeps changing"):
-        get(site, tmp_path, settings=Settings(1, 20_000, 0.01))
+    with pytest.raises(FormatError, match="a changed one at each of 3 tries"):
+        get(site, tmp_path, settings=TransferSettings(1, 20_000, 0.01))
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
@@ -222,31 +221,31 @@ def test_too_little_room_is_told_before_anything_is_written(
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) + 10))
-    with pytest.raises(CarlascError, match="free space for the zips and what is in them"):
-        get(site, tmp_path, unpack=True)
+    with pytest.raises(CarlascError, match="free space for the zips and the files in them"):
+        get(site, tmp_path, extract=True)
     assert names(tmp_path) == []
     assert get(site, tmp_path).exists()
 
 
 def test_unpacking_gives_the_files_removes_the_zip_and_is_not_done_twice(site: Site, tmp_path: Path) -> None:
-    assert not get(site, tmp_path, unpack=True).exists()
+    assert not get(site, tmp_path, extract=True).exists()
     with zipfile.ZipFile(io.BytesIO(site.files[VAL])) as archive:
         for name in MEMBERS:
             assert (tmp_path / name).read_bytes() == archive.read(name)
     count = len(site.requests)
-    result = download(tmp_path, split="val", base_url=site.url, unpack=True)
+    result = download(tmp_path, split="val", base_url=site.url, extract=True)
     assert len(site.requests) == count
     assert result.archives[0].files == len(MEMBERS)
 
 
 def test_unpacking_can_keep_the_zip(site: Site, tmp_path: Path) -> None:
-    assert get(site, tmp_path, unpack=True, keep=True).exists()
+    assert get(site, tmp_path, extract=True, keep=True).exists()
 
 
 def test_grids_are_unpacked_beside_the_sequences_not_over_them(site: Site, tmp_path: Path) -> None:
     member = "Val/Town07_Light/cartesian/evaluation/000000.bin"
     site.files["/eval_fine.zip"] = make_zip(3, {member: 64})
-    download(tmp_path, what="fine", base_url=site.url, unpack=True, settings=QUICK)
+    download(tmp_path, what="fine", base_url=site.url, extract=True, settings=QUICK)
     assert (tmp_path / "eval_fine" / member).stat().st_size == 64
 
 
@@ -255,7 +254,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused_before_anything_is_unpac
     path = tmp_path / "x.zip"
     path.write_bytes(make_zip(0, {"good": 10, name: 10}))
     with pytest.raises(FormatError, match="names inside the folder"):
-        extraction.extract(path, tmp_path / "out", lambda _: None)
+        extraction.extract_zip(path, tmp_path / "out", lambda _: None)
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "evil").exists()
 
@@ -266,7 +265,7 @@ def test_a_link_in_a_zip_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(link, "/etc/passwd")
     with pytest.raises(FormatError, match="found the link"):
-        extraction.extract(path, tmp_path / "out", lambda _: None)
+        extraction.extract_zip(path, tmp_path / "out", lambda _: None)
 
 
 def test_a_damaged_member_is_named_and_not_left_half_written(tmp_path: Path) -> None:
@@ -276,22 +275,22 @@ def test_a_damaged_member_is_named_and_not_left_half_written(tmp_path: Path) -> 
     path = tmp_path / "x.zip"
     path.write_bytes(content)
     with pytest.raises(FormatError, match="damaged.*'b'"):
-        extraction.extract(path, tmp_path / "out", lambda _: None)
+        extraction.extract_zip(path, tmp_path / "out", lambda _: None)
     assert names(tmp_path / "out") == ["a"]
 
 
 def test_unpacking_goes_on_after_an_interruption_and_refuses_foreign_files(tmp_path: Path) -> None:
     path, out = tmp_path / "x.zip", tmp_path / "out"
     path.write_bytes(make_zip(0, {"a": 100, "b": 200}))
-    extraction.extract(path, out, lambda _: None)
+    extraction.extract_zip(path, out, lambda _: None)
     stamp = (out / "a").stat().st_mtime_ns
     (out / "b").unlink()
-    assert extraction.extract(path, out, lambda _: None) == 2
+    assert extraction.extract_zip(path, out, lambda _: None) == 2
     assert (out / "a").stat().st_mtime_ns == stamp
     assert (out / "b").stat().st_size == 200
     (out / "b").write_bytes(b"other")
     with pytest.raises(ConflictError, match="another"):
-        extraction.extract(path, out, lambda _: None)
+        extraction.extract_zip(path, out, lambda _: None)
 
 
 def test_the_table_answers_for_each_split_and_kind() -> None:

@@ -9,8 +9,8 @@ from helpers.sequences import scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source
-from carlasc.storage.packed.hdf5_store import HDF5Sink
-from carlasc.storage.packed.store import Options
+from carlasc.storage.packed.arrays.hdf5_store import HDF5Sink
+from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
@@ -95,7 +95,7 @@ def test_a_corrupted_chunk_names_field_and_frame(store: Path) -> None:
 
 def test_a_truncated_file_is_one_clear_error(store: Path) -> None:
     store.write_bytes(store.read_bytes()[: store.stat().st_size // 2])
-    with pytest.raises(FormatError, match=r"x\.h5: cannot be read as HDF5.*cut short"):
+    with pytest.raises(FormatError, match=r"x\.h5: cannot be read as HDF5.*truncated"):
         carlasc.open(store)
 
 

@@ -21,6 +21,7 @@ import carlasc
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.storage import FolderSink, FolderSource
+from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack, unpack
 
 KINDS = ("zarr", "h5", "parquet")
@@ -159,10 +160,13 @@ def test_the_result_counts_bytes_a_field_and_names_what_stays_behind(data: Path,
     assert result.left_out == [f"{PATH}: notes.txt"]
     assert result.sequences == sorted(carlasc.open(root).sequences())
     assert result.frames == 4 + 3 + 2
-    assert result.published["points"] == sum(len(d) for n, d in files.items() if "velodyne" in n)
-    assert result.published["flow"] == sum(len(d) for n, d in files.items() if "predictions" in n)
-    assert result.published["documents"] == sum(len(d) for n, d in files.items() if n.endswith((".txt", ".json"))) - 4
-    assert sum(result.stored.values()) == sum(map(len, files_of(tmp_path / "x.zarr").values()))
+    assert result.published_bytes["points"] == sum(len(d) for n, d in files.items() if "velodyne" in n)
+    assert result.published_bytes["flow"] == sum(len(d) for n, d in files.items() if "predictions" in n)
+    assert (
+        result.published_bytes["documents"]
+        == sum(len(d) for n, d in files.items() if n.endswith((".txt", ".json"))) - 4
+    )
+    assert sum(result.stored_bytes.values()) == sum(map(len, files_of(tmp_path / "x.zarr").values()))
     assert steps[-1][0] == steps[-1][1] == len([n for n in files if n.endswith((".bin", ".label", ".jpg", ".npz"))])
 
 
@@ -170,7 +174,7 @@ def test_the_result_counts_bytes_a_field_and_names_what_stays_behind(data: Path,
 def test_a_place_that_is_taken_is_refused_unless_it_may_be_overwritten(data: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / f"x.{kind}"
     pack(data / "Val", out)
-    with pytest.raises(ConflictError, match="--overwrite"):
+    with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
         pack(data, out)
     assert len(carlasc.open(out).sequences()) == 1
     pack(data, out, overwrite=True)
@@ -182,7 +186,7 @@ def test_unpacking_refuses_a_folder_that_is_there_unless_it_may_write_into_it(da
     pack(data / "Val", tmp_path / "x.zarr")
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "mine.txt").write_text("mine")
-    with pytest.raises(ConflictError, match="--overwrite"):
+    with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
         unpack(tmp_path / "x.zarr", tmp_path / "files")
     unpack(tmp_path / "x.zarr", tmp_path / "files", overwrite=True)
     assert files_of(tmp_path / "files") == files_of(data / "Val") | {"mine.txt": b"mine"}
@@ -325,3 +329,73 @@ def test_the_command_line_tells_wrong_usage_from_failure(
     assert result.exit_code == code
     assert result.stderr.startswith("carlasc: ")
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("kind", ["h5", "parquet"])
+def test_only_zarr_has_a_small_kind_and_the_command_names_the_option(data: Path, tmp_path: Path, kind: str) -> None:
+    result = runner.invoke(app, ["pack", str(data), str(tmp_path / f"x.{kind}"), "--small"])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("carlasc: --small: expected a .zarr store")
+    assert result.stderr.endswith("leave `--small` out\n")
+
+
+def test_no_threads_are_an_argument_error(data: Path, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="threads: expected 1 or more, found 0"):
+        pack(data, tmp_path / "x.h5", threads=0)
+    with pytest.raises(ArgumentError, match="threads: expected 1 or more, found 0"):
+        unpack(data, tmp_path / "files", threads=0)
+
+
+def test_results_say_how_long_it_took(data: Path, tmp_path: Path) -> None:
+    began = time.perf_counter()
+    packed = pack(data / "Val", tmp_path / "x.h5")
+    unpacked = unpack(tmp_path / "x.h5", tmp_path / "files")
+    assert packed.elapsed_s > 0 and unpacked.elapsed_s > 0
+    assert packed.elapsed_s + unpacked.elapsed_s <= time.perf_counter() - began
+
+
+def test_unpacking_over_a_folder_replaces_its_files_and_counts_them(data: Path, tmp_path: Path) -> None:
+    pack(data / "Val", tmp_path / "x.h5")
+    first = unpack(tmp_path / "x.h5", tmp_path / "files")
+    assert (first.files, first.kept) == (6, 0)
+    damaged = next((tmp_path / "files").rglob("000001.label"))
+    damaged.write_bytes(b"damaged!")
+    steps: list[tuple[int, int]] = []
+    again = unpack(
+        tmp_path / "x.h5", tmp_path / "files", overwrite=True, progress=lambda done, total: steps.append((done, total))
+    )
+    assert (again.files, again.kept) == (6, 0)
+    assert steps[-1] == (6, 6)
+    assert files_of(tmp_path / "files") == files_of(data / "Val")
+
+
+def test_a_continued_unpacking_counts_the_files_that_it_kept(data: Path, tmp_path: Path) -> None:
+    pack(data / "Val", tmp_path / "x.h5")
+    unpack(tmp_path / "x.h5", tmp_path / "files").out.rename(tmp_path / "files.part")
+    next((tmp_path / "files.part").rglob("000001.label")).unlink()
+    steps: list[tuple[int, int]] = []
+    result = unpack(tmp_path / "x.h5", tmp_path / "files", progress=lambda done, total: steps.append((done, total)))
+    assert (result.files, result.kept) == (1, 5)
+    assert steps[-1] == (6, 6)
+
+
+@pytest.mark.parametrize("millimetres", [0.001, 1000])
+def test_the_limits_of_quantisation(millimetres: float) -> None:
+    assert Options(lossy_mm=millimetres).scale_m == millimetres / 1000
+
+
+def test_leftovers_of_an_older_replacement_are_removed(data: Path, tmp_path: Path) -> None:
+    pack(data / "Val", tmp_path / "x.h5")
+    (tmp_path / "x.h5.old").mkdir()
+    (tmp_path / "x.h5.old" / "file").write_bytes(b"1")
+    pack(data / "Val", tmp_path / "x.h5", overwrite=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.h5"]
+
+
+def test_a_file_that_appears_meanwhile_is_not_overwritten(data: Path, tmp_path: Path) -> None:
+    def appear(done: int, total: int) -> None:
+        (tmp_path / "x.h5").write_bytes(b"diary")
+
+    with pytest.raises(ConflictError, match=r"x\.h5: expected nothing there, found a file"):
+        pack(data / "Val", tmp_path / "x.h5", progress=appear)
+    assert (tmp_path / "x.h5").read_bytes() == b"diary"

@@ -184,7 +184,7 @@ def test_a_server_without_ranges_is_told_apart_before_anything_is_fetched(
     folder, url, handler = site
     write_zip(files_of(published), folder / "other.zip")
     monkeypatch.setattr(handler, "ranges", False)
-    with pytest.raises(CarlascError, match=r"other\.zip: expected a server that answers range requests.*download"):
+    with pytest.raises(CarlascError, match=r"other\.zip: expected a server that supports range requests.*download"):
         carlasc.open(f"{url}/other.zip")
 
 

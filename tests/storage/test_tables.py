@@ -10,8 +10,8 @@ from helpers.sequences import FRAMES
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import FolderSource, Sink, Source
-from carlasc.storage.packed.store import Options
-from carlasc.storage.packed.tablewriter import ParquetSink
+from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.tables.writing import ParquetSink
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
@@ -95,7 +95,7 @@ def test_a_truncated_table_is_one_clear_error(store: Path) -> None:
 
 def test_a_missing_table_is_damage(store: Path) -> None:
     (store / WHOLE / "points.parquet").unlink()
-    with pytest.raises(FormatError, match="damaged store"):
+    with pytest.raises(FormatError, match="the store is damaged"):
         carlasc.open(store).sequences()[WHOLE].read("points", 5)
 
 

@@ -11,8 +11,8 @@ from helpers.sequences import files_of, scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source, layout
-from carlasc.storage.packed.store import Options
-from carlasc.storage.packed.zarr_store import ZarrSink
+from carlasc.storage.packed.arrays.zarr_store import ZarrSink
+from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
@@ -193,7 +193,7 @@ def test_a_second_run_keeps_finished_sequences_unless_it_packs_differently(tmp_p
 
 
 def test_overwriting_takes_a_store_but_no_other_folder(store: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConflictError, match="--overwrite"):
+    with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
         ZarrSink(store)
     with ZarrSink(store, overwrite=True):
         assert carlasc.open(store).sequences()  # the old one stands until the new one is finished

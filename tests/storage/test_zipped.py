@@ -78,7 +78,7 @@ def test_every_member_equals_what_zipfile_reads(archive: Path) -> None:
 def test_a_truncated_zip_says_that_it_is_cut_short(archive: Path, keep: float) -> None:
     data = archive.read_bytes()
     archive.write_bytes(data[: int(len(data) * keep)])
-    with pytest.raises(FormatError, match=r"data\.zip: .*cut short") as caught:
+    with pytest.raises(FormatError, match=r"data\.zip: .*truncated") as caught:
         carlasc.open(archive).sequences()
     assert "\n" not in str(caught.value)
 
@@ -103,7 +103,7 @@ def test_a_damaged_record_of_the_directory_is_one_clear_error(archive: Path) -> 
     (start,) = struct.unpack_from("<I", data, data.rindex(b"PK\x05\x06") + 16)
     data[data.index(b"PK\x01\x02", start + 4)] ^= 0xFF
     archive.write_bytes(data)
-    with pytest.raises(FormatError, match="member 1's record"):
+    with pytest.raises(FormatError, match="the record of member 1"):
         carlasc.open(archive).sequences()
 
 
@@ -127,7 +127,7 @@ def test_a_flipped_bit_in_a_member_names_it(files: dict[str, bytes], tmp_path: P
     data[start + 1000] ^= 4
     archive.write_bytes(data)
     sequence = carlasc.open(archive).sequences()[WHOLE]
-    with pytest.raises(FormatError, match=r"velodyne/000005\.bin: .*damaged zip"):
+    with pytest.raises(FormatError, match=r"velodyne/000005\.bin: .*the zip is damaged"):
         sequence.read("points", 5)
     assert len(sequence.read("points", 2)) == 777
 

@@ -1,5 +1,6 @@
-"""Fetching the published zips: what there is (`archives`), how it comes here whole (`transfer`), unpacking (`extraction`)."""
+"""Downloading the published zips: their list (`archives`), transfer (`transfer`), and extraction (`extraction`)."""
 
 from carlasc.storage.downloads.fetching import Downloaded, DownloadResult, download
+from carlasc.storage.downloads.transfer import TransferSettings
 
-__all__ = ["DownloadResult", "Downloaded", "download"]
+__all__ = ["DownloadResult", "Downloaded", "TransferSettings", "download"]

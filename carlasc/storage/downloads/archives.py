@@ -1,4 +1,4 @@
-"""The published zips as one table (FORMAT section 1)."""
+"""The published zips as one table (see the format page, `docs/format.md#layout`)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Archive:
 
     Attributes:
         name: file name.
-        what: "sequences" (scans, poses, coarse Cartesian grids), or the grids alone: "fine", "cylindrical".
-        split: "train", "val", "test"; None where it holds all of them.
-        url: where it is.
-        gigabytes: about how large it is.
+        what: "sequences" (scans, poses, coarse Cartesian grids), or grids alone: "fine", "cylindrical".
+        split: "train", "val", "test"; None if it holds all of them.
+        url: its URL.
+        gigabytes: its approximate size.
     """
 
     name: str
@@ -31,9 +31,9 @@ class Archive:
 
     @property
     def folder(self) -> str:
-        """Folder that it is unpacked into, below the one asked for.
+        """Folder that it is extracted to, inside the one that the user chose.
 
-        The eval zips go to their own: their folders have the names of the coarse grids', and are a second root to readers.
+        The grids' zips have folders of their own: in them, the grids have the same names as the coarse grids of the sequences.
         """
         return "." if self.what == SEQUENCES else self.name.removesuffix(".zip")
 
@@ -55,24 +55,29 @@ ARCHIVES = (
 
 
 def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
-    """Return the zips that hold what is asked for.
+    """Return the zips of some splits, or of some grids.
 
     Args:
-        splits: "train", "val", "test" or "all", in any case; none for the grids, which come for all splits at once.
+        splits: "train", "val", "test" or "all", in any case; none for grids, whose zips hold all splits.
         what: "sequences", "fine" or "cylindrical".
 
     Raises:
-        ArgumentError: an unknown split or kind, or a split where none can be chosen.
+        ArgumentError: `splits` or `what` is unknown, or a split is given for grids.
     """
     kinds = tuple(dict.fromkeys(archive.what for archive in ARCHIVES))
     if what not in kinds:
-        raise ArgumentError("what", expected=f"one of {', '.join(kinds)}", found=f"{what!r}")
+        raise ArgumentError("what", expected=f"one of {', '.join(kinds)}", found=repr(what))
     known = tuple(dict.fromkeys(archive.split for archive in ARCHIVES if archive.split))
     wanted = {split.lower() for split in splits}
     if unknown := wanted - {*known, "all"}:
-        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found=f"{', '.join(sorted(unknown))}")
+        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found=", ".join(sorted(unknown)))
     if what != SEQUENCES and wanted - {"all"}:
-        raise ArgumentError(f"split: expected none, the {what} grids come in one zip for all splits: leave it out")
+        raise ArgumentError(
+            "split",
+            expected=f"none with {what} grids",
+            found=", ".join(sorted(wanted)),
+            advice="leave it out: one zip holds the grids of all splits",
+        )
     if what == SEQUENCES and not wanted:
         raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found="none")
     return tuple(

@@ -1,4 +1,4 @@
-"""Ranges of a file over HTTP, believed only when every header says what was asked for."""
+"""Ranges of a file over HTTP, accepted only if all headers agree with the request."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _FULL, _PARTIAL = 200, 206
 
 
 class InterruptionError(Exception):
-    """The connection broke or the server stumbled: worth another try."""
+    """The connection was interrupted or the server failed: the request may be repeated."""
 
 
 class ChangedError(Exception):
-    """The file at the other end is no longer the one that was begun."""
+    """The file on the server has changed since the transfer began."""
 
 
 class RangeIgnoredError(Exception):
-    """The server sent the whole file where a range was asked for."""
+    """The server sent the whole file instead of the requested range."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class RemoteFile:
     """What a server says of a file.
 
     Attributes:
-        url: where it is.
-        size: bytes; None where the server does not say.
-        validator: its ETag, or else its date: tells whether it has changed. None where the server gives neither.
-        ranges: whether the server sends parts of it.
+        url: its URL.
+        size: its bytes; None if the server does not say.
+        validator: its ETag, or else its date, which tell whether it has changed; None if the server sends neither.
+        ranges: whether the server supports range requests.
     """
 
     url: str
@@ -49,12 +49,12 @@ class RemoteFile:
 
 
 def probe(url: str) -> RemoteFile:
-    """Ask for the first bytes of a zip: they tell its size, whether ranges work, and whether it is a zip at all.
+    """Request the first bytes of a zip, to learn its size, whether ranges are supported, and whether it is a zip.
 
     Raises:
-        InterruptionError: the server cannot be reached just now.
-        MissingDataError: the file is not there, or not for us.
-        FormatError: what is there is no zip.
+        InterruptionError: the server cannot be reached now.
+        MissingDataError: the file does not exist, or access is denied.
+        FormatError: the file is not a zip.
     """
     with _request(url, {"Range": f"bytes=0-{len(_ZIP) - 1}"}) as response:
         partial = response.status == _PARTIAL
@@ -73,7 +73,7 @@ def read_range(file: RemoteFile, start: int, stop: int, piece: int) -> Iterator[
     """Yield the bytes [start, stop) of a file in pieces.
 
     Raises:
-        InterruptionError: the connection broke, or the server sent another range than was asked for; what was yielded is good.
+        InterruptionError: the connection was interrupted, or the server sent another range; what was yielded is correct.
         ChangedError: the file has changed; nothing was yielded.
         RangeIgnoredError: the server sent the whole file; nothing was yielded.
     """
@@ -96,10 +96,10 @@ def read_range(file: RemoteFile, start: int, stop: int, piece: int) -> Iterator[
 
 
 def read_whole(file: RemoteFile, piece: int) -> Iterator[bytes]:
-    """Yield a whole file in pieces, from a server that knows no ranges.
+    """Yield a whole file in pieces, from a server without range requests.
 
     Raises:
-        InterruptionError: the connection broke: what was yielded is the file's beginning.
+        InterruptionError: the connection was interrupted; what was yielded is the beginning of the file.
         ChangedError: the file has changed; nothing was yielded.
     """
     with _request(file.url, {}) as response:
@@ -137,7 +137,7 @@ def _request(url: str, headers: dict[str, str]) -> Iterator[HTTPResponse]:
     except (OSError, http.client.HTTPException) as error:
         raise InterruptionError(str(error) or type(error).__name__) from error
     except ValueError as error:
-        raise CarlascError(url, expected="a URL", found="something else", advice=f"{error}") from error
+        raise CarlascError(url, expected="a URL", found=f"something else ({error})") from error
     with response:
         yield response
 
@@ -152,7 +152,7 @@ def _length(response: HTTPResponse) -> int | None:
 
 
 def _total(response: HTTPResponse, url: str) -> int:
-    """The size of the whole file, from Content-Range."""
+    """Return the size of the whole file, from Content-Range."""
     text = response.headers.get("Content-Range", "")
     match = re.fullmatch(r"bytes [0-9]+-[0-9]+/([0-9]+)", text)
     if match is None:

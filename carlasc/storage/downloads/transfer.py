@@ -1,6 +1,6 @@
-"""Bringing one file here whole: in blocks, over several connections, going on where an earlier run stopped.
+"""Fetching one file: in blocks, over several connections, continuing where an earlier run stopped.
 
-Bytes go to `<name>.part`, and which blocks are there to `<name>.part.json` beside it; the file takes its name only when every byte has come.
+Bytes are written to `<name>.part`, and the list of the blocks in it to `<name>.part.json`. The file gets its name when it is whole.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from carlasc.errors import CarlascError, FormatError
+from carlasc.errors import ArgumentError, CarlascError, FormatError
 from carlasc.storage.downloads.http import (
     ChangedError,
     InterruptionError,
@@ -30,29 +30,37 @@ _T = TypeVar("_T")
 
 _BLOCK = 16 << 20
 _PIECE = 256 << 10
-_TRIES = 6  # without a byte of progress between
-_RESTARTS = 3  # because the file changed
-_WAIT_S = 0.5  # before the second try, then twice as long each time
+_TRIES = 6  # in succession without a byte of progress
+_RESTARTS = 3  # after the file has changed
+_WAIT_S = 0.5  # before the second try; then twice as long each time
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How a transfer goes about it; the defaults suit files of gigabytes.
+class TransferSettings:
+    """How files are fetched; the defaults suit files of gigabytes.
 
     Attributes:
-        connections: blocks that come at once.
-        block: bytes of a block.
-        wait_s: pause before the second try of a request; doubles from try to try.
+        connections: number of blocks that are fetched at once.
+        block_bytes: bytes per block.
+        wait_s: seconds before the second try of a request; they double from try to try.
+
+    Raises:
+        ArgumentError: a value below 1, or a negative time.
     """
 
     connections: int = 4
-    block: int = _BLOCK
+    block_bytes: int = _BLOCK
     wait_s: float = _WAIT_S
+
+    def __post_init__(self) -> None:
+        for name, least in (("connections", 1), ("block_bytes", 1), ("wait_s", 0)):
+            if not getattr(self, name) >= least:
+                raise ArgumentError(name, expected=f"{least} or more", found=str(getattr(self, name)))
 
 
 @dataclass
 class _State:
-    """Which bytes of which file are in the .part file: for each block, how many from its start."""
+    """Which bytes of a file are in the .part file: for each block, how many from its start."""
 
     file: RemoteFile
     block: int
@@ -63,44 +71,44 @@ class _State:
         return sum(self.got.values())
 
     def stop(self, index: int) -> int:
-        """Where a block ends in the file."""
+        """Return the end of a block in the file."""
         return min((index + 1) * self.block, self.file.size or 0)
 
     @property
     def open_blocks(self) -> list[int]:
-        """The blocks that are not whole."""
+        """The blocks that are not complete."""
         count = -(-(self.file.size or 0) // self.block)
         return [i for i in range(count) if i * self.block + self.got.get(i, 0) < self.stop(i)]
 
 
-def find_file(url: str, settings: Settings) -> RemoteFile:
-    """Ask the server for a file, some times over if need be.
+def find_file(url: str, settings: TransferSettings) -> RemoteFile:
+    """Ask the server for a file, several times if necessary.
 
     Raises:
-        CarlascError: it cannot be reached, is not there, or is no zip.
+        CarlascError: the server cannot be reached, or the file does not exist or is not a zip.
     """
     return _persistently(lambda: probe(url), url, settings, threading.Event())
 
 
-def remaining_bytes(file: RemoteFile, path: Path, settings: Settings) -> int:
-    """Return how many bytes are still to come, given what an earlier run has left."""
+def remaining_bytes(file: RemoteFile, path: Path, settings: TransferSettings) -> int:
+    """Return how many bytes are left to fetch after an earlier run."""
     return (file.size or 0) - _load(file, path, settings).total
 
 
-def transfer(file: RemoteFile, path: Path, settings: Settings, advance: Callable[[int], None]) -> int:
-    """Fetch a file to `path`, going on with what an earlier run has left.
+def transfer(file: RemoteFile, path: Path, settings: TransferSettings, advance: Callable[[int], None]) -> int:
+    """Fetch a file to `path`, continuing what an earlier run has left.
 
     Args:
-        file: as `find_file` found it.
-        path: where it goes; `path` is there only when it is whole.
+        file: the file, from `find_file`.
+        path: where it is written; it exists only when it is whole.
         settings: connections, blocks.
-        advance: called with the number of bytes that came; negative where some are thrown away. From one thread at a time.
+        advance: called with the number of bytes that arrived, from one thread at a time; negative where bytes are discarded.
 
     Returns:
-        The number of bytes that an earlier run had brought.
+        The number of bytes that an earlier run had fetched.
 
     Raises:
-        CarlascError: the server gave up, or keeps changing the file. What came stays for the next run.
+        CarlascError: the server cannot be reached, or the file keeps changing. What was fetched stays for the next run.
     """
     resumed = 0
     for _ in range(_RESTARTS):
@@ -118,16 +126,16 @@ def transfer(file: RemoteFile, path: Path, settings: Settings, advance: Callable
             advance(-state.total)
             _discard(path)
             file = find_file(file.url, settings)
-        except RangeIgnoredError:  # it said it knew ranges
+        except RangeIgnoredError:  # the server had announced range requests
             advance(-state.total)
             _discard(path)
             file = RemoteFile(file.url, file.size, file.validator, ranges=False)
     raise FormatError(
-        file.url, expected="one file", found=f"another at each of {_RESTARTS} tries", advice="it keeps changing"
+        file.url, expected="a file that stays the same", found=f"a changed one at each of {_RESTARTS} tries"
     )
 
 
-def _fetch_blocks(state: _State, path: Path, settings: Settings, advance: Callable[[int], None]) -> None:
+def _fetch_blocks(state: _State, path: Path, settings: TransferSettings, advance: Callable[[int], None]) -> None:
     stop, lock = threading.Event(), threading.Lock()
     descriptor = os.open(_part(path), os.O_RDWR | os.O_CREAT, 0o666)
     executor = ThreadPoolExecutor(settings.connections, thread_name_prefix="download")
@@ -155,14 +163,14 @@ def _fetch_blocks(state: _State, path: Path, settings: Settings, advance: Callab
         for future in done:
             future.result()
     finally:
-        stop.set()  # Ctrl-C and a failed block stop the others at their next piece; what they got counts
+        stop.set()  # after Ctrl-C or a failed block, the others stop at their next piece; their bytes count
         executor.shutdown(wait=True, cancel_futures=True)
         _save(state, path, descriptor)
         os.close(descriptor)
 
 
-def _fetch_stream(state: _State, path: Path, settings: Settings, advance: Callable[[int], None]) -> None:
-    """Fetch from a server without ranges: from the start each time, so nothing is kept of a try that failed."""
+def _fetch_stream(state: _State, path: Path, settings: TransferSettings, advance: Callable[[int], None]) -> None:
+    """Fetch from a server without range requests: each try begins again at the start."""
 
     def one_try() -> None:
         advance(-state.total)
@@ -179,11 +187,11 @@ def _fetch_stream(state: _State, path: Path, settings: Settings, advance: Callab
 def _persistently(
     work: Callable[[], _T],
     url: str,
-    settings: Settings,
+    settings: TransferSettings,
     stop: threading.Event,
     measure: Callable[[], int] = lambda: 0,
 ) -> _T:
-    """Do the work, again after an interruption; give up after some tries that brought nothing."""
+    """Call `work`, again after an interruption; give up after several tries without progress."""
     tries, before = 0, measure()
     while True:
         try:
@@ -196,15 +204,15 @@ def _persistently(
                     url,
                     expected="data",
                     found=f"none at {tries} tries ({error})",
-                    advice="run the same command again to go on",
+                    advice="run the same command again to continue",
                 ) from error
             if stop.wait(settings.wait_s * 2 ** (tries - 1)):
-                raise CarlascError(f"{url}: stopped") from error
+                raise CarlascError(url, problem="stopped") from error
 
 
-def _load(file: RemoteFile, path: Path, settings: Settings) -> _State:
-    """Find what an earlier run has left of this very file; anything else is thrown away."""
-    fresh = _State(file, settings.block)
+def _load(file: RemoteFile, path: Path, settings: TransferSettings) -> _State:
+    """Return what an earlier run has fetched of the same file, or nothing if the file has changed."""
+    fresh = _State(file, settings.block_bytes)
     part, record = _part(path), _record(path)
     if not (part.is_file() and record.is_file() and file.ranges):
         return fresh
@@ -214,12 +222,12 @@ def _load(file: RemoteFile, path: Path, settings: Settings) -> _State:
         same = (values["url"], values["size"], values["validator"]) == (file.url, file.size, file.validator)
     except (FormatError, KeyError, TypeError, ValueError, AttributeError):
         return fresh
-    # without a validator the same size is no proof of the same file
+    # Without a validator, an equal size does not prove that it is the same file.
     return state if same and file.validator is not None and part.stat().st_size == file.size else fresh
 
 
 def _save(state: _State, path: Path, descriptor: int) -> None:
-    """Record what is there, after it has reached the disk."""
+    """Record which bytes were fetched, after they have reached the disk."""
     os.fsync(descriptor)
     file = state.file
     got = {str(index): count for index, count in sorted(state.got.items())}
@@ -230,11 +238,11 @@ def _save(state: _State, path: Path, descriptor: int) -> None:
 
 
 def _finish(state: _State, path: Path) -> None:
-    """Give the file its name, if every byte has come."""
+    """Give the file its name if it is whole."""
     size, expected = _part(path).stat().st_size, state.file.size
     if expected is not None and (state.total != expected or size != expected):
         raise FormatError(
-            path, expected=f"{expected} bytes", found=f"{min(size, state.total)}", advice="run the same command again"
+            path, expected=f"{expected} bytes", found=str(min(size, state.total)), advice="run the same command again"
         )
     with _part(path).open("rb") as file:
         _check_zip(file, path)
@@ -244,9 +252,11 @@ def _finish(state: _State, path: Path) -> None:
 
 
 def _check_zip(file: BinaryIO, path: Path) -> None:
-    """A zip ends with its table of contents: one that was cut short has none."""
+    """Check for the central directory at a zip's end, which a truncated one lacks."""
     if not zipfile.is_zipfile(file):
-        raise FormatError(path, expected="a whole zip", found="none", advice=f"remove {_part(path).name} and run again")
+        raise FormatError(
+            path, expected="a whole zip", found="a truncated one", advice=f"remove {_part(path).name} and run again"
+        )
 
 
 def _write_at(descriptor: int, data: bytes, offset: int) -> None:

@@ -1,4 +1,4 @@
-"""The published layout in any tree of files: which sequences there are, and their fields, a file a frame and field."""
+"""The published layout in any tree of files: its sequences and their fields, one file per frame and field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from carlasc.storage import layout
 from carlasc.storage.folders.trees import Tree
 from carlasc.storage.protocol import Sequence, Source, identity_of
 
-_DEPTH = 4  # <root>/<split>/<sequence>/<coordinates>, and one folder that a zip may have put around it
+_DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them, as some zips have it
 _CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")
 
 
@@ -29,29 +29,26 @@ class PublishedSource(Source):
         """Return the sequences found up to four levels down, by path.
 
         Raises:
-            MissingDataError: there is none; says what was looked for, and what was found instead.
+            MissingDataError: no sequence was found; says what was looked for, and what was found instead.
         """
         paths = sorted(_find_sequences(self.tree, "", _DEPTH))
         if not paths:
-            raise MissingDataError(f"{self.location}: {self._explain_absence()}")
+            raise self._nothing_found()
         return {path: PublishedSequence(self.tree, path) for path in paths}
 
-    def _explain_absence(self) -> str:
-        entries = self.tree.entries()
+    def _nothing_found(self) -> MissingDataError:
+        entries, expected = self.tree.entries(), "a sequence or a folder above it"
         if layout.PARAMS in entries or any(_is_frame(name) for name in entries):
-            return (
-                "expected a sequence or a folder above it, found the files of one field: give the folder above this one"
-            )
-        if stores := sorted(name for name in entries if name.endswith(_CONTAINERS)):
-            return f"expected a sequence or a folder above it, found {', '.join(stores[:4])}: give one of these"
-        if entries.get("raw"):
-            return (
-                "expected a sequence or a folder above it, found a raw capture: make grids of it first (carlasc regrid)"
-            )
-        return (
-            f"expected a data set, a split, a sequence or its cartesian/ or cylindrical/ folder, found none of {', '.join(sorted(_marks()))}"
-            " down to four levels: give the folder that holds Train, Val and Test, or one inside it"
-        )
+            found, advice = "the files of one field", "give the folder above this one"
+        elif stores := sorted(name for name in entries if name.endswith(_CONTAINERS)):
+            found, advice = ", ".join(stores[:4]), "give one of these"
+        elif entries.get("raw"):
+            found, advice = "a raw capture", "make grids of it first (carlasc regrid)"
+        else:
+            expected = "a data set, a split, a sequence or its cartesian/ or cylindrical/ folder"
+            found = f"none of {', '.join(sorted(_marks()))} within four levels of folders"
+            advice = "give the folder that holds Train, Val and Test, or one inside it"
+        return MissingDataError(self.location, expected=expected, found=found, advice=advice)
 
 
 class PublishedSequence(Sequence):
@@ -69,7 +66,7 @@ class PublishedSequence(Sequence):
 
     @cached_property
     def _listing(self) -> dict[str, layout.Field]:
-        """The fields whose folders are there: one look at the sequence's folder and one for a file in each of its grids'."""
+        """The fields whose folders exist: lists the sequence's folder, and asks for one file in each grid's."""
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
         fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
         for grid in sorted(folders - layout.scan_folders()):
@@ -86,7 +83,7 @@ class PublishedSequence(Sequence):
         return frozenset(name for name in self._listing if len(self.frames(name)))
 
     def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field, from one listing of its folder."""
+        """Return the frames of a field; its folder is listed once."""
         if field not in self._frames:
             self._list_folder_of(field)
         return self._frames[field]
@@ -102,13 +99,13 @@ class PublishedSequence(Sequence):
             self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one file; a local one is memory-mapped: read-only, and no byte is touched before it is used."""
+        """Read one file; a local one is memory-mapped: the array is read-only, and its bytes are read when they are used."""
         entry = self._entry(field)
         path = self._prefix + entry.file(frame)
         return entry.decode(self.tree.read(path), self.tree.where(path), self._shape(entry))
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read several files; remote ones at once."""
+        """Read several files; all at once from a remote tree."""
         entry = self._entry(field)
         paths = [self._prefix + entry.file(frame) for frame in frames]
         shape = self._shape(entry)
@@ -118,7 +115,7 @@ class PublishedSequence(Sequence):
     def _entry(self, field: str) -> layout.Field:
         if field not in self._listing:
             raise MissingDataError(
-                self.location, expected=f"the field {field}", found=f"{', '.join(sorted(self.fields())) or 'none'}"
+                self.location, expected=f"the field {field}", found=", ".join(sorted(self.fields())) or "none"
             )
         return self._listing[field]
 
@@ -126,7 +123,7 @@ class PublishedSequence(Sequence):
         return self.grids[entry.folder].size if entry.per == "voxel" else None
 
     def documents(self) -> tuple[str, ...]:
-        """Return the text files that are there."""
+        """Return the names of the text files."""
         texts = (layout.POSES, layout.TIMES, layout.METADATA)
         names = [name for name in texts if self.tree.is_file(self._prefix + name)]
         grids = sorted({field.folder for name, field in self._listing.items() if "/" in name})
@@ -137,7 +134,7 @@ class PublishedSequence(Sequence):
         return bytes(self.tree.read(self._prefix + name))
 
     def unknown_files(self) -> tuple[str, ...]:
-        """Return what stands in the sequence's folder and its fields' folders that the layout does not know; folders end in "/"."""
+        """Return the files and folders of the sequence that the layout does not know; names of folders end in "/"."""
         known = {field.folder for field in self._listing.values()}
         texts = {layout.POSES, layout.TIMES, layout.METADATA}
         entries = self.tree.entries(self.path)
@@ -166,7 +163,7 @@ def _find_sequences(tree: Tree, path: str, depth: int) -> Iterator[str]:
     if depth == 0:
         return
     for name, is_folder in children.items():
-        if is_folder and name != "raw":  # a capture (carlasc.captures.raw) is no sequence of the layout
+        if is_folder and name != "raw":  # a capture (carlasc.captures.raw) is not a sequence of the layout
             yield from _find_sequences(tree, f"{path}/{name}" if path else name, depth - 1)
 
 

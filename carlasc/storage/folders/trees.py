@@ -1,6 +1,6 @@
-"""Trees of files: a local folder, a remote one, the inside of a zip. All of them list folders and read ranges of bytes.
+"""Trees of files: a local folder or a remote one. They list folders and read ranges of bytes.
 
-No tree keeps a handle open, so all of them pickle and may be used on both sides of a fork.
+No tree keeps a handle open, so that all of them can be pickled, and used on both sides of a fork.
 """
 
 from __future__ import annotations
@@ -14,58 +14,57 @@ from typing import Any, NoReturn
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError, import_extra
 
-_MAPPED = (
-    1 << 22
-)  # bytes from which on a range is mapped: to read a scan's megabyte takes less than to touch its mapped pages
+# Bytes from which on a range is mapped. Reading the megabyte of a scan is faster than touching its mapped pages.
+_MAPPED = 1 << 22
 _EXTRAS = {"http": "aiohttp", "https": "aiohttp", "s3": "s3fs", "s3a": "s3fs"}  # packages of the extra `remote`
 
 
 class Tree(ABC):
-    """A folder of files, wherever it is. Paths inside it are relative, parts joined by "/"; "" is the folder itself.
+    """A folder of files. Paths in it are relative, their parts joined by "/"; "" is the folder itself.
 
     Attributes:
-        location: what to call it in errors: a folder, a zip, a URL.
+        location: its name in errors: a folder, a zip, a URL.
     """
 
     location: str
 
     @abstractmethod
     def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """Return the names in a folder, and of each whether it is a folder; nothing where there is no such folder."""
+        """Return the names in a folder, each with whether it is a folder; empty if the folder does not exist."""
 
     @abstractmethod
     def read(self, path: str) -> bytes | memoryview:
         """Return a file's bytes.
 
         Raises:
-            MissingDataError: there is no such file.
+            MissingDataError: the file does not exist.
             FormatError: it cannot be read, or is damaged.
         """
 
     @abstractmethod
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes [start, end) of a file; both may be counted from its end (start < 0, end = 0).
+        """Return the bytes [start, end) of a file; if start is negative, both are counted from the file's end.
 
         Raises:
-            MissingDataError: there is no such file.
+            MissingDataError: the file does not exist.
             FormatError: the file is shorter.
         """
 
     def is_file(self, path: str) -> bool:
-        """Whether a file is there."""
+        """Whether a file exists."""
         folder, _, name = path.rpartition("/")
         return self.entries(folder).get(name) is False
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
-        """Return several files' bytes; remote trees ask for all of them at once."""
+        """Return several files' bytes; remote trees request all of them at once."""
         return [self.read(path) for path in paths]
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
-        """Return several ranges; remote trees ask for all of them at once."""
+        """Return several ranges; remote trees request all of them at once."""
         return [self.read_range(*part) for part in ranges]
 
     def where(self, path: str) -> str:
-        """Return what to call a file of the tree in errors."""
+        """Return the name of a file of the tree in errors."""
         return f"{self.location}/{path}" if path else self.location
 
 
@@ -77,31 +76,31 @@ class LocalTree(Tree):
         self.location = str(self.root)
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """Scan the folder."""
+        """List the folder."""
         try:
             with os.scandir(self.root / folder) as found:
                 return {entry.name: entry.is_dir() for entry in found}
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except OSError as error:
-            raise CarlascError(f"{self.where(folder)}: cannot be listed: {error.strerror or error}") from error
+            raise CarlascError(self.where(folder), problem=f"cannot be listed: {error.strerror or error}") from error
 
     def is_file(self, path: str) -> bool:
-        """Look for the one file."""
+        """Whether the file exists, without listing its folder."""
         return (self.root / path).is_file()
 
     def read(self, path: str) -> bytes | memoryview:
-        """Map the file: no byte is touched before it is used."""
+        """Map the file into memory: its bytes are read when they are used."""
         descriptor = self._open(path)
         try:
             if os.fstat(descriptor).st_size == 0:
-                return b""  # an empty file cannot be mapped, and is an empty scan
+                return b""  # an empty file, such as an empty scan, cannot be mapped
             return memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
         finally:
             os.close(descriptor)
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Read the range, or map it where it is large."""
+        """Read the range, or map it into memory if it is large."""
         descriptor = self._open(path)
         try:
             if start < 0:
@@ -121,14 +120,14 @@ class LocalTree(Tree):
         except (FileNotFoundError, NotADirectoryError) as error:
             raise MissingDataError(path, expected="a file", found="nothing") from error
         except OSError as error:
-            raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
+            raise FormatError(path, problem=f"cannot be read: {error.strerror or error}") from error
 
 
 class RemoteTree(Tree):
     """A folder, or a single file (path ""), at any URL that fsspec knows: http, s3, memory, ..."""
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
-        """Remember the URL and fsspec's storage options; nothing is asked for yet.
+        """Remember the URL and fsspec's storage options; nothing is requested yet.
 
         Raises:
             DependencyError: the URL needs a package that is not installed.
@@ -142,13 +141,13 @@ class RemoteTree(Tree):
 
     @property
     def _fs(self) -> Any:
-        """The file system of this process: fsspec keeps one for equal arguments, and none across a fork."""
+        """The file system of this process: fsspec keeps one for equal arguments, and makes a new one after a fork."""
         from fsspec.core import url_to_fs
 
         try:
             return url_to_fs(self.location, **self.options)[0]
         except (ValueError, ImportError) as error:
-            raise CarlascError(f"{self.location}: cannot be opened: {error}") from error
+            raise CarlascError(self.location, problem=f"cannot be opened: {error}") from error
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder, once."""
@@ -158,7 +157,7 @@ class RemoteTree(Tree):
                 found = self._fs.ls(f"{url}/" if url.startswith("http") else url, detail=True)
             except (FileNotFoundError, NotADirectoryError):
                 found = []
-            except Exception as error:  # noqa: BLE001 (every file system has its own kinds)
+            except Exception as error:  # noqa: BLE001 (each file system raises its own types)
                 _fail(url, error)
             listed = {}
             for entry in found:
@@ -171,7 +170,7 @@ class RemoteTree(Tree):
         return self._listed[folder]
 
     def is_file(self, path: str) -> bool:
-        """Ask for the one file where folders cannot be listed (http), else look in its folder's listing."""
+        """Whether the file exists: asked of the server where folders cannot be listed (http), else of the folder's listing."""
         return self.size(path) is not None if self.location.startswith("http") else super().is_file(path)
 
     def read(self, path: str) -> bytes | memoryview:
@@ -179,7 +178,7 @@ class RemoteTree(Tree):
         return self.read_many([path])[0]
 
     def read_range(self, path: str, start: int, end: int) -> bytes:
-        """Fetch the range, and nothing else."""
+        """Fetch the range."""
         return self.read_ranges([(path, start, end)])[0]
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
@@ -207,14 +206,14 @@ class RemoteTree(Tree):
         return [check_length(bytes(data), end - start, url) for data, start, end, url in parts]
 
     def open(self, path: str) -> Any:
-        """Open a file for reading, as an object for libraries that want one: it reads blocks as they are needed."""
+        """Open a file, for libraries that take file objects: it fetches blocks as they are needed."""
         try:
             return self._fs.open(self.where(path), "rb", cache_type="blockcache", block_size=1 << 18)
         except Exception as error:  # noqa: BLE001
             _fail(self.where(path), error)
 
     def size(self, path: str = "") -> int | None:
-        """Return a file's size in bytes, None where there is no such file, or a folder (or a page that lists one)."""
+        """Return a file's size in bytes; None if it does not exist or is a folder (or a page that lists one)."""
         url = self.where(path)
         try:
             found = self._fs.info(url)
@@ -227,10 +226,10 @@ class RemoteTree(Tree):
         return found["size"]
 
     def check_ranges(self, path: str = "") -> None:
-        """Ask for one byte: a server that knows no ranges would send all of the file for each.
+        """Request one byte: a server without range requests would send the whole file for each of them.
 
         Raises:
-            CarlascError: it knows none.
+            CarlascError: the server does not support range requests.
         """
         url = self.where(path)
         if not url.startswith("http"):
@@ -253,7 +252,7 @@ class RemoteTree(Tree):
         if found != 206:
             raise CarlascError(
                 url,
-                expected="a server that answers range requests",
+                expected="a server that supports range requests",
                 found="one that does not",
                 advice="download the file first",
             )
@@ -265,17 +264,19 @@ class RemoteTree(Tree):
 def _map_range(descriptor: int, start: int, end: int, where: str) -> memoryview:
     found = os.fstat(descriptor).st_size
     if end > found:
-        raise FormatError(where, expected=f"at least {end} bytes", found=f"{found}", advice="cut short?")
+        raise FormatError(where, expected=f"at least {end} bytes", found=str(found), advice="is it truncated?")
     skipped = start % mmap.ALLOCATIONGRANULARITY
-    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)  # all pages at once, not one by one as they are touched
+    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)  # read all pages at once (Linux only)
     mapped = mmap.mmap(descriptor, end - start + skipped, flags, mmap.PROT_READ, offset=start - skipped)
     return memoryview(mapped)[skipped:]
 
 
 def check_length(data: bytes, expected: int, where: str) -> bytes:
-    """Return `data`, or say that the file is cut short (or that a server gave something else than the range)."""
+    """Return `data` if it has the expected length; else the file is truncated, or a server sent another range."""
     if len(data) != expected:
-        raise FormatError(where, expected=f"{expected} bytes there", found=f"{len(data)}", advice="cut short?")
+        raise FormatError(
+            where, expected=f"{expected} bytes in this range", found=str(len(data)), advice="is the file truncated?"
+        )
     return data
 
 
@@ -284,4 +285,4 @@ def _fail(where: str, error: Exception) -> NoReturn:
         raise error
     if isinstance(error, FileNotFoundError):
         raise MissingDataError(where, expected="a file", found="nothing") from error
-    raise CarlascError(f"{where}: cannot be read: {type(error).__name__}: {error}") from error
+    raise CarlascError(where, problem=f"cannot be read: {type(error).__name__}: {error}") from error

@@ -1,1 +1,1 @@
-"""Packed stores: zarr and HDF5, which hold arrays, and Parquet, which holds tables."""
+"""Packed stores: zarr and HDF5, which hold arrays (`arrays`), and Parquet, which holds tables (`tables`)."""

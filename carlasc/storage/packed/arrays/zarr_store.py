@@ -1,12 +1,11 @@
 """Packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core specification.
 
-zarr-python writes them, and any zarr v3 library reads them. For reading, the shards' indices and chunks are read directly
-(zarr specification v3, "sharding_indexed" and "crc32c"), which takes a tenth of zarr-python's time a chunk.
+zarr-python writes them, and any zarr v3 library reads them. Here, the shards' indices and chunks are read directly (zarr specification
+v3, "sharding_indexed" and "crc32c"), which takes a tenth of zarr-python's time per chunk.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import warnings
@@ -22,21 +21,22 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
-from carlasc.storage.packed.arrays import SEQUENCE, ArraySource, ArrayStore
-from carlasc.storage.packed.arraywriter import ArraySink, ArrayStoreWriter, ChunkWriter, remove
-from carlasc.storage.packed.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
-from carlasc.storage.packed.store import Options
+from carlasc.storage.packed.arrays.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
+from carlasc.storage.packed.arrays.reading import SEQUENCE, ArraySource, ArrayStore
+from carlasc.storage.packed.arrays.writing import ArraySink, ArrayStoreWriter, ChunkWriter
+from carlasc.storage.packed.output import remove
+from carlasc.storage.packed.protocol import Options
 
 METADATA = "zarr.json"
-_SHARD = 32 << 20  # bytes of a shard before compression: held back while one is filled
-_MOST_CHUNKS = 256  # of a shard: its index is read whole
-_CHECKSUM = 4
-_RESIDUE = 0x48674BC7  # crc32c of any bytes with their own crc32c behind them
+_SHARD = 32 << 20  # bytes of a shard before compression: they are kept in memory until it is full
+_MOST_CHUNKS = 256  # per shard, because the shard's index is read as a whole
+_CHECKSUM = 4  # bytes
+_RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c
 _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}
 
 
 class ZarrSource(ArraySource):
-    """A packed zarr store in a tree: a folder, a URL, or a zip of one."""
+    """A packed zarr store: a folder, a URL, or a zip of either."""
 
     def __init__(self, tree: Tree) -> None:
         """Read the store's metadata.
@@ -54,10 +54,10 @@ class ZarrSink(ArraySink):
     """Writes a packed zarr store."""
 
     def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
-        """Start a store, or go on with one that was cut off: its finished sequences are kept.
+        """Start a store, or continue one whose packing was interrupted: its finished sequences are kept.
 
         Raises:
-            ConflictError: something is in its place, and `overwrite` is not given.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: zarr is not installed.
         """
         options = options or Options()
@@ -88,23 +88,23 @@ class ZarrStore(ArrayStore):
             return np.empty(array.shape, array.dtype)
         try:
             return array.read_chunk(0)[tuple(slice(n) for n in array.shape)]
-        except (FormatError, MissingDataError) as error:
-            raise FormatError(f"{self.location}/{node}: {error}") from error
+        except FormatError as error:
+            raise error.within(f"{self.location}/{node}") from error
 
     def array(self, node: str) -> ZarrArray:
-        """Return an array to read chunks of."""
+        """Return an array whose chunks can be read."""
         metadata = self._metadata(node)
         if metadata is None or metadata.get("node_type") != "array":
             raise FormatError(
                 f"{self.location}/{node}",
                 expected="an array",
-                found=f"{'nothing' if metadata is None else 'a group'}",
-                advice="damaged store",
+                found="none" if metadata is None else "a group",
+                advice="the store is damaged",
             )
         return ZarrArray.from_metadata(self.tree, node, metadata)
 
     def stored_bytes(self, node: str) -> int:
-        """Add up the files below a node; a folder of this machine only."""
+        """Return the bytes of the files below a node; for a local folder only."""
         files = os.walk(f"{self.location}/{node}")
         return sum((Path(folder) / name).stat().st_size for folder, _, names in files for name in names)
 
@@ -131,7 +131,7 @@ class ZarrArray(StoredArray):
         """Read the metadata of an array.
 
         Raises:
-            FormatError: codecs or chunks are of another kind.
+            FormatError: its codecs or its chunks are not those that carlasc writes.
         """
         where = tree.where(node)
         try:
@@ -148,7 +148,7 @@ class ZarrArray(StoredArray):
             array = cls(tree, node, dtype, shape, chunk, axis, encoding, metadata.get("attributes", {}))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise FormatError(
-                where, expected="an array as carlasc packs them", found="others codecs or chunks", advice=f"{error}"
+                where, expected="the codecs and chunks that carlasc writes", found=f"others ({error})"
             ) from error
         array.per_shard = outer[axis] // chunk[axis] if sharded else None
         array._indices = {}
@@ -157,7 +157,7 @@ class ZarrArray(StoredArray):
     _indices: dict[int, NDArray[np.uint64]]
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Look chunks up in their shards' indices, which are read once."""
+        """Look up chunks in the indices of their shards, which are read once."""
         if self.per_shard is None:
             return [(self._file(number), 0, -1) for number in numbers]
         places = []
@@ -167,9 +167,9 @@ class ZarrArray(StoredArray):
             if offset == 2**64 - 1:
                 raise FormatError(
                     self.tree.where(self._file(shard)),
-                    expected=f"chunk {number} in it",
-                    found="it missing",
-                    advice="damaged store",
+                    expected=f"chunk {number}",
+                    found="none",
+                    advice="the store is damaged",
                 )
             places.append((self._file(shard), offset, offset + length))
         return places
@@ -181,11 +181,13 @@ class ZarrArray(StoredArray):
                 return [memoryview(data) for data in self.tree.read_many([self._file(number) for number in numbers])]
             return super().fetch(numbers)
         except MissingDataError as error:
-            raise FormatError(f"damaged store: {error}") from error
+            raise FormatError(
+                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+            ) from error
 
     def verify(self, data: memoryview, number: int) -> memoryview:
-        """Check the crc32c at a chunk's end."""
-        return _verify(data, f"chunk {number} of {self.name}")
+        """Verify the crc32c at the end of a chunk."""
+        return _verified(data, f"chunk {number} of {self.name}")
 
     def _file(self, number: int) -> str:
         key = ["0"] * len(self.shape)
@@ -194,10 +196,9 @@ class ZarrArray(StoredArray):
 
     def _index(self, shard: int) -> NDArray[np.uint64]:
         if shard not in self._indices:
-            assert self.per_shard is not None
-            size = 16 * self.per_shard + _CHECKSUM
+            size = 16 * (self.per_shard or 1) + _CHECKSUM
             data = memoryview(self.tree.read_range(self._file(shard), -size, 0))
-            self._indices[shard] = np.frombuffer(_verify(data, f"the index of {self._file(shard)}"), "<u8").reshape(
+            self._indices[shard] = np.frombuffer(_verified(data, f"the index of {self._file(shard)}"), "<u8").reshape(
                 -1, 2
             )
         return self._indices[shard]
@@ -219,14 +220,14 @@ class ZarrStoreWriter(ArrayStoreWriter):
         self._root = self._zarr.open_group(path, mode="r+", use_consolidated=False)
 
     def _belongs_to(self, run: dict[str, Any]) -> bool:
-        """Whether what a run that was cut off left behind was packed in the same way."""
+        """Whether what an interrupted run left was packed with the same options."""
         try:
             return ZarrStore(self._tree).attributes("") == run
         except (FormatError, MissingDataError):
             return False
 
     def write_group(self, node: str, attributes: dict[str, Any]) -> None:
-        """Make a group."""
+        """Create a group."""
         group = self._root.require_group(node)
         group.attrs.put(attributes)
 
@@ -276,17 +277,18 @@ class ZarrStoreWriter(ArrayStoreWriter):
         remove(self._path / node)
 
     def finished(self) -> dict[str, str]:
-        """Look for the groups that are marked as whole."""
+        """Find the groups that are marked as complete."""
         found = {}
         for folder, _, files in os.walk(self._path):
             if METADATA in files:
-                attributes = json.loads((Path(folder) / METADATA).read_bytes()).get("attributes", {})
+                metadata = parse_json((Path(folder) / METADATA).read_bytes(), folder)
+                attributes = metadata.get("attributes", {})
                 if attributes.get("type") == SEQUENCE and attributes.get("complete"):
                     found[attributes["path"]] = Path(folder).relative_to(self._path).as_posix()
         return found
 
     def close(self, attributes: dict[str, Any]) -> Path:
-        """Consolidate the metadata, the mark of completeness among them."""
+        """Write the root's attributes and consolidate the metadata."""
         self._root.attrs.put(attributes)
         with _quietly():
             self._zarr.consolidate_metadata(self._path)
@@ -294,7 +296,7 @@ class ZarrStoreWriter(ArrayStoreWriter):
 
 
 class _ZarrChunkWriter(ChunkWriter):
-    """Holds a shard's chunks back and writes them together: a shard cannot grow."""
+    """Keeps the chunks of a shard and writes them together, because a shard cannot be extended."""
 
     def __init__(self, array: Any, axis: int, step: int, per_shard: int) -> None:
         self.array = array
@@ -325,7 +327,7 @@ class _ZarrChunkWriter(ChunkWriter):
 
 
 def _codecs(encoding: Encoding, dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Return zarr-python's arguments for an encoding, a crc32c behind each chunk."""
+    """Return zarr-python's arguments for an encoding with a crc32c after each chunk."""
     codecs = import_extra("zarr.codecs", "zarr")
     if encoding.codec == "pcodec":
         import_extra("pcodec", "zarr")
@@ -339,10 +341,10 @@ def _codecs(encoding: Encoding, dtype: np.dtype[Any]) -> dict[str, Any]:
 
 
 def _encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
-    """Return the encoding of an array's (inner) codecs, as they stand in its metadata.
+    """Return the encoding that the (inner) codecs in an array's metadata stand for.
 
     Raises:
-        ValueError: they are of another kind.
+        ValueError: they are not those of an `Encoding`.
     """
     names = [codec["name"] for codec in codecs]
     if names == ["numcodecs.pcodec", "crc32c"]:
@@ -353,15 +355,22 @@ def _encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
     raise ValueError(f"codecs {', '.join(names)}")
 
 
-def _verify(data: memoryview, what: str) -> memoryview:
+def _verified(data: memoryview, what: str) -> memoryview:
+    """Return bytes without the checksum at their end.
+
+    Raises:
+        FormatError: the checksum does not match.
+    """
     if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
-        raise FormatError(f"{what}: the checksum does not fit: corrupted, fetch or pack it again")
+        raise FormatError(
+            what, problem="the checksum does not match", advice="the store is corrupted: fetch or pack it again"
+        )
     return data[:-_CHECKSUM]
 
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Without zarr-python's word that consolidated metadata and numcodecs' codecs are extensions of the specification."""
+    """Suppress zarr-python's warnings that consolidated metadata and numcodecs' codecs are extensions of the specification."""
     with warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", message=".*(Consolidated metadata|Numcodecs codecs|not have a Zarr V3 spec).*"

@@ -1,4 +1,4 @@
-"""Packed stores of Parquet tables, writing. The format is docs/storage.md, section "Tables"."""
+"""Writing packed stores of Parquet tables."""
 
 from __future__ import annotations
 
@@ -13,26 +13,39 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import to_json, write_atomic
-from carlasc.storage.packed.arrays import STORE
-from carlasc.storage.packed.arraywriter import TABLES_MARK, UNFINISHED_MARK, put_in_place, refuse_existing, remove
-from carlasc.storage.packed.store import VERSION, Options, PackedSink, PackedWriter
-from carlasc.storage.packed.tablefields import statistics, table_field
-from carlasc.storage.packed.tables import DOCUMENTS, FRAMES, SEQUENCE
-from carlasc.storage.protocol import identity_of
+from carlasc.storage.packed.output import (
+    TABLES_MARK,
+    UNFINISHED_MARK,
+    put_in_place,
+    refuse_existing,
+    remove,
+    unfinished,
+)
+from carlasc.storage.packed.protocol import (
+    STORE,
+    VERSION,
+    FieldWriter,
+    Options,
+    PackedSink,
+    PackedWriter,
+    node_of,
+)
+from carlasc.storage.packed.tables.columns import statistics, table_field
+from carlasc.storage.packed.tables.reading import DOCUMENTS, FRAMES, SEQUENCE
 
-_LEVEL = 12  # of Zstandard: from 11 on points pack better by 2 %, above 12 it takes several times longer
-_PAGE = 8 << 20  # bytes: a scan's column in one page
+_LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
+_PAGE = 8 << 20  # bytes: one page holds a scan's column
 
 
 class ParquetSink(PackedSink):
-    """Writes a folder of packed Parquet tables, as a whole: it stands in its place when the sink is closed."""
+    """Writes a folder of packed Parquet tables, which gets its name when the sink is closed, and not before."""
 
     def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
-        """Start a store, or go on with one that was cut off: its finished sequences are kept.
+        """Start a store, or continue one whose packing was interrupted: its finished sequences are kept.
 
         Raises:
-            ArgumentError: `small` is asked for, which Parquet has no encoding for.
-            ConflictError: something is in its place, and `overwrite` is not given.
+            ArgumentError: `small` is given, for which Parquet has no encoding.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: pyarrow is not installed.
         """
         import_extra("pyarrow.parquet", "parquet")
@@ -42,13 +55,10 @@ class ParquetSink(PackedSink):
         self.overwrite = overwrite
         if self.options.small:
             raise ArgumentError(
-                path,
-                expected="a .zarr store with --small",
-                found="Parquet, which has no PCodec",
-                advice="leave --small out",
+                "small", expected="a .zarr store", found=f"{path}: Parquet has no PCodec", advice="leave `small` out"
             )
         refuse_existing(self.path, overwrite)
-        self._part = self.path.with_name(f"{self.path.name}.part")
+        self._part = unfinished(self.path)
         run = to_json({"lossy_mm": self.options.lossy_mm})
         if not (self._part / UNFINISHED_MARK).is_file() or (self._part / UNFINISHED_MARK).read_bytes() != run:
             remove(self._part)
@@ -59,18 +69,18 @@ class ParquetSink(PackedSink):
         }
 
     def finished(self, path: str) -> bool:
-        """Whether an earlier run, cut off later on, has written this sequence whole."""
+        """Whether an earlier run that was interrupted has written this sequence whole."""
         return path in self._sequences
 
     def sequence(self, path: str) -> ParquetWriter:
-        """Start a sequence; what a run that was cut off left of it is removed."""
-        folder = path.replace("\\", "/").strip("/") or "sequence"
+        """Start a sequence; what an interrupted run left of it is removed."""
+        folder = node_of(path, self.location)
         self._sequences.pop(path, None)
         remove(self._part / folder)
         return ParquetWriter(self._part, path, folder, self.options, self._sequences)
 
     def close(self) -> None:
-        """Mark the store as whole and put it in its place."""
+        """Mark the store as finished and give it its name."""
         root = {
             "type": STORE,
             "version": VERSION,
@@ -84,23 +94,18 @@ class ParquetSink(PackedSink):
 
 
 class ParquetWriter(PackedWriter):
-    """Writes one sequence of a store of tables, each field's frames in rising order."""
+    """Writes one sequence of a store of tables."""
 
     def __init__(self, root: Path, path: str, folder: str, options: Options, finished: dict[str, str]) -> None:
-        self.location = str(root / folder)
-        self.identity = identity_of(path)
+        super().__init__(str(root / folder), path)
         self._folder = root / folder
-        self._path = path
         self._name = folder
         self._options = options
         self._finished = finished
-        self._tables: dict[str, _TableWriter] = {}
-        self._documents: dict[str, bytes] = {}
         self._statistics: dict[int, dict[str, Any]] = {}
 
-    def has(self, field: str, frame: int) -> bool:
-        """Whether this run has written it."""
-        return field in self._tables and frame in self._tables[field].rows
+    def _start_field(self, field: str) -> FieldWriter:
+        return _TableWriter(self._folder / f"{field}.parquet", field, self._options)
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Append one frame as a row group.
@@ -108,44 +113,28 @@ class ParquetWriter(PackedWriter):
         Raises:
             FormatError: it does not fit the field, or an earlier frame.
         """
-        if field not in self._tables:
-            self._tables[field] = _TableWriter(self._folder / f"{field}.parquet", field, self._options)
-        try:
-            self._tables[field].append(frame, array)
-        except FormatError as error:
-            raise FormatError(f"{self.location}: field {field}, frame {frame}: {error}") from error
+        super().write(field, frame, array)
         self._statistics.setdefault(frame, {}).update(statistics(field, array))
-
-    def write_document(self, name: str, data: bytes) -> None:
-        """Keep a text file's bytes."""
-        self._documents[name] = data
-
-    def read_document(self, name: str) -> bytes | None:
-        """Return a text file's bytes, None if it is not there."""
-        return self._documents.get(name)
 
     def close(self) -> None:
         """Finish the tables and mark the sequence as whole."""
-        for table in self._tables.values():
+        for table in self.writers.values():
             table.close()
         self._write_frames()
         self._write_documents()
-        split, name, coordinates = self.identity
-        about: dict[str, Any] = {"path": self._path, "split": split, "name": name, "coordinates": coordinates}
-        about |= {"fields": sorted(self._tables), "documents": sorted(self._documents)}
-        write_atomic(self._folder / SEQUENCE, to_json(about))
-        self._finished[self._path] = self._name
+        write_atomic(self._folder / SEQUENCE, to_json(self.about()))
+        self._finished[self.path] = self._name
 
     def _write_documents(self) -> None:
-        """Write the table with one row a text file: its name and its bytes."""
+        """Write the table with one row per text file: its name and its bytes."""
         pa, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
-        columns = {"name": pa.array(list(self._documents), pa.string())}
-        columns["data"] = pa.array(list(self._documents.values()), pa.binary())
+        columns = {"name": pa.array(list(self.contents), pa.string())}
+        columns["data"] = pa.array(list(self.contents.values()), pa.binary())
         self._folder.mkdir(parents=True, exist_ok=True)
         parquet.write_table(pa.table(columns), self._folder / DOCUMENTS, compression="zstd", write_page_checksum=True)
 
     def _write_frames(self) -> None:
-        """Write the table with one row a frame: pose, time, statistics."""
+        """Write the table with one row per frame: pose, time, statistics."""
         pa, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
         frames = sorted(self._statistics)
         columns: dict[str, Any] = {"frame": pa.array(frames, pa.int64())}
@@ -154,10 +143,10 @@ class ParquetWriter(PackedWriter):
             ("pose", layout.POSES, layout.decode_poses),
         ):
             try:
-                lines = decode(self._documents[document], document)
+                lines = decode(self.contents[document], document)
                 rows = [lines[frame if frames[-1] < len(lines) else frames.index(frame)] for frame in frames]
             except (KeyError, FormatError, IndexError):
-                continue  # no such file, or one that its reader will say what is wrong with: the text is kept as it is
+                continue  # no such file, or not numbers: the text is kept as it is, and its reader reports the error
             values = np.array(rows, np.float64).reshape(len(frames), -1)
             columns[name] = (
                 pa.array(values[:, 0])
@@ -170,44 +159,39 @@ class ParquetWriter(PackedWriter):
         parquet.write_table(pa.table(columns), self._folder / FRAMES, compression="zstd", write_page_checksum=True)
 
 
-class _TableWriter:
-    """One field's file, growing by row groups."""
+class _TableWriter(FieldWriter):
+    """Writes one field's file, row group by row group."""
 
     def __init__(self, path: Path, field: str, options: Options) -> None:
+        super().__init__(field)
         self.kind = table_field(field)
-        self.field = field
         self.path = path
-        self.scale = options.lossy_mm / 1000 if field == "points" and options.lossy_mm else None
-        self.rows: dict[int, int] = {}
+        self.scale_m = options.scale_m if field == "points" else None
+        self.rows: list[int] = []  # of each frame
         self.attributes: dict[str, Any] = {}
         self._writer: Any = None
 
-    def append(self, frame: int, array: NDArray[Any]) -> None:
-        if self.rows and frame <= next(reversed(self.rows)):
-            raise FormatError(f"expected frames in rising order, found {frame} after {next(reversed(self.rows))}")
-        layout.field_named(self.field).check(array, "its array")
+    def write(self, frame: int, array: NDArray[Any]) -> None:
+        """Append one row group; an empty frame has none."""
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)
         columns = self.kind.split(array, self.attributes)
         count = len(next(iter(columns.values())))
         if count:
-            arrays = [pa.array(np.full(count, frame, np.int64))] + [
-                pa.array(column) if isinstance(column, np.ndarray) else column for column in columns.values()
-            ]
+            arrays = [pa.array(np.full(count, frame, np.int64)), *map(pa.array, columns.values())]
             self._writer.write_table(pa.table(arrays, schema=self._schema), row_group_size=count)
-        self.rows[frame] = count
+        self.rows.append(count)
 
     def _start(self, pa: Any, array: NDArray[Any]) -> None:
         parquet = import_extra("pyarrow.parquet", "parquet")
-        entry = layout.field_named(self.field)
         self.attributes = {
             "type": "carlasc.table",
             "version": VERSION,
-            "field": self.field,
-            "unit": entry.unit,
-        } | self.kind.describe(array, self.scale)
-        types, is_picture = self.kind.columns(self.attributes), entry.kind == "picture"
+            "field": self.entry.name,
+            "unit": self.entry.unit,
+        } | self.kind.describe(array, self.scale_m)
+        types, is_picture = self.kind.columns(self.attributes), self.entry.kind == "picture"
         self._schema = pa.schema(
             [("frame", pa.int64())] + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
@@ -220,6 +204,7 @@ class _TableWriter:
         )  # fmt: skip
 
     def close(self) -> None:
-        about = self.attributes | {"frames": list(self.rows), "rows": list(self.rows.values())}
+        """Write the footer."""
+        about = self.attributes | {"frames": list(self.frames), "rows": self.rows}
         self._writer.add_key_value_metadata({"carlasc": json.dumps(about)})
         self._writer.close()

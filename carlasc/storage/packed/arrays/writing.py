@@ -1,8 +1,7 @@
-"""Packed stores of arrays: what zarr and HDF5 have in common, writing. The format is docs/storage.md, section "Arrays"."""
+"""Writing packed stores of arrays: what zarr and HDF5 have in common."""
 
 from __future__ import annotations
 
-import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,26 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
+from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.arrays import COLUMN, DOCUMENT, FIELD, SEQUENCE, STORE, document_node, field_node
-from carlasc.storage.packed.chunks import Encoding, StoredArray
-from carlasc.storage.packed.store import (
-    VERSION,
-    Column,
-    Options,
-    PackedSink,
-    PackedWriter,
-    Packing,
-    common_type,
-    packing_of,
-)
-from carlasc.storage.protocol import identity_of
+from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray
+from carlasc.storage.packed.arrays.columns import Column, packing_of
+from carlasc.storage.packed.arrays.reading import COLUMN, DOCUMENT, FIELD, SEQUENCE, document_node, field_node
+from carlasc.storage.packed.numbers import common_type
+from carlasc.storage.packed.output import put_in_place, refuse_existing, unfinished
+from carlasc.storage.packed.protocol import STORE, VERSION, FieldWriter, Options, PackedSink, PackedWriter, node_of
 
-TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
-UNFINISHED_MARK = "unfinished.json"  # the one beside it until the store is whole
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_HEADROOM = 1.125  # a chunk holds the first frame and this much more: later frames seldom need a second chunk
+_HEADROOM = 1.125  # a chunk is this much larger than the first frame, so that later frames seldom need a second chunk
 
 
 class ChunkWriter(ABC):
@@ -43,25 +32,25 @@ class ChunkWriter(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Write what is held back; the array is whole then."""
+        """Write the chunks that are held back; the array is whole then."""
 
 
 class ArrayStoreWriter(ABC):
-    """A tree of groups and arrays, to be written beside its place.
+    """A tree of groups and arrays to write to.
 
     Attributes:
-        location: where it will be.
+        location: where it is written, for errors.
     """
 
     location: str
 
     @abstractmethod
     def write_group(self, node: str, attributes: dict[str, Any]) -> None:
-        """Make a group, or give it other attributes."""
+        """Create a group, or replace its attributes."""
 
     @abstractmethod
     def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
-        """Write a whole array as one chunk, over what is there."""
+        """Write a whole array as one chunk; an older one is replaced."""
 
     @abstractmethod
     def create(
@@ -77,133 +66,97 @@ class ArrayStoreWriter(ABC):
 
     @abstractmethod
     def array(self, node: str) -> StoredArray:
-        """Return a closed array, to read it again."""
+        """Return a closed array, whose chunks can be read."""
 
     @abstractmethod
     def move(self, node: str, target: str) -> None:
-        """Put an array in the place of another."""
+        """Rename an array; another one of that name is replaced."""
 
     @abstractmethod
     def remove(self, node: str) -> None:
-        """Remove a node and what is below, if there is one."""
+        """Remove a node and those below it, if it exists."""
 
     @abstractmethod
     def finished(self) -> dict[str, str]:
-        """Return the sequences that an earlier run, cut off later on, has finished: group by path."""
+        """Return the groups of the sequences that an interrupted run has finished, by path."""
 
     @abstractmethod
     def close(self, attributes: dict[str, Any]) -> Path:
-        """Write the root's attributes; return the file or folder, whole now."""
+        """Write the root's attributes and return the file or folder, which is whole then."""
 
 
 class ArraySink(PackedSink):
-    """Writes a packed store of arrays, as a whole: it stands in its place when the sink is closed, and not before."""
+    """Writes a packed store of arrays, which gets its name when the sink is closed, and not before."""
 
     def __init__(
         self, path: Path, writer: Callable[[Path], ArrayStoreWriter], options: Options, overwrite: bool
     ) -> None:
-        """Start a store, or go on with one that was cut off.
+        """Start a store, or continue one whose packing was interrupted.
 
         Raises:
-            ConflictError: something is in its place, and `overwrite` is not given.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
         """
         self.path = path
         self.location = str(path)
         self.options = options
         self.overwrite = overwrite
         refuse_existing(path, overwrite)
-        self._store = writer(path.with_name(f"{path.name}.part"))
+        self._store = writer(unfinished(path))
         self._sequences = dict(self._store.finished())
 
     def finished(self, path: str) -> bool:
-        """Whether an earlier run, cut off later on, has written this sequence whole."""
+        """Whether an earlier run that was interrupted has written this sequence whole."""
         return path in self._sequences
 
     def sequence(self, path: str) -> ArrayWriter:
-        """Start a sequence; what a run that was cut off left of it is removed."""
-        group = path.replace("\\", "/").strip("/") or "sequence"
+        """Start a sequence; what an interrupted run left of it is removed."""
+        group = node_of(path, self.location)
         self._sequences.pop(path, None)
         self._store.remove(group)
         return ArrayWriter(self._store, path, group, self.options, self._sequences)
 
     def close(self) -> None:
-        """Finish the store and put it in its place."""
+        """Finish the store and give it its name."""
         root = {"type": STORE, "version": VERSION, "complete": True, "sequences": self._sequences}
         root |= {"lossy_mm": self.options.lossy_mm} if self.options.lossy_mm else {}
         put_in_place(self._store.close(root), self.path, self.overwrite)
 
 
 class ArrayWriter(PackedWriter):
-    """Writes one sequence of a packed store, each field's frames in rising order."""
+    """Writes one sequence of a packed store of arrays."""
 
     def __init__(
         self, store: ArrayStoreWriter, path: str, group: str, options: Options, finished: dict[str, str]
     ) -> None:
-        self.location = f"{store.location}/{group}"
+        super().__init__(f"{store.location}/{group}", path)
         self._store = store
-        self._path = path
         self._group = group
         self._options = options
         self._finished = finished
-        self._fields: dict[str, _FieldWriter] = {}
-        self._documents: dict[str, bytes] = {}
-        self.identity = identity_of(path)
 
-    def has(self, field: str, frame: int) -> bool:
-        """Whether this run has written it."""
-        return field in self._fields and frame in self._fields[field].frames
-
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
-        """Append one frame to a field's columns.
-
-        Raises:
-            FormatError: it does not fit the field, or an earlier frame.
-        """
-        if field not in self._fields:
-            packing = packing_of(layout.field_named(field), self._options)
-            self._fields[field] = _FieldWriter(self._store, f"{self._group}/{field_node(field)}", packing)
-        try:
-            self._fields[field].append(frame, array)
-        except FormatError as error:
-            raise FormatError(f"{self.location}: field {field}, frame {frame}: {error}") from error
-
-    def write_document(self, name: str, data: bytes) -> None:
-        """Keep a text file's bytes."""
-        self._documents[name] = data
-
-    def read_document(self, name: str) -> bytes | None:
-        """Return a text file's bytes, None if it is not there."""
-        return self._documents.get(name)
+    def _start_field(self, field: str) -> FieldWriter:
+        return _ArrayFieldWriter(self._store, f"{self._group}/{field_node(field)}", field, self._options)
 
     def close(self) -> None:
         """Write what is held back and mark the sequence as whole."""
-        for writer in self._fields.values():
+        for writer in self.writers.values():
             writer.close()
-        for name, data in self._documents.items():
+        for name, data in self.contents.items():
             attributes = {"type": DOCUMENT, "version": VERSION, "dtype": "uint8", "unit": "bytes", "name": name}
             self._store.write_small(f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes)
         self._write_numbers()
-        split, name, coordinates = self.identity
-        attributes = {
-            "type": SEQUENCE,
-            "version": VERSION,
-            "path": self._path,
-            "split": split,
-            "name": name,
-            "coordinates": coordinates,
-        }
-        attributes |= {"fields": sorted(self._fields), "documents": sorted(self._documents), "complete": True}
+        attributes = {"type": SEQUENCE, "version": VERSION, **self.about(), "complete": True}
         self._store.write_group(self._group, attributes)
-        self._finished[self._path] = self._group
+        self._finished[self.path] = self._group
 
     def _write_numbers(self) -> None:
-        """Write poses and times as numbers too, for programs that know arrays and not these text files."""
+        """Write poses and times as arrays too, for programs that do not read the text files."""
         for name, document, unit in (("poses", layout.POSES, "m"), ("times", layout.TIMES, "s")):
-            if document not in self._documents:
+            if document not in self.contents:
                 continue
-            with suppress(FormatError):  # not numbers: the text is kept as it is, and reading it says what is wrong
+            with suppress(FormatError):  # not numbers: the text is kept as it is, and its reader reports the error
                 decode = layout.decode_poses if name == "poses" else layout.decode_times
-                numbers = decode(self._documents[document], document)
+                numbers = decode(self.contents[document], document)
                 attributes = {
                     "type": "carlasc.numbers",
                     "version": VERSION,
@@ -214,26 +167,22 @@ class ArrayWriter(PackedWriter):
                 self._store.write_small(f"{self._group}/{name}", numbers, attributes)
 
 
-class _FieldWriter:
-    """The columns of a field, growing frame by frame."""
+class _ArrayFieldWriter(FieldWriter):
+    """Writes the columns of a field."""
 
-    def __init__(self, store: ArrayStoreWriter, node: str, packing: Packing) -> None:
+    def __init__(self, store: ArrayStoreWriter, node: str, field: str, options: Options) -> None:
+        super().__init__(field)
         self.store = store
         self.node = node
-        self.packing = packing
-        self.frames: dict[int, None] = {}
-        self.columns = {
-            c.name: _ColumnWriter(store, f"{node}/{c.name}", c, packing.kind == "grid") for c in packing.columns
-        }
+        self.packing = packing_of(self.entry, options)
+        is_grid = self.packing.kind == "grid"
+        self.columns = {c.name: _ColumnWriter(store, f"{node}/{c.name}", c, is_grid) for c in self.packing.columns}
 
-    def append(self, frame: int, array: NDArray[Any]) -> None:
-        if self.frames and frame <= next(reversed(self.frames)):
-            raise FormatError(f"expected frames in rising order, found {frame} after {next(reversed(self.frames))}")
-        self.packing.entry.check(array, "its array")
+    def write(self, frame: int, array: NDArray[Any]) -> None:
+        """Append one frame to the columns."""
         parts = self.packing.split(array)
         for name, column in self.columns.items():
             column.append(parts.get(name))
-        self.frames[frame] = None
 
     def close(self) -> None:
         entry = self.packing.entry
@@ -258,25 +207,27 @@ class _ColumnWriter:
     def __init__(self, store: ArrayStoreWriter, node: str, column: Column, is_grid: bool) -> None:
         self.store = store
         self.node = node
-        self.place = node  # where the array stands until it is closed
+        self.place = node  # the array's node until it is closed
         self.column = column
         self.is_grid = is_grid
         self.dtype = np.dtype(column.dtype)
-        self.step = column.step or 0  # elements a chunk; 0: not known before the first frame that has any
+        self.step = column.step or 0  # elements per chunk; 0 until the first frame with any elements
         self.chunks = 0
         self.spans: list[tuple[int, int]] = []
         self._writer: ChunkWriter | None = None
         self._shape: tuple[int, ...] | None = None  # of a grid
 
     def append(self, values: NDArray[Any] | None) -> None:
-        """Add a frame's values; None where it has none of this column."""
+        """Add a frame's values; None if it does not need this column."""
         if values is None or (values.size == 0 and not self.is_grid):
             self.spans.append((0, 0))
             return
         self._fit_type(values.dtype)
         if self.is_grid:
             if self._shape not in (None, values.shape):
-                raise FormatError(f"expected a grid of {self._shape}, as in the frames before, found {values.shape}")
+                raise FormatError(
+                    "its array", expected=f"shape {self._shape}, as in earlier frames", found=str(values.shape)
+                )
             self._shape = values.shape
             self._put(values[None].astype(self.dtype, copy=False))
             return
@@ -312,7 +263,7 @@ class _ColumnWriter:
         return self.store.create(self.place, self.dtype, chunk, axis, self.column.encoding, attributes)
 
     def _fit_type(self, dtype: np.dtype[Any]) -> None:
-        """Widen the array where a frame holds what its type does not: written again, chunk by chunk."""
+        """Widen the array if its type does not hold a frame's values: it is written again, chunk by chunk."""
         wider = common_type(self.dtype, dtype)
         if wider == self.dtype:
             return
@@ -329,51 +280,5 @@ class _ColumnWriter:
 
 
 def _round_up(count: int) -> int:
-    """Round a chunk's elements up to a multiple of 256, whole pages of memory in every type."""
+    """Round the elements of a chunk up to a multiple of 256."""
     return -(-count // 256) * 256
-
-
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Refuse to write over something that is there, and over anything but a packed store even with `overwrite`."""
-    if not path.name:
-        raise ArgumentError(path, expected="the name of a store", found="none")
-    if not path.exists():
-        return
-    kind = "folder" if path.is_dir() else "file"
-    if not overwrite:
-        raise ConflictError(
-            path, expected="nothing there", found=f"a {kind}", advice="choose another place, or --overwrite"
-        )
-    if path.is_dir():
-        is_store = any((path / mark).is_file() for mark in ("zarr.json", TABLES_MARK))
-    else:
-        with path.open("rb") as file:
-            is_store = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
-    if not is_store:
-        raise ConflictError(
-            path, expected="a packed store to overwrite", found=f"another {kind}", advice="choose another place"
-        )
-
-
-def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
-    """Rename a finished store to its place; an older one makes way only then."""
-    try:
-        if path.exists():
-            refuse_existing(path, overwrite)
-            old = path.with_name(f"{path.name}.old")
-            remove(old)
-            path.rename(old)
-            finished.rename(path)
-            remove(old)
-        else:
-            finished.rename(path)
-    except OSError as error:
-        raise CarlascError(f"{path}: cannot be put in place: {error.strerror or error}") from error
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder, if there is one."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

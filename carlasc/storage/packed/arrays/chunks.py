@@ -1,8 +1,8 @@
-"""Arrays in chunks, read straight from the files that hold them.
+"""Chunked arrays, read directly from the files that hold the chunks.
 
-A chunk is a range of bytes in some file: zarr's shards and HDF5's chunked data sets both come down to that. It is fetched, its
-checksum is checked, and numcodecs decodes it: a whole scan in about a millisecond, where the stores' own libraries take several.
-No handle stays open, so all of this may be pickled and used on both sides of a fork.
+A chunk is a range of bytes in a file, in zarr's shards and in HDF5's chunked data sets alike. It is fetched, its checksum is verified,
+and numcodecs decodes it: about a millisecond for a whole scan, where the stores' own libraries take several. No handle stays open, so
+these objects can be pickled, and used on both sides of a fork.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import CarlascError, FormatError, import_extra
+from carlasc.running import count_workers
 from carlasc.storage.folders.trees import Tree
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
 NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
-BLOCK = 1 << 21  # bytes that Blosc compresses in one go: a whole scan, where smaller blocks cost size
+BLOCK = 1 << 21  # bytes that Blosc compresses together: a whole scan, because smaller blocks compress less
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Encoding:
 
     Attributes:
         codec: "blosc" (Zstandard after a shuffle) or "pcodec".
-        level: effort, of Zstandard or of PCodec.
+        level: compression level of Zstandard or PCodec.
         shuffle: NO_SHUFFLE, SHUFFLE (bytes) or BITSHUFFLE.
     """
 
@@ -45,17 +46,17 @@ class Encoding:
     shuffle: int = NO_SHUFFLE
 
     def encode(self, chunk: NDArray[Any], extra: str) -> bytes:
-        """Return a chunk's bytes, as the store keeps them (less its checksum)."""
+        """Return a chunk's bytes as they are stored, without the checksum."""
         if self.codec == "pcodec":
             return bytes(_pcodec(self.level, extra).encode(np.ascontiguousarray(chunk).reshape(-1)))
         blosc = import_extra("numcodecs.blosc", extra)
         return bytes(blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK))
 
     def decode(self, data: bytes | memoryview, out: NDArray[Any], extra: str) -> None:
-        """Decode a chunk's bytes into `out`, which is contiguous and of its shape and dtype.
+        """Decode a chunk's bytes into `out`, a contiguous array of the chunk's shape and dtype.
 
         Raises:
-            FormatError: they decode to something else.
+            FormatError: they cannot be decoded.
         """
         try:
             if self.codec == "pcodec":
@@ -64,8 +65,8 @@ class Encoding:
                 import_extra("numcodecs.blosc", extra).decompress(data, out)
         except CarlascError:
             raise
-        except Exception as error:  # each codec has its own kinds
-            raise FormatError(f"cannot be decoded: {error}") from error
+        except Exception as error:  # each codec raises its own types
+            raise FormatError("its bytes", problem=f"cannot be decoded: {error}") from error
 
 
 @cache
@@ -77,14 +78,14 @@ class StoredArray:
     """An array of a store, chunked along one axis, whole along the others.
 
     Attributes:
-        tree: holds the files with the chunks.
-        name: what to call the array in errors.
+        tree: the tree of files that holds the chunks.
+        name: name of the array, for errors.
         dtype: type of the elements, little-endian.
         shape: of the whole array.
         chunk: shape of a chunk.
-        axis: the axis along which chunks follow each other.
+        axis: the axis that is divided into chunks.
         encoding: how chunks become bytes.
-        attributes: what the store says of the array.
+        attributes: the array's attributes in the store.
     """
 
     extra = "zarr"
@@ -111,40 +112,40 @@ class StoredArray:
 
     @property
     def step(self) -> int:
-        """Elements of a chunk along the axis."""
+        """Length of a chunk along the axis."""
         return self.chunk[self.axis]
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Return where chunks are: file, first byte, end."""
+        """Return the file, the first byte and the end of each chunk."""
         raise NotImplementedError
 
     def verify(self, data: memoryview, number: int) -> memoryview:
         """Return a chunk's encoded bytes without their checksum.
 
         Raises:
-            FormatError: the checksum is another.
+            FormatError: the checksum does not match.
         """
         raise NotImplementedError
 
     def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
-        """Read chunks as they are stored; from a remote store all at once."""
+        """Read chunks as they are stored; all at once from a remote store."""
         return [memoryview(data) for data in self.tree.read_ranges(self.locate(numbers))]
 
     def decode(self, data: memoryview, number: int, out: NDArray[Any]) -> None:
-        """Check and decode a fetched chunk into `out`."""
+        """Verify a fetched chunk and decode it into `out`."""
         self.encoding.decode(self.verify(data, number), out, self.extra)
 
     def read_chunk(self, number: int) -> NDArray[Any]:
-        """Fetch, check and decode one chunk."""
+        """Fetch, verify and decode one chunk."""
         out = np.empty(self.chunk, self.dtype)
         self.decode(self.fetch([number])[0], number, out)
         return out
 
 
 def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
-    """Apply a function that spends its time in decoders (which let other threads run) to several items.
+    """Apply a function to several items in threads; it should spend its time in decoders, which release the GIL.
 
-    A worker process of a DataLoader does so in one thread: there are as many workers as the user wants threads.
+    A worker process, such as a DataLoader's, uses one thread: the user has chosen the number of processes.
     """
     items = list(items)
     if len(items) < 2 or multiprocessing.parent_process() is not None:
@@ -153,7 +154,7 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
 
 
 def crc32c(data: bytes | memoryview, extra: str) -> int:
-    """Return the CRC-32C of some bytes, which processors have an instruction for: six times as fast as CRC-32."""
+    """Return the CRC-32C of some bytes: processors have an instruction for it, which makes it six times as fast as CRC-32."""
     source = data.obj if isinstance(data, memoryview) else data
     whole = (
         source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
@@ -162,7 +163,7 @@ def crc32c(data: bytes | memoryview, extra: str) -> int:
 
 
 def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return memory of this thread, as it was left: the next call hands it out again."""
+    """Return uninitialised memory of this thread, which the next call returns again."""
     size = math.prod(shape) * dtype.itemsize
     if _scratch.memory.size < size:
         _scratch.memory = np.empty(size, np.uint8)
@@ -178,5 +179,5 @@ _scratch = _Scratch()
 
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
-    """Threads of this process: a fork inherits the object, but not its threads."""
-    return ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0))), thread_name_prefix="carlasc-decode")
+    """Return the threads of this process: after a fork, the object exists in the child, but its threads do not."""
+    return ThreadPoolExecutor(min(8, count_workers(None)), thread_name_prefix="carlasc-decode")

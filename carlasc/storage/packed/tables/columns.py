@@ -1,4 +1,7 @@
-"""How a field's frames become columns of a Parquet table, and come back: docs/storage.md, section "Tables", in code."""
+"""How a field's frames become columns of a Parquet table, and come back.
+
+Parquet's own dictionaries and byte-stream split make them small: values keep their published types.
+"""
 
 from __future__ import annotations
 
@@ -11,27 +14,28 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.store import Columns, narrow, quantise
+from carlasc.storage.packed.numbers import narrow, quantise
 
 Attributes = Mapping[str, Any]
+Columns = dict[str, NDArray[Any]]
 
 
 class TableField(ABC):
     """The columns of one kind of field.
 
     Attributes:
-        split_bytes: columns whose bytes are stored plane by plane, for numbers that hardly repeat.
+        split_bytes: columns with Parquet's byte-stream split, which suits numbers that seldom repeat.
     """
 
     split_bytes: frozenset[str] = frozenset()
 
     def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-        """Return what a reader needs to know, from the first frame."""
+        """Return what a reader needs to know besides the columns, from the first frame."""
         return {}
 
     @abstractmethod
     def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return each column's type, as pyarrow calls it."""
+        """Return the name of each column's type in pyarrow."""
 
     @abstractmethod
     def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
@@ -43,20 +47,20 @@ class TableField(ABC):
 
 
 class PointsTable(TableField):
-    """`x`, `y`, `z` and `fourth`; quantised ones are integers of `scale_m`."""
+    """`x`, `y`, `z` and `fourth`; quantised coordinates are integers, in steps of `scale_m`."""
 
     split_bytes = frozenset("xyz")
 
     def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-        """Note the quantisation."""
+        """Return the step of quantised coordinates."""
         return {"scale_m": scale_m} if scale_m else {}
 
     def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return a column an axis."""
+        """Return one column per axis."""
         return dict.fromkeys("xyz", "int32" if "scale_m" in attributes else "float32") | {"fourth": "float32"}
 
     def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return a column an axis."""
+        """Return one column per axis."""
         columns = {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(("x", "y", "z", "fourth"))}
         if scale := attributes.get("scale_m"):
             columns |= {name: quantise(columns[name], scale) for name in "xyz"}
@@ -79,11 +83,11 @@ class VectorTable(TableField):
         self.names = names
 
     def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return a column an axis."""
+        """Return one column per axis."""
         return dict.fromkeys(self.names, "float32")
 
     def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return a column an axis."""
+        """Return one column per axis."""
         return {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(self.names)}
 
     def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
@@ -92,7 +96,7 @@ class VectorTable(TableField):
 
 
 class ValuesTable(TableField):
-    """One column of numbers in their published type; a grid's voxels in C order."""
+    """One column of numbers in their published type; the voxels of a grid in C order."""
 
     def __init__(self, entry: layout.Field) -> None:
         (self.name,) = entry.names
@@ -108,13 +112,13 @@ class ValuesTable(TableField):
         return {self.name: np.ascontiguousarray(array, self.dtype).reshape(-1)}
 
     def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return the flat values, labels as narrow as they may be."""
+        """Return the flat values; labels in the narrowest type that holds them."""
         values = columns[self.name]
         return narrow(values) if self.narrow else values
 
 
 class PictureTable(TableField):
-    """`jpeg`: one row a frame, the file's bytes."""
+    """`jpeg`: one row per frame, the bytes of the file."""
 
     def columns(self, attributes: Attributes) -> dict[str, str]:
         """Return the one column."""
@@ -132,10 +136,10 @@ class PictureTable(TableField):
 
 
 class VotesTable(TableField):
-    """`voxel`, `label`, `votes`: the table as it is."""
+    """`voxel`, `label` and `votes`: the columns of the field's own table."""
 
     def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-        """Note whether labels are wide."""
+        """Return the bytes per label."""
         return {"label_bytes": array.dtype["label"].itemsize}
 
     def columns(self, attributes: Attributes) -> dict[str, str]:
@@ -143,15 +147,17 @@ class VotesTable(TableField):
         return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
 
     def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Take the table apart."""
+        """Return the columns of the table."""
         if array.dtype["label"].itemsize != attributes["label_bytes"]:
             raise FormatError(
-                f"expected labels of {attributes['label_bytes']} bytes, as in the first frame, found others"
+                "its labels",
+                expected=f"{attributes['label_bytes']} bytes each, as in the first frame",
+                found=str(array.dtype["label"].itemsize),
             )
         return {name: np.ascontiguousarray(array[name]) for name in self.columns(attributes)}
 
     def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Put the table together."""
+        """Return the table."""
         wide = attributes["label_bytes"] > 1
         votes = np.empty(len(columns["voxel"]), layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)
         for name, column in columns.items():
@@ -160,7 +166,7 @@ class VotesTable(TableField):
 
 
 def table_field(name: str) -> TableField:
-    """Return how a field stands in a table.
+    """Return how a field is stored in a table.
 
     Raises:
         FormatError: the layout has no such field.
@@ -180,7 +186,7 @@ def table_field(name: str) -> TableField:
 
 
 def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
-    """Return what frames.parquet says of a field's frame."""
+    """Return what frames.parquet tells about one frame of a field."""
     if field == "points":
         finite = array[np.isfinite(array).all(axis=1), :3]
         reach = float(np.sqrt((finite.astype(np.float64) ** 2).sum(axis=1).max())) if len(finite) else None

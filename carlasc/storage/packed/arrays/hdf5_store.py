@@ -1,7 +1,7 @@
-"""Packed stores in HDF5: the nodes of docs/storage.md as groups and chunked data sets, compressed by the Blosc filter.
+"""Packed stores in HDF5: groups and chunked data sets, compressed by the Blosc filter.
 
-Any HDF5 reader with hdf5plugin opens them. For reading, h5py looks up where the chunks stand in the file, once a data set; the
-chunks themselves are read and decoded directly.
+Any HDF5 reader with hdf5plugin opens them. Here, h5py looks up the places of the chunks in the file, once per data set; the chunks
+themselves are read and decoded directly.
 """
 
 from __future__ import annotations
@@ -18,21 +18,22 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extra
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
-from carlasc.storage.packed.arrays import ArraySource, ArrayStore
-from carlasc.storage.packed.arraywriter import ArraySink, ArrayStoreWriter, ChunkWriter, remove
-from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c, parallel
-from carlasc.storage.packed.store import Options
+from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c, parallel
+from carlasc.storage.packed.arrays.reading import ArraySource, ArrayStore
+from carlasc.storage.packed.arrays.writing import ArraySink, ArrayStoreWriter, ChunkWriter
+from carlasc.storage.packed.output import remove
+from carlasc.storage.packed.protocol import VERSION, Options
 
 _BLOSC = 32001  # the filter's registered number
-_AHEAD = 16  # chunks that are encoded side by side
-_CRC = "_crc32c"  # ending of the data set with the checksums of another one's chunks
+_AHEAD = 16  # chunks that are encoded in parallel
+_CRC = "_crc32c"  # suffix of the data set with the checksums of another one's chunks
 
 
 class HDF5Source(ArraySource):
     """A packed HDF5 file."""
 
     def __init__(self, tree: Tree, path: str) -> None:
-        """Look at the file's root.
+        """Read the attributes of the file's root.
 
         Raises:
             DependencyError: h5py or the codecs are not installed.
@@ -47,26 +48,26 @@ class HDF5Sink(ArraySink):
     """Writes a packed HDF5 file."""
 
     def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
-        """Start a file, anew if an earlier run was cut off.
+        """Start a file; what an interrupted run left is removed.
 
         Raises:
-            ArgumentError: `small` is asked for, which HDF5 has no filter for.
-            ConflictError: something is in its place, and `overwrite` is not given.
+            ArgumentError: `small` is given, for which HDF5 has no filter.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
         """
         options = options or Options()
         if options.small:
             raise ArgumentError(
-                path,
-                expected="a .zarr store with --small",
-                found="HDF5, which has no PCodec filter",
-                advice="leave --small out",
+                "small",
+                expected="a .zarr store",
+                found=f"{path}: HDF5 has no PCodec filter",
+                advice="leave `small` out",
             )
         super().__init__(Path(path), HDF5StoreWriter, options, overwrite)
 
 
 class HDF5Store(ArrayStore):
-    """The nodes of an HDF5 file, which is opened for each look and closed again."""
+    """The nodes of an HDF5 file, which is opened for each call and closed again."""
 
     def __init__(self, tree: Tree, path: str) -> None:
         self.tree = tree
@@ -85,14 +86,14 @@ class HDF5Store(ArrayStore):
             return np.asarray(self._dataset(file, node)[...])
 
     def array(self, node: str) -> StoredArray:
-        """Return a data set to read chunks of."""
+        """Return a data set whose chunks can be read."""
         with self._open() as file:
             return HDF5Array.from_dataset(
                 self.tree, self.path, self._dataset(file, node), self._dataset(file, node + _CRC)[...]
             )
 
     def stored_bytes(self, node: str) -> int:
-        """Return the bytes of the data sets below a node; of the root the file's."""
+        """Return the bytes of the data sets below a node; for the root, those of the file."""
         if not node:
             return Path(self.location).stat().st_size
         h5py = import_extra("h5py", "hdf5")
@@ -109,7 +110,9 @@ class HDF5Store(ArrayStore):
 
     def _dataset(self, file: Any, node: str) -> Any:
         if node not in file:
-            raise FormatError(self.location, expected=f"the data set {node}", found="nothing", advice="damaged store")
+            raise FormatError(
+                self.location, expected=f"the data set {node}", found="none", advice="the store is damaged"
+            )
         return file[node]
 
     @contextmanager
@@ -125,11 +128,13 @@ class HDF5Store(ArrayStore):
         except CarlascError:
             raise
         except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise FormatError(f"{self.location}: cannot be read as HDF5: {error}: cut short or corrupted?") from error
+            raise FormatError(
+                self.location, problem=f"cannot be read as HDF5: {error}", advice="is it truncated or corrupted?"
+            ) from error
 
 
 class HDF5Array(StoredArray):
-    """A chunked data set behind the Blosc filter, with the place and the checksum of each chunk."""
+    """A chunked data set with the Blosc filter, and the place and the checksum of each chunk."""
 
     extra = "hdf5"
     _places: NDArray[np.int64]
@@ -137,19 +142,19 @@ class HDF5Array(StoredArray):
 
     @classmethod
     def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]) -> HDF5Array:
-        """Look up the chunks of a data set.
+        """Look up the places of a data set's chunks.
 
         Raises:
-            FormatError: it is not chunked along one axis behind Blosc, or chunks are missing.
+            FormatError: it is not chunked, has other filters, or lacks chunks.
         """
         shape, chunk = dataset.shape, dataset.chunks
         plist = dataset.id.get_create_plist()
         if chunk is None or plist.get_nfilters() != 1 or plist.get_filter(0)[0] != _BLOSC:
             raise FormatError(
                 f"{tree.where(path)}: {dataset.name}",
-                expected="a chunked data set behind Blosc",
+                expected="a chunked data set with the Blosc filter",
                 found="another",
-                advice="damaged store",
+                advice="the store is damaged",
             )
         axis = next((axis for axis in range(len(shape)) if dataset.maxshape[axis] is None), len(shape) - 1)
         places = np.full((len(checksums), 2), -1, np.int64)
@@ -165,7 +170,7 @@ class HDF5Array(StoredArray):
                 f"{tree.where(path)}: {dataset.name}",
                 expected=f"{len(checksums)} chunks",
                 found="others",
-                advice="damaged store",
+                advice="the store is damaged",
             )
         array = cls(tree, dataset.name, dataset.dtype, shape, chunk, axis, Encoding(), _read_attributes(dataset))
         array._path, array._places, array._checksums = path, places, checksums
@@ -174,20 +179,22 @@ class HDF5Array(StoredArray):
     _path: str
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Look chunks up."""
+        """Return the places of chunks."""
         return [(self._path, *self._places[number].tolist()) for number in numbers]
 
     def verify(self, data: memoryview, number: int) -> memoryview:
-        """Check a chunk against the data set of checksums."""
+        """Compare a chunk with the data set of checksums."""
         if crc32c(data, "hdf5") != self._checksums[number]:
             raise FormatError(
-                f"chunk {number} of {self.name}: the checksum does not fit: corrupted, fetch or pack it again"
+                f"chunk {number} of {self.name}",
+                problem="the checksum does not match",
+                advice="the store is corrupted: fetch or pack it again",
             )
         return data
 
 
 class HDF5StoreWriter(ArrayStoreWriter):
-    """Writes an HDF5 file with h5py; chunks are encoded here, side by side, as the Blosc filter would."""
+    """Writes an HDF5 file with h5py; chunks are encoded here, in parallel, as the Blosc filter would encode them."""
 
     def __init__(self, path: Path) -> None:
         h5py = import_extra("h5py", "hdf5")
@@ -201,7 +208,7 @@ class HDF5StoreWriter(ArrayStoreWriter):
         self._file = h5py.File(path, "w", libver=("v110", "v110"), track_order=False)
 
     def write_group(self, node: str, attributes: dict[str, Any]) -> None:
-        """Make a group."""
+        """Create a group."""
         _write_attributes(self._file.require_group(node), attributes)
 
     def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
@@ -222,7 +229,7 @@ class HDF5StoreWriter(ArrayStoreWriter):
         encoding: Encoding,
         attributes: dict[str, Any],
     ) -> ChunkWriter:
-        """Start a data set that grows along an axis."""
+        """Create a data set that grows along an axis."""
         empty = tuple(0 if a == axis else n for a, n in enumerate(chunk))
         most = tuple(None if a == axis else n for a, n in enumerate(chunk))
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
@@ -238,19 +245,19 @@ class HDF5StoreWriter(ArrayStoreWriter):
         )
 
     def move(self, node: str, target: str) -> None:
-        """Give a data set, and its checksums, another name."""
+        """Rename a data set and its checksums."""
         self.remove(target)
         for ending in ("", _CRC):
             self._file.move(node + ending, target + ending)
 
     def remove(self, node: str) -> None:
-        """Unlink a node; the file uses its space again."""
+        """Remove a node; the file uses its space again."""
         for name in (node, node + _CRC):
             if name in self._file:
                 del self._file[name]
 
     def finished(self) -> dict[str, str]:
-        """Return nothing: a file that was cut off is started anew."""
+        """Return nothing: what an interrupted run left is not continued."""
         return {}
 
     def close(self, attributes: dict[str, Any]) -> Path:
@@ -279,7 +286,7 @@ class _HDF5ChunkWriter(ChunkWriter):
         self._flush()
         attributes = {
             "type": "carlasc.checksums",
-            "version": 1,
+            "version": VERSION,
             "dtype": "uint32",
             "unit": "crc32c of a chunk's stored bytes",
         }
@@ -298,7 +305,7 @@ class _HDF5ChunkWriter(ChunkWriter):
 
 
 def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
-    """Give a node its attributes: text and numbers as they are, anything else as JSON under `<name>:json`."""
+    """Replace a node's attributes: text and numbers are written as they are, other values as JSON under `<name>:json`."""
     for name in list(node.attrs):
         del node.attrs[name]
     for name, value in attributes.items():

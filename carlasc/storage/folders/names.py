@@ -1,0 +1,15 @@
+"""The check of names that come from archives and stores, which anybody may have made."""
+
+from __future__ import annotations
+
+import re
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+
+
+def leads_outside(name: str) -> bool:
+    """Whether a name with parts joined by "/" may lead out of the folder that it is relative to, on any system.
+
+    Such are absolute names, names with a drive ("C:"), with a part "..", with a backslash, and with a zero byte.
+    """
+    return name.startswith("/") or "\\" in name or "\0" in name or ".." in name.split("/") or bool(_DRIVE.match(name))

@@ -1,0 +1,102 @@
+"""What zarr and HDF5 stores share: chunks, types, leftovers of interrupted runs. HDF5 stands for both where they do the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.sequences import files_of
+from storage.contract import BARE, WHOLE
+
+import carlasc
+from carlasc.errors import FormatError
+from carlasc.storage import Sequence
+from carlasc.storage.opening import open_sink
+from carlasc.storage.packed.protocol import Options
+
+h5py = pytest.importorskip("h5py")
+
+
+def points_of(count: int, seed: int = 0) -> np.ndarray:
+    points = np.zeros((count, 4), np.float32)
+    points[:, :3] = np.random.default_rng(seed).normal(size=(count, 3))
+    return points
+
+
+def write(path: Path, scans: list[np.ndarray], options: Options | None = None, field: str = "points") -> Sequence:
+    with open_sink(path, options or Options(), False) as sink, sink.sequence(BARE) as writer:
+        for frame, array in enumerate(scans):
+            writer.write(field, frame, array)
+    return carlasc.open(path).sequences()[BARE]
+
+
+def test_memory_is_used_again_only_where_shape_and_type_are_the_same(tmp_path: Path) -> None:
+    scans = [points_of(300), points_of(40_000), points_of(17)]
+    exact = write(tmp_path / "exact.h5", scans)
+    rounded = write(tmp_path / "rounded.h5", scans, Options(lossy_mm=1))
+    spare: list[np.ndarray] = []
+    for frame in (0, 1, 0, 2, 1):
+        for sequence, tolerance in ((exact, 0.0), (rounded, 0.00051)):
+            spare = sequence.read_xyz([frame], spare)
+            assert spare[0].dtype == np.float32
+            assert np.abs(spare[0] - scans[frame][:, :3]).max() <= tolerance
+    first = exact.read_xyz([0])
+    memory = first[0].base
+    assert exact.read_xyz([2], first)[0].base is memory
+
+
+@pytest.mark.parametrize("bits", [0x80000000, 0x7FC00123, 0x3F800000], ids=["-0.0", "a NaN with a payload", "1.0"])
+def test_a_4th_column_comes_back_bit_for_bit(tmp_path: Path, bits: int) -> None:
+    points = points_of(50)
+    points.view(np.uint32)[7, 3] = bits
+    sequence = write(tmp_path / "x.h5", [points_of(50), points])
+    assert sequence.read("points", 0).tobytes() == points_of(50).tobytes()
+    assert sequence.read("points", 1).tobytes() == points.tobytes()
+
+
+@pytest.mark.parametrize(("count", "chunk"), [(1, 16_384), (14_600, 16_640), (40_000, 45_056)])
+def test_a_chunk_has_nine_eighths_of_the_first_scan_in_whole_pages(tmp_path: Path, count: int, chunk: int) -> None:
+    write(tmp_path / "x.h5", [points_of(0), points_of(count), points_of(3)])
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert file[BARE]["scans/points/xyz"].chunks == (3, chunk)
+
+
+def test_a_grid_of_another_size_than_the_first_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"frame 1: its array: expected shape \(2, 3, 4\).*found \(2, 3, 5\)"):
+        write(tmp_path / "x.h5", [np.zeros((2, 3, 4), np.uint8), np.zeros((2, 3, 5), np.uint8)], None, "fine/labels")
+
+
+def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_path: Path) -> None:
+    with open_sink(tmp_path / "x.h5", Options(), False) as sink, sink.sequence(BARE) as writer:
+        writer.write_document("poses.txt", b"not numbers")
+        writer.write_document("times.txt", b"0\n1\n")
+    assert carlasc.open(tmp_path / "x.h5").sequences()[BARE].read_document("poses.txt") == b"not numbers"
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert set(file[BARE]) == {"documents", "times"}
+
+
+@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")])
+def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
+    tmp_path: Path, kind: str, package: str
+) -> None:
+    pytest.importorskip(package)
+    with open_sink(tmp_path / f"x.{kind}", Options(), False) as sink:
+        for path in (BARE, WHOLE):
+            with sink.sequence(path) as writer:
+                writer.write("labels", 0, np.arange(3, dtype=np.uint32))
+        sink.sequence(BARE)
+    assert list(carlasc.open(tmp_path / f"x.{kind}").sequences()) == [WHOLE]
+
+
+@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("parquet", "pyarrow")])
+def test_what_an_interrupted_run_left_of_a_sequence_is_removed(tmp_path: Path, kind: str, package: str) -> None:
+    pytest.importorskip(package)
+    labels = np.arange(3, dtype=np.uint32)
+    interrupted = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(BARE)
+    interrupted.write("instances", 0, labels)
+    for writer in interrupted.writers.values():
+        writer.close()  # the field is whole, its sequence is not
+    assert any("instances" in name for name in files_of(tmp_path))
+    write(tmp_path / f"x.{kind}", [labels], None, "labels")
+    assert not any("instances" in name for name in files_of(tmp_path))

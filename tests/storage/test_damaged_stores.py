@@ -1,0 +1,257 @@
+"""Packed stores that are damaged, and names in them that lead elsewhere."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.sequences import files_of, write_dataset
+from storage.contract import BARE, WHOLE
+
+import carlasc
+from carlasc.errors import FormatError
+from carlasc.storage import FolderSource, Sequence, Source
+from carlasc.storage.opening import open_sink
+from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packing import pack, unpack
+
+PACKAGES = {"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}
+KINDS = [
+    pytest.param(kind, marks=pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed"))
+    for kind, name in PACKAGES.items()
+]
+OUTSIDE = ["../victim", "Train/../../victim", "/victim", "C:victim", "Train\\..\\..\\victim", "Train/a\0b"]
+
+
+class Renamed(Source):
+    """A source of one sequence under a name of the test's choice."""
+
+    def __init__(self, published: Path, name: str) -> None:
+        self.location = str(published)
+        self.name = name
+
+    def sequences(self) -> dict[str, Sequence]:
+        return {self.name: FolderSource(self.location).sequences()[BARE]}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("published") / "data")
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sequence_whose_path_leads_elsewhere_is_not_packed(data: Path, tmp_path: Path, kind: str, name: str) -> None:
+    (tmp_path / "victim").mkdir()
+    (tmp_path / "victim" / "diary.txt").write_text("mine")
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        pack(Renamed(data, name), tmp_path / f"x.{kind}")
+    assert files_of(tmp_path / "victim") == {"diary.txt": b"mine"}
+    assert not (tmp_path / f"x.{kind}").exists()
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_sequence_whose_path_leads_elsewhere_is_not_unpacked(data: Path, tmp_path: Path, name: str) -> None:
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        unpack(Renamed(data, name), tmp_path / "files")
+    assert not files_of(tmp_path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fields_and_text_files_whose_names_lead_elsewhere_are_not_written(tmp_path: Path, kind: str) -> None:
+    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(BARE)
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        writer.write("../../../../victim/labels", 0, np.zeros((2, 2, 2), np.uint32))
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        writer.write_document("../../../../victim.txt", b"1")
+    assert not list(tmp_path.rglob("victim*"))
+
+
+def edit_zarr(store: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """Change the root's metadata of a zarr store, which hold those of all nodes."""
+    root = json.loads((store / "zarr.json").read_bytes())
+    change(root)
+    (store / "zarr.json").write_text(json.dumps(root))
+    return store
+
+
+def node(root: dict[str, Any], name: str) -> dict[str, Any]:
+    return root["consolidated_metadata"]["metadata"][name]
+
+
+@pytest.mark.parametrize("entry", ["group", "field", "document"])
+def test_a_store_with_names_that_lead_elsewhere_is_not_read(data: Path, tmp_path: Path, entry: str) -> None:
+    pytest.importorskip("zarr")
+
+    def change(root: dict[str, Any]) -> None:
+        if entry == "group":
+            root["attributes"]["sequences"] = {BARE: "../victim"}
+        elif entry == "field":
+            node(root, BARE)["attributes"]["fields"] += ["../../victim/labels"]
+        else:
+            node(root, BARE)["attributes"]["documents"] += ["../victim.txt"]
+
+    store = edit_zarr(pack(data, tmp_path / "x.zarr").out, change)
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        carlasc.open(store).sequences()
+
+
+@pytest.fixture(scope="module")
+def zarr_store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("zarr")
+    return pack(data, tmp_path_factory.mktemp("zarr") / "x.zarr").out
+
+
+def change_type(root: dict[str, Any]) -> None:
+    node(root, WHOLE)["attributes"]["type"] = "carlasc.field"
+
+
+def remove_split(root: dict[str, Any]) -> None:
+    del node(root, WHOLE)["attributes"]["split"]
+
+
+def change_kind(root: dict[str, Any]) -> None:
+    node(root, f"{WHOLE}/scans/points")["attributes"]["kind"] = "values"
+
+
+def make_big_endian(root: dict[str, Any]) -> None:
+    codecs = node(root, f"{WHOLE}/scans/points/frames")["codecs"]
+    codecs[0]["configuration"] = {"endian": "big"}
+
+
+def change_codec(root: dict[str, Any]) -> None:
+    node(root, f"{WHOLE}/scans/points/frames")["codecs"][1]["name"] = "gzip"
+
+
+def remove_array(root: dict[str, Any]) -> None:
+    del root["consolidated_metadata"]["metadata"][f"{WHOLE}/scans/points/frames"]
+
+
+def remove_field(root: dict[str, Any]) -> None:
+    del root["consolidated_metadata"]["metadata"][f"{WHOLE}/scans/points"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (change_type, "expected the sequence that the store lists"),
+        (remove_split, "expected the attribute split, found none: the store is damaged"),
+        (change_kind, "expected a field of kind points, found 'values'"),
+        (make_big_endian, r"expected the codecs and chunks that carlasc writes, found others \(codecs"),
+        (change_codec, r"found others \(codecs bytes, gzip, crc32c\)"),
+        (remove_array, "expected an array, found none"),
+        (remove_field, "expected the field that the sequence lists, found none"),
+    ],
+)
+def test_wrong_metadata_are_one_clear_error(
+    zarr_store: Path, change: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    before = (zarr_store / "zarr.json").read_bytes()
+    try:
+        edit_zarr(zarr_store, change)
+        with pytest.raises(FormatError, match=message):
+            carlasc.open(zarr_store).sequences()[WHOLE].read("points", 5)
+    finally:
+        (zarr_store / "zarr.json").write_bytes(before)
+
+
+@pytest.fixture
+def hdf5_store(data: Path, tmp_path: Path) -> Path:
+    pytest.importorskip("h5py")
+    return pack(data / "Train", tmp_path / "x.h5").out
+
+
+def edit_hdf5(store: Path, name: str, values: Any) -> None:
+    """Replace a data set of one chunk, as another program might."""
+    import h5py
+
+    with h5py.File(store, "r+") as file:
+        attributes = dict(file[name].attrs)
+        del file[name]
+        file.create_dataset(name, data=values).attrs.update(attributes)
+
+
+LABELS = "Town01_Light/cartesian/scans/labels/values"
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        [(2, 1), (2, 1002)],  # not at the start of a chunk
+        [(2, 0), (2, -5)],  # an end before its start
+        [(2, 0), (3, 1)],  # beyond the array
+        [(-1, 0), (0, 0)],
+        [],  # three frames
+    ],
+)
+def test_wrong_offsets_are_one_clear_error(hdf5_store: Path, last: list[tuple[int, int]]) -> None:
+    import h5py
+
+    with h5py.File(hdf5_store) as file:
+        step = file[LABELS].chunks[0]
+        assert file[LABELS].shape == (3 * step,)
+        right = file[f"{LABELS}_offsets"][:]
+    assert right.tolist() == [[0, 0], [0, 1], [step, step + 777], [2 * step, 2 * step + 1001]]
+    wrong = [chunk * step + element for chunk, element in last]
+    edit_hdf5(hdf5_store, f"{LABELS}_offsets", np.array([*right[:3].tolist(), *([wrong] if wrong else [])], np.int64))
+    with pytest.raises(FormatError, match="expected offsets of 4 frames inside the array"):
+        carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
+
+
+def test_an_index_beyond_the_palette_is_one_clear_error(hdf5_store: Path) -> None:
+    import h5py
+
+    name = "Town01_Light/cartesian/scans/flow/palette_offsets"
+    with h5py.File(hdf5_store) as file:
+        offsets = file[name][:]
+    assert offsets[3, 1] - offsets[3, 0] == 4  # frame 5 has four distinct vectors
+    offsets[3, 1] -= 1
+    edit_hdf5(hdf5_store, name, offsets)
+    sequence = carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"]
+    with pytest.raises(FormatError, match="field flow, frame 5: .*expected indices below 3, found 3"):
+        sequence.read("flow", 5)
+    assert len(sequence.read("flow", 2)) == 777
+
+
+def test_chunks_that_are_missing_are_one_clear_error(hdf5_store: Path) -> None:
+    import h5py
+
+    with h5py.File(hdf5_store) as file:
+        checksums = file[f"{LABELS}_crc32c"][:]
+    for wrong in (checksums[:-1], np.append(checksums, checksums[:1])):
+        edit_hdf5(hdf5_store, f"{LABELS}_crc32c", wrong)
+        with pytest.raises(FormatError, match=rf"expected {len(wrong)} chunks, found others"):
+            carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
+    edit_hdf5(hdf5_store, f"{LABELS}_crc32c", checksums)
+    with h5py.File(hdf5_store, "r+") as file:
+        file[LABELS].resize((4 * file[LABELS].chunks[0],))  # a chunk that was never written
+    edit_hdf5(hdf5_store, f"{LABELS}_crc32c", np.append(checksums, checksums[:1]))
+    with pytest.raises(FormatError, match="expected 4 chunks, found others"):
+        carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
+
+
+def test_a_data_set_without_the_filter_is_one_clear_error(hdf5_store: Path) -> None:
+    edit_hdf5(hdf5_store, LABELS, np.zeros(30, np.uint8))
+    with pytest.raises(FormatError, match="expected a chunked data set with the Blosc filter"):
+        carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
+
+
+@pytest.mark.parametrize("rows", [[0, 1, 776, 1002], [1, 1, 776, 1001]])
+def test_a_table_whose_footer_counts_other_rows_is_one_clear_error(data: Path, tmp_path: Path, rows: list[int]) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    pack(data, tmp_path / "x.parquet")
+    path = tmp_path / "x.parquet" / WHOLE / "labels.parquet"
+    table = parquet.ParquetFile(path)
+    about = json.loads(table.metadata.metadata[b"carlasc"]) | {"rows": rows}
+    groups = [table.read_row_group(number) for number in range(table.num_row_groups)]
+    with parquet.ParquetWriter(path, table.schema_arrow) as writer:
+        for group in groups:
+            writer.write_table(group)
+        writer.add_key_value_metadata({"carlasc": json.dumps(about)})
+    with pytest.raises(FormatError, match="frame 2.*expected 776 rows, found"):
+        carlasc.open(tmp_path / "x.parquet").sequences()[WHOLE].read("labels", 2)
