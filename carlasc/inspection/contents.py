@@ -38,7 +38,7 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
         advice = "the sequence is empty or not complete: copy it again, or give another folder"
         yield Finding("error", "empty", sequence.path, where, "scans or grids", "none", advice)
     elif not grids:
-        advice = "make grids with `carlasc regrid`, or read those of eval_*.zip with `grids_root`"
+        advice = "make grids with `carlasc regrid`, or read those of eval_*.zip with `grids_source`"
         yield Finding("note", "no-grids", sequence.path, where, "a folder of grids", "scans only", advice)
     if isinstance(sequence, FolderSequence):
         yield from _check_grid_folders(sequence, set(grids))
