@@ -1,9 +1,10 @@
-"""How good a grid is: confusion matrix, IoU, completeness, the masks that say where it counts, and scores over data sets."""
+"""How good a grid is: confusion matrix, IoU, completeness, masks of the voxels that count, and scores of data sets."""
 
 from carlasc.metrics.confusion import Completeness, ConfusionMatrix
-from carlasc.metrics.evaluation import Evaluation, evaluate
+from carlasc.metrics.evaluation import evaluate
 from carlasc.metrics.masks import distance_band, field_of_view, known, semantickitti
-from carlasc.metrics.tables import Table, geometric_table, semantic_table
+from carlasc.metrics.scores import Evaluation, geometric_table, semantic_table
+from carlasc.metrics.tables import Table
 from carlasc.metrics.truth import TruthScore, score_truth
 
 __all__ = [

@@ -174,7 +174,7 @@ def test_a_chart_is_drawn(
 
 
 def test_a_chart_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="expected a file ending in .png"):
+    with pytest.raises(ArgumentError, match="plot: expected a file that ends in .png"):
         draw_histograms(Statistics("", CARLA, None, {}, {}), tmp_path / "classes.doc")
 
 
@@ -194,3 +194,35 @@ def test_points_beside_a_prediction_are_counted_in_its_classes(tmp_path: Path) -
         "Ground": 2,
         "Vehicles": 1,
     }
+
+
+def test_of_several_other_grids_none_is_counted(tmp_path: Path) -> None:
+    for grid in ("evaluation_a", "evaluation_b"):
+        write_sequence(tmp_path, "cartesian", 0, grid=grid)
+    assert (stats(tmp_path).total.grids, stats(tmp_path).total.scans) == (0, 5)
+    assert stats(tmp_path, grid="evaluation_b").total.grids == 5
+
+
+def test_every_other_frame_starts_with_the_first(tmp_path: Path) -> None:
+    write_sequence(tmp_path, "cartesian", 0, frames=2)
+    (tmp_path / "cartesian/labels/000001.label").write_bytes(b"odd")
+    assert stats(tmp_path, every=2).failures == ()
+
+
+def test_voxels_of_a_grid_without_counts_are_all_known(tmp_path: Path) -> None:
+    write_sequence(tmp_path, "cartesian", 0)
+    for path in (tmp_path / "cartesian/evaluation").glob("*.bin"):
+        path.unlink()
+    total = stats(tmp_path).total
+    assert (total.unknown, total.voxels.sum(), total.known_share) == (0, 5 * SPEC.num_voxels, 1.0)
+
+
+def test_the_remap_of_a_table_without_one_is_none(tmp_path: Path) -> None:
+    write_sequence(tmp_path, "cartesian", 0)
+    params = tmp_path / "cartesian/evaluation/params.json"
+    params.write_text(json.dumps(SPEC.to_params(11) | {"carlasc": {"classes": "carlasc11"}}))
+    for path in (tmp_path / "cartesian/evaluation").glob("*.label"):
+        (np.fromfile(path, "<u4") % 11).astype("<u4").tofile(path)
+    result = stats(tmp_path)
+    assert (result.classes, result.remap) == (CARLASC11, None)
+    assert result.summed(result.total.voxels) == result.named(result.total.voxels)

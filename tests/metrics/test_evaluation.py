@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from carlasc import GridSpec
+from carlasc import ClassTable, GridSpec
 from carlasc.core.tables import CARLASC11, REMAPS
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.metrics import ConfusionMatrix, distance_band, evaluate, geometric_table, semantic_table
+from carlasc.metrics import ConfusionMatrix, Evaluation, distance_band, evaluate, geometric_table, semantic_table
 from carlasc.storage import FolderSink, layout
 
 SPEC = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -2.0), (4.0, 4.0, 1.0))
@@ -83,7 +83,7 @@ def test_frames_regions_and_masks_choose_what_counts(folders, world):
 def test_predictions_beside_the_data_are_found_by_the_name_of_their_grid(folders, world):
     _, truth = folders
     write_grids(truth, world[2], grid="completion", classes="carlasc11")
-    assert evaluate(truth, truth, pred_grid="completion").matrix == expected_matrix(world)
+    assert evaluate(truth, truth, grid="completion").matrix == expected_matrix(world)
 
 
 def test_one_sequence_pairs_with_one_sequence_whatever_their_paths(folders, world):
@@ -159,16 +159,20 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     pred, truth = folders
     with pytest.raises(FormatError, match="expected classes of semantickitti"):
         evaluate(pred, truth, remap="semantickitti19")
-    with pytest.raises(MissingDataError, match="expected truth for the sequence"):
+    with pytest.raises(MissingDataError, match="expected ground truth for the sequence"):
         evaluate(pred, truth / "Test")
     with pytest.raises(MissingDataError, match="grid nothing"):
-        evaluate(pred, truth, pred_grid="nothing")
+        evaluate(pred, truth, grid="nothing")
     with pytest.raises(MissingDataError, match="none in the range"):
         evaluate(pred, truth, frames=(7, 9))
-    with pytest.raises(ArgumentError, match="mask"):
+    with pytest.raises(ArgumentError, match="mask: expected known, semantickitti or all, found 'some'"):
         evaluate(pred, truth, mask="some")
-    write_grids(tmp_path / "bare", world[0])
-    assert "expected counts" in evaluate(pred, tmp_path / "bare").failures[0][1]
+    with pytest.raises(ArgumentError, match="absent: expected zero or skip"):
+        evaluate(pred, truth, absent="maybe")
+    with pytest.raises(ArgumentError, match="frames: expected a range that holds a frame"):
+        evaluate(pred, truth, frames=(2, 1))
+    write_grids(tmp_path / "without_counts", world[0])
+    assert "expected counts" in evaluate(pred, tmp_path / "without_counts").failures[0][1]
 
 
 def test_absent_classes_count_zero_or_are_left_out(folders, world, tmp_path):
@@ -196,4 +200,112 @@ def test_tables_hold_the_figures_in_percent(folders):
     latex = geometric.to_latex()
     assert r"Net\_1 & " in latex
     assert latex.count(r"\\") == 2
-    assert json.loads(json.dumps(result.figures()))["class_iou"].keys() == set(CARLASC11.names.values())
+    assert json.loads(json.dumps(result.to_dict()))["class_iou"].keys() == set(CARLASC11.names.values())
+
+
+def write_plain(folder, files):
+    """Write a plain folder: {name: array}."""
+    folder.mkdir()
+    for name, array in files.items():
+        array.tofile(folder / name)
+    return folder
+
+
+def test_a_plain_folder_of_truth_has_counts_or_all_its_voxels_are_unknown(tmp_path):
+    truth, pred = (
+        np.array([7, 7, 0, 1], np.uint32),
+        np.array([6, 0, 0, 1], np.uint32),
+    )  # 7 is a road: class 6 of the eleven
+    source = write_plain(tmp_path / "source", {"000000.label": pred})
+    plain = {"000000.label": truth, "000000.bin": np.array([1, 2, 0, 3], np.float32)}
+    result = evaluate(source, write_plain(tmp_path / "truth", plain))
+    assert (result.matrix.total, result.matrix.accuracy) == (3, pytest.approx(2 / 3))
+    without = write_plain(tmp_path / "without", {"000000.label": truth})
+    assert "give `mask=all`" in evaluate(source, without).failures[0][1]
+    assert evaluate(source, without, mask="all").matrix.total == 4
+
+
+def test_plain_folders_of_different_sizes_are_told_by_the_size_of_their_files(tmp_path):
+    source = write_plain(tmp_path / "source", {"000000.label": np.zeros(3, np.uint32)})
+    without = write_plain(tmp_path / "without", {"000000.label": np.zeros(4, np.uint32)})
+    counted = {"000000.label": np.zeros(4, np.uint32), "000000.bin": np.ones(4, np.float32)}
+    assert r"expected the truth's shape (4,), found (3,)" in evaluate(source, without, mask="all").failures[0][1]
+    assert "expected 4 labels" in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]
+
+
+def test_the_classes_of_plain_predictions_can_be_named(folders, world, tmp_path):
+    heavy = SEQUENCES[0]
+    files = {f"{frame:06d}.label": world[0][heavy, frame].astype(np.uint32) for frame in range(3)}
+    source, truth = write_plain(tmp_path / "plain", files), folders[1] / heavy
+    assert evaluate(source, truth, source_classes="carla").matrix.accuracy == 1.0
+    assert len(evaluate(source, truth).failures) == 3  # ids above 10 are not ids of the scored classes
+
+
+def test_a_region_needs_grids_whose_geometry_is_known(tmp_path):
+    folder = write_plain(tmp_path / "plain", {"000000.label": np.zeros(4, np.uint32)})
+    with pytest.raises(ArgumentError, match="region: expected None for grids without geometry"):
+        evaluate(folder, folder, mask="all", region=lambda spec: distance_band(spec, 0, 1))
+
+
+def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tmp_path):
+    labels = np.array([[[0, 1], [10, 40]]])  # 1 is ignored
+    spec = GridSpec("cartesian", (1, 2, 2), (0.0, -1.0, 0.0), (1.0, 1.0, 2.0))
+    write_grids(
+        tmp_path / "a", {(SEQUENCES[0], 0): labels}, {(SEQUENCES[0], 0): np.array([[[1, 1], [1, 0]]])}, spec=spec
+    )
+    path = tmp_path / "a" / SEQUENCES[0] / layout.METADATA
+    path.write_text(json.dumps({"classes": "semantickitti"}))
+    result = evaluate(tmp_path / "a", tmp_path / "a", mask="semantickitti")
+    assert result.matrix.total == 2
+    half = evaluate(
+        tmp_path / "a", tmp_path / "a", mask="semantickitti", region=lambda spec: spec.centers()[..., 1] < 0
+    )
+    assert half.matrix.total == 1
+
+
+def test_sequences_of_different_classes_are_not_summed(world, tmp_path):
+    labels, counts = world[2], world[1]
+    for path, classes in zip(SEQUENCES, ("carlasc11", "carla"), strict=True):
+        write_grids(tmp_path, {k: v for k, v in labels.items() if k[0] == path}, counts, classes=classes)
+    with pytest.raises(FormatError, match="expected the classes carlasc11, found carla"):
+        evaluate(tmp_path, tmp_path, remap=None)
+
+
+def test_of_several_grids_one_is_to_be_named(world, tmp_path):
+    for grid in ("evaluation_a", "evaluation_b"):
+        write_grids(tmp_path, world[0], world[1], grid=grid)
+    with pytest.raises(
+        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose one with"
+    ):
+        evaluate(tmp_path, tmp_path)
+    assert evaluate(tmp_path, tmp_path, truth_grid="evaluation_b").miou > 0.9
+
+
+def evaluation(classes, matrix, absent="zero"):
+    return Evaluation("Net_1", classes, matrix, {}, 1, "known", absent, [])
+
+
+def test_ids_that_are_no_class_are_not_in_the_mean():
+    classes = ClassTable("two", {0: "free", 2: "thing"}, {0: (0, 0, 0), 2: (1, 1, 1)})
+    result = evaluation(classes, ConfusionMatrix(3, counts=np.diag([4, 0, 4])))
+    assert (result.miou, result.miou_without_free) == (1.0, 1.0)
+    assert result.to_dict()["class_iou"] == {"free": 1.0, "thing": 1.0}
+
+
+def test_figures_that_are_not_defined_are_dashes_and_null():
+    classes = ClassTable("two", {0: "free", 1: "thing & co"}, {0: (0, 0, 0), 1: (1, 1, 1)})
+    result = evaluation(classes, ConfusionMatrix(2, counts=np.diag([4, 0])), "skip")
+    semantic, geometric = result.tables()
+    assert semantic.texts() == [["Net_1", "100.00", "-", "100.00", "-", "100.00"]]
+    assert geometric.texts() == [["Net_1", "-", "-", "-"]]
+    assert r"Network & free & thing \& co & mIoU" in semantic.to_latex()
+    assert result.to_dict()["class_iou"] == {"free": 1.0, "thing & co": None}
+    assert (result.to_dict()["iou"], result.to_dict()["miou"]) == (None, 1.0)
+
+
+def test_a_table_needs_evaluations_of_the_same_classes():
+    one, other = (ClassTable(name, {0: "free"}, {0: (0, 0, 0)}) for name in ("one", "other"))
+    with pytest.raises(ArgumentError, match="found none"):
+        semantic_table([])
+    with pytest.raises(ArgumentError, match="evaluations: expected evaluations of one class table, found one, other"):
+        semantic_table([evaluation(table, ConfusionMatrix(1)) for table in (one, other)])

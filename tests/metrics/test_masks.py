@@ -41,6 +41,21 @@ def test_vertical_field_of_view_leaves_out_what_is_above():
     assert not seen[..., 1].any()
 
 
+LINE = GridSpec("cartesian", (4, 1, 3), (0.0, -0.5, -1.5), (4.0, 0.5, 1.5))  # centres at x = 0.5..3.5, y = 0, z = -1..1
+
+
+def test_a_distance_band_includes_its_near_end_and_not_its_far_end():
+    np.testing.assert_array_equal(distance_band(LINE, 1.5, 2.5)[:, 0, 0], [False, True, False, False])
+
+
+def test_a_vertical_field_of_view_includes_both_ends_and_is_measured_from_the_horizontal_distance():
+    np.testing.assert_array_equal(field_of_view(LINE, vertical_rad=(0.0, 1.5))[0, 0], [False, True, True])
+    np.testing.assert_array_equal(field_of_view(LINE, vertical_rad=(-1.5, 0.0))[0, 0], [True, True, False])
+    corner = GridSpec("cartesian", (1, 1, 1), (0.5, 0.5, 0.5), (1.5, 1.5, 1.5))  # elevation of (1, 1, 1): 35.3 degrees
+    assert field_of_view(corner, vertical_rad=(0.0, math.radians(36))).all()
+    assert not field_of_view(corner, vertical_rad=(0.0, math.radians(35))).any()
+
+
 def test_semantickitti_scores_empty_voxels_but_neither_ignored_classes_nor_invalid_ones():
     labels = np.array([0, 0, 1, 52, 99, 10, 252, 40], np.uint16)
     invalid = np.array([0, 1, 0, 0, 0, 0, 0, 1])
@@ -51,10 +66,15 @@ def test_semantickitti_scores_empty_voxels_but_neither_ignored_classes_nor_inval
 
 
 def test_masks_that_can_hold_nothing_are_refused():
-    with pytest.raises(ArgumentError):
+    with pytest.raises(ArgumentError, match="far_m: expected more than 5, where the band starts, found 5"):
         distance_band(SPEC, 5, 5)
-    with pytest.raises(ArgumentError):
-        field_of_view(SPEC, 0.0)
+    with pytest.raises(ArgumentError, match="near_m: expected 0 or more, found -1"):
+        distance_band(SPEC, -1, 5)
+    for angle in (0.0, 6.3):
+        with pytest.raises(ArgumentError, match=r"horizontal_rad: expected an angle in \(0, 2 pi\]"):
+            field_of_view(SPEC, angle)
+    with pytest.raises(ArgumentError, match="vertical_rad"):
+        field_of_view(SPEC, vertical_rad=(0.1, 0.1))
 
 
 def test_known_is_a_count_above_zero():
@@ -75,6 +95,15 @@ def test_truth_is_scored_over_voxels_known_to_both():
     total = score + score
     assert (total.known_both, total.matrix.total) == (4, 4)
     assert total.coverage == score.coverage
+
+
+def test_truth_is_scored_only_where_the_mask_says():
+    spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
+    grid = Grid(spec, np.array([1, 2, 0, 2], np.uint8).reshape(4, 1, 1), np.ones(spec.size, np.float32))
+    score = score_truth(grid, grid, 3, np.array([True, True, False, False]).reshape(4, 1, 1))
+    assert (score.known, score.known_reference, score.known_both, score.matrix.total) == (2, 2, 2, 2)
+    empty = score_truth(grid, grid, 3, np.zeros(spec.size, bool))
+    assert math.isnan(empty.coverage) and math.isnan(empty.accuracy)
 
 
 def test_truth_of_another_grid_is_refused():

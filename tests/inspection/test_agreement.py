@@ -1,0 +1,135 @@
+"""Agreement of points with a grid: shares, mistakes and the limits between them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.inspection.agreement import GridEvidence
+from carlasc.inspection.alignment import choose_pairs, diagnose_poses
+
+SPEC = GridSpec("cartesian", (20, 20, 6), (-10.0, -10.0, -3.0), (10.0, 10.0, 3.0))
+ROUND = GridSpec("cylindrical", (10, 24, 6), (0.0, -math.pi, -3.0), (10.0, math.pi, 3.0))
+
+
+def scene(spec=SPEC, seed=0, right=1.0, count=2000):
+    """Return points at the centres of voxels, their labels, and a grid in which a share of them has its class."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(1, 9, spec.size).astype(np.uint8)
+    cells = rng.integers(0, spec.size, (count, 3))
+    points = spec.from_axes(spec.centers())[tuple(cells.T)]
+    wrong = rng.random(count) >= right
+    return points, np.where(wrong, 9, labels[tuple(cells.T)]), Grid(spec, labels, np.ones(spec.size, np.float32))
+
+
+def diagnose(points, labels, grid, frames=1):
+    evidence = GridEvidence(grid.spec)
+    for _ in range(frames):
+        evidence.add(points, labels, grid)
+    return evidence.diagnose()
+
+
+@pytest.mark.parametrize("spec", [SPEC, ROUND])
+def test_points_in_voxels_of_their_class_agree(spec):
+    result = diagnose(*scene(spec), frames=2)
+    assert (result.share, result.occupied_share, result.frames, result.mistake) == (1.0, 1.0, 2, None)
+
+
+def test_the_share_is_that_of_the_points_in_known_voxels():
+    points, labels, grid = scene(right=0.8)
+    counts = np.ones(SPEC.size, np.float32)
+    counts[:, :10] = 0
+    known = points[:, 1] >= 0
+    cells, _ = SPEC.index(points)
+    right = grid.labels[tuple(cells.T)] == labels
+    result = diagnose(points, labels, Grid(SPEC, grid.labels, counts))
+    assert result.share == pytest.approx(right[known].mean())
+    assert result.mistake is None
+
+
+def test_unlabelled_points_do_not_count():
+    points, labels, grid = scene()
+    labels[::2] = 0
+    assert diagnose(points, labels, grid).share == 1.0
+
+
+def test_frames_with_few_points_in_known_voxels_are_left_out():
+    points, labels, grid = scene()
+    assert diagnose(points[:99], labels[:99], grid).frames == 0
+    assert math.isnan(diagnose(points[:99], labels[:99], grid).share)
+    assert diagnose(points[:100], labels[:100], grid).frames == 1
+
+
+def test_without_labels_occupied_voxels_count():
+    points, _, grid = scene()
+    free = grid.labels.copy()
+    free[:10] = 0
+    result = diagnose(points, None, Grid(SPEC, free, grid.counts))
+    assert result.share == pytest.approx((points[:, 0] >= 0).mean())
+    assert result.share == result.occupied_share
+
+
+@pytest.mark.parametrize("spec", [SPEC, ROUND])
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_grid_shifted_along_its_second_axis_is_named(spec, step):
+    points, labels, grid = scene(spec)
+    result = diagnose(points, labels, Grid(spec, np.roll(grid.labels, step, axis=1), grid.counts), frames=2)
+    axis = "y" if spec is SPEC else "azimuth"
+    assert result.mistake == f"a grid shifted by one cell towards {'+' if step > 0 else '-'}{axis}"
+    assert result.corrected_share > 0.9
+    if spec is ROUND:  # the azimuth is periodic: nothing leaves the grid
+        assert result.corrected_share == 1.0
+
+
+def test_a_mistake_in_a_minority_of_frames_is_not_reported():
+    points, labels, grid = scene()
+    mirrored = points * [1, -1, 1]
+    evidence = GridEvidence(SPEC)
+    for wrong in (True, True, False, False):
+        evidence.add(mirrored if wrong else points, labels, grid)
+    assert evidence.diagnose().mistake is None
+    for _ in range(6):
+        evidence.add(mirrored, labels, grid)
+    assert "y mirrored" in evidence.diagnose().mistake
+
+
+def walls(seed=0):
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.uniform((-25, -25, 0), (25, 25, 3), (400, 3)) for _ in range(3)])
+
+
+def structure_along(poses, world):
+    """Return what a sensor sees of fixed points at each of its poses."""
+    return lambda i: (world - poses[i, :3, 3]) @ poses[i, :3, :3]
+
+
+def straight(count, step):
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = step * np.arange(count)
+    return poses
+
+
+def test_poses_under_which_scans_fall_on_each_other_have_no_mistake():
+    poses = straight(12, 0.5)
+    result = diagnose_poses(structure_along(poses, walls()), poses)
+    assert (result.correction, result.offset_m) == (None, None)
+    assert result.share > 0.9
+
+
+def test_an_offset_is_from_where_the_scan_fits_to_where_the_poses_put_it():
+    true, stored = straight(12, 0.5), straight(12, 0.5)
+    stored[:, 1, 3] = 0.4 * np.arange(12)  # the poses drift to +y: 4 frames, 1.6 m per pair
+    result = diagnose_poses(structure_along(true, walls()), stored)
+    assert result.correction is None
+    assert result.offset_m == pytest.approx((0.0, 1.6, 0.0), abs=0.41)
+
+
+def test_pairs_are_two_metres_apart_or_ten_frames():
+    assert all(later - earlier == 4 for earlier, later in choose_pairs(straight(30, 0.5), 8) if later < 29)
+    assert all(later - earlier == 10 for earlier, later in choose_pairs(straight(40, 0.1), 8) if later < 39)
+    assert {later - earlier for earlier, later in choose_pairs(straight(40, 0.0), 8) if later < 39} == {1, 4}
+    assert choose_pairs(straight(1, 1.0), 8) == []
+    assert len(choose_pairs(straight(60, 0.5), 8)) == 8
