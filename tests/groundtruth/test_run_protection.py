@@ -188,3 +188,16 @@ def test_a_conflict_in_one_sequence_is_found_before_any_is_written(tmp_path):
     with pytest.raises(ConflictError, match="b/cartesian"):
         regrid(tmp_path, SMALL, workers=1, voting=Voting(free_step_m=0.5))
     assert not (tmp_path / "a/cartesian").exists()
+
+
+@pytest.mark.parametrize("document", ["poses.txt", "times.txt"])
+def test_poses_and_times_may_differ_by_rounding_and_not_by_more(made, document):
+    path = made / "cartesian" / document
+    values = np.loadtxt(path)
+    for difference, accepted in ((9e-7, True), (2e-6, False)):
+        np.savetxt(path, values + difference)
+        if accepted:
+            regrid(made, GridSpec.published().with_size((16, 16, 4)), workers=1)
+        else:
+            with pytest.raises(ConflictError, match=f"{document}: expected the data of this run"):
+                regrid(made, GridSpec.published().with_size((8, 8, 4)), workers=1)
