@@ -40,7 +40,7 @@ def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:
 @pytest.mark.parametrize(
     ("points", "labels", "pose", "match"),
     [
-        (POINTS, LABELS[:3], POSE, r"expected shape \(4,\), one a point, found \(3,\)"),
+        (POINTS, LABELS[:3], POSE, r"expected shape \(4,\), one per point, found \(3,\)"),
         (POINTS[:, :2], LABELS, POSE, r"expected shape \(N, 3\) float32, found \(4, 2\)"),
         (POINTS.astype(np.float64), LABELS, POSE, r"float32, found \(4, 3\) float64"),
         (POINTS, LABELS.astype(np.int64), POSE, "expected unsigned integers, found int64"),
