@@ -189,7 +189,7 @@ class ScanFeed:
         scan, pose = self._voting_points(frame), self.pose(frame)
         prepared = PreparedScan.of(frame, scan.points, _labels(scan), pose)
         segments: list[Segment] = []
-        standing = Standing.none(frame)
+        standing = Standing.empty(frame)
         moving = np.flatnonzero(np.isin(_labels(scan), sorted(self.classes.moving)))
         if self.motion_source == "instances":
             segments = segment_by_instances(frame, scan, pose)
