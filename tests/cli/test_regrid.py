@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers import passing
 from helpers.captures import read_tree, write_capture
 from typer.testing import CliRunner
 
@@ -135,6 +136,24 @@ def test_a_folder_without_a_capture_is_1(tmp_path):
         "nowhere: expected a folder, a zip or a packed store, found nothing"
         in _regrid(tmp_path / "nowhere", "--res", 0.2).stderr
     )
+
+
+def test_advice_names_options_where_the_library_names_arguments(tmp_path, capture):
+    street = passing.write_sequence(tmp_path / "street", (), frames=2, poses=False)
+    assert "`--poses kiss-icp`" in _regrid(street, "--res", 0.4).stderr
+    assert _regrid("--preset", "coarse").exit_code == 0
+    advice = _regrid("--preset", "coarse", "--voting", "sample").stderr
+    assert "choose another `--name`, or replace the grid with `--overwrite`" in advice
+    assert "`--out`" in _regrid("--preset", "coarse", "--name", "velodyne2", "-o", street, "--frames", "100").stderr
+
+
+def test_options_for_scans_and_grids_say_what_observes_the_scene(capture):
+    runs = {"capture": [], "scans": ["--stride", 2, "--force"], "grid": ["--from-grid", "capture"]}
+    for kind, options in runs.items():
+        result = _regrid("--size", "16,16,4", "--name", kind, *options)
+        assert result.exit_code == 0, result.stderr
+        record = json.loads((capture / "cartesian" / kind / "params.json").read_bytes())["carlasc"]
+        assert record["observe"] == kind
 
 
 def test_presets_are_the_published_grids_in_the_coordinates_asked_for():

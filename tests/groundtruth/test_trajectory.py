@@ -9,7 +9,7 @@ import carlasc
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.trajectory import check_trajectory
+from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.storage import FolderSink, layout
 
@@ -85,6 +85,22 @@ def test_a_sequence_without_poses_offers_to_estimate_them(tmp_path):
     (sequence,) = carlasc.open(tmp_path).sequences().values()
     with pytest.raises(MissingDataError, match='poses.txt: expected poses.*`poses="kiss-icp"`'):
         check_trajectory(sequence, FromScans())
+
+
+def test_frames_without_a_scan_take_the_estimated_pose_of_the_scan_before(tmp_path, monkeypatch):
+    sequence = write(tmp_path, straight(10, 6), frames=[0, 2, 5])
+    sizes = []
+
+    def estimate(scans, max_range_m):
+        sizes.extend(scan.shape for scan in scans)
+        assert max_range_m == 100.0
+        return np.stack([translation((number, 0, 0)) for number in range(len(sizes))])
+
+    monkeypatch.setattr("carlasc.groundtruth.from_scans.trajectory.estimate_poses", estimate)
+    estimated = with_estimated_poses(sequence)
+    assert sizes == [(1, 3)] * 3
+    assert estimated.poses[:, 0, 3].tolist() == [0, 0, 1, 1, 1, 2]
+    assert [estimated.read_pose(frame)[0, 3] for frame in (0, 2, 5)] == [0, 1, 2]
 
 
 class TestSequenceWithOtherPoses:
