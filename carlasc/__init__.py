@@ -36,6 +36,10 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.dataset import Dataset as Dataset
     from carlasc.dataset import Flip as Flip
     from carlasc.dataset import collate as collate
+    from carlasc.groundtruth import FromCapture as FromCapture
+    from carlasc.groundtruth import FromGrid as FromGrid
+    from carlasc.groundtruth import FromScans as FromScans
+    from carlasc.groundtruth import Voting as Voting
     from carlasc.groundtruth import regrid as regrid
     from carlasc.inspection import info as info
     from carlasc.inspection import stats as stats
@@ -96,7 +100,13 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
         "record",
         "simulate",
     ),
-    "groundtruth": ("regrid",),
+    "groundtruth": (
+        "FromCapture",
+        "FromGrid",
+        "FromScans",
+        "Voting",
+        "regrid",
+    ),
     "dataset": (
         "Dataset",
         "Flip",

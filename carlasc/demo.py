@@ -92,7 +92,7 @@ def demonstrate(
     grids = []
     for name, spec in _demo_grids().items():
         with step(f"ground truth, {name}") as progress:
-            made = regrid(sequence, None, spec, workers=workers, progress=progress)
+            made = regrid(sequence, spec, workers=workers, progress=progress)
             if made.failures:
                 raise ConflictError(made.failures[0].message)
             grids += [Path(folder) for folder in made.grids]

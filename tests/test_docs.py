@@ -251,7 +251,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert ran.returncode == 0, ran.stderr
     html = (tmp_path / "site" / "format" / "index.html").read_text()
     assert "velodyne/000000.bin" in html and "generated:" not in html
-    assert "--free-step" in (tmp_path / "site" / "commands" / "regrid" / "index.html").read_text()
+    assert "--free-step-m" in (tmp_path / "site" / "commands" / "regrid" / "index.html").read_text()
     assert not list((tmp_path / "site").rglob("*.py"))
 
 

@@ -17,13 +17,13 @@ from carlasc.cli.grid_options import (
     Preset,
     PresetOption,
     ResOption,
+    RuleOption,
     SizeOption,
     StrideOption,
-    VoteOption,
     WindowMOption,
     WindowOption,
-    merging_of,
     parse_grid,
+    scans_of,
 )
 from carlasc.errors import ArgumentError
 
@@ -114,7 +114,7 @@ def convert(
     size: SizeOption = None,
     coordinates: CoordinatesOption = None,
     bounds: BoundsOption = None,
-    vote: VoteOption = None,
+    rule: RuleOption = None,
     window: WindowOption = None,
     window_m: WindowMOption = None,
     stride: StrideOption = None,
@@ -132,8 +132,8 @@ def convert(
     """
     from carlasc.converting import convert as convert_recordings
 
-    merging = merging_of(window, window_m, stride, dynamic, None, None)
-    asked = any(value is not None for value in (preset, res, size, coordinates, bounds, vote, merging))
+    merging = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
+    asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, merging))
     if asked and grids is not Grids.scans:
         raise ArgumentError(
             "grid options are for --grids scans", expected="none of them", found=f"some with {grids.value}"
@@ -153,7 +153,7 @@ def convert(
             grids=grids.value,
             spec=spec,
             merging=merging,
-            vote=None if vote is None else vote.value,
+            vote=None if rule is None else rule.value,
             poses=poses.value,
             flow=flow.value,
             allow_unknown=allow_unknown,

@@ -1,4 +1,4 @@
-"""What `regrid` and `convert` are told of the grids they make: options that both take, and what they mean."""
+"""The options for grids that `regrid` and `convert` share, and their translation into arguments of the library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from carlasc.errors import ArgumentError
 
 if TYPE_CHECKING:
     from carlasc.core.grids import GridSpec
-    from carlasc.groundtruth.from_scans.windows import Merging
+    from carlasc.groundtruth import FromScans
 
 
 class Coordinates(StrEnum):
@@ -31,7 +31,7 @@ class Preset(StrEnum):
     cylindrical = "cylindrical"
 
 
-class Vote(StrEnum):
+class Rule(StrEnum):
     """How votes are counted."""
 
     sensor = "sensor"
@@ -39,8 +39,8 @@ class Vote(StrEnum):
     point = "point"
 
 
-class Dynamics(StrEnum):
-    """What becomes of moving points."""
+class Dynamic(StrEnum):
+    """What happens to moving points."""
 
     align = "align"
     current = "current"
@@ -54,72 +54,78 @@ SCANS = "Scans merged over time"
 ResOption = Annotated[
     str | None,
     typer.Option(
-        "--res", help="Size of a voxel: metres, or one value an axis: x,y,z or radius,degrees,z.", rich_help_panel=_GRID
+        "--res",
+        help="Size of a voxel: one value in metres, or one value per axis: x,y,z or radius,degrees,z.",
+        rich_help_panel=_GRID,
     ),
 ]
 SizeOption = Annotated[
     str | None,
-    typer.Option("--size", help="Number of voxels an axis, X,Y,Z, over exactly the bounds.", rich_help_panel=_GRID),
+    typer.Option("--size", help="Number of voxels per axis, X,Y,Z, within exactly the bounds.", rich_help_panel=_GRID),
 ]
-PresetOption = Annotated[Preset | None, typer.Option("--preset", help="A published grid.", rich_help_panel=_GRID)]
+PresetOption = Annotated[
+    Preset | None, typer.Option("--preset", help="A grid of the published data set.", rich_help_panel=_GRID)
+]
 CoordinatesOption = Annotated[
     Coordinates | None,
-    typer.Option("--coordinates", help="Axes of the grid; cartesian if not given.", rich_help_panel=_GRID),
+    typer.Option("--coordinates", help="Coordinates of the grid; default: cartesian.", rich_help_panel=_GRID),
 ]
 BoundsOption = Annotated[
     str | None,
     typer.Option(
         "--bounds",
-        help="x0,x1,y0,y1,z0,z1 in metres (cylindrical: radius in metres, azimuth in degrees, z); the published ones if not given.",
+        help="x0,x1,y0,y1,z0,z1 in metres (cylindrical: radius in metres, azimuth in degrees, z in metres); default: the published bounds.",
         rich_help_panel=_GRID,
     ),
 ]
-VoteOption = Annotated[
-    Vote | None,
+RuleOption = Annotated[
+    Rule | None,
     typer.Option(
-        "--vote",
-        help="sensor: one vote a sensor, voxel and class (as published; the default for captures); sample: every sample (as in the"
-        " paper); point: every point, free space once a scan (the default for scans).",
+        "--voting",
+        help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures);"
+        " sample: every sample counts, as in the paper; point: every point counts, free space once per scan (default for scans).",
         rich_help_panel=_GRID,
     ),
 ]
 WindowOption = Annotated[
     str | None,
     typer.Option(
-        "--window", help="Scans A:B around each frame, in frames; -30:30 if not given.", rich_help_panel=SCANS
+        "--window",
+        help="First and last scan to merge, relative to each frame, in frames; default: -30:30.",
+        rich_help_panel=SCANS,
     ),
 ]
 WindowMOption = Annotated[
     float | None,
-    typer.Option("--window-m", help="Of those, only scans within so many metres driven.", rich_help_panel=SCANS),
+    typer.Option("--window-m", help="Merge only scans within this driven distance, in metres.", rich_help_panel=SCANS),
 ]
-StrideOption = Annotated[int | None, typer.Option("--stride", help="Every so manyth scan.", rich_help_panel=SCANS)]
+StrideOption = Annotated[
+    int | None,
+    typer.Option(
+        "--stride", help="Merge every N-th scan of the window; default: 1.", metavar="N", rich_help_panel=SCANS
+    ),
+]
 DynamicOption = Annotated[
-    Dynamics | None,
+    Dynamic | None,
     typer.Option(
         "--dynamic",
-        help="What moves: align (complete each actor; the default), current (that frame's points only), drop, tube (SemanticKITTI's rule).",
+        help="What happens to moving points. align: complete each actor from all scans (default); current: use those of the frame"
+        " itself; drop: use none; tube: leave them where they were seen, as in SemanticKITTI.",
         rich_help_panel=SCANS,
     ),
 ]
 
 
-def merging_of(
-    window: str | None,
-    window_m: float | None,
-    stride: int | None,
-    dynamic: Dynamics | None,
-    min_range: float | None,
-    max_range: float | None,
-) -> Merging | None:
-    """Return how scans are merged, None if nothing was said of it."""
-    from carlasc.groundtruth.from_scans.windows import Merging
+def scans_of(*, window: str | None, dynamic: Dynamic | None, **others: Any) -> FromScans | None:
+    """Return how scans are merged, with the defaults of `FromScans` for what is None; None if everything is."""
+    from carlasc.groundtruth import FromScans
 
-    given: dict[str, Any] = {"window_m": window_m, "stride": stride, "min_range_m": min_range, "max_range_m": max_range}
-    given["dynamic"] = None if dynamic is None else dynamic.value
-    given["window"] = None if window is None else _parse_window(window)
+    given = others | {
+        "window": None if window is None else _parse_window(window),
+        "dynamic": None if dynamic is None else dynamic.value,
+    }
     given = {name: value for name, value in given.items() if value is not None}
-    return Merging(**given) if given else None
+    return FromScans(**given) if given else None
 
 
 def _parse_window(text: str) -> tuple[int, int]:
@@ -128,30 +134,28 @@ def _parse_window(text: str) -> tuple[int, int]:
         return int(first), int(last)
     except ValueError:
         raise ArgumentError(
-            "--window", expected="A:B in frames around the current one such as -30:30", found=f"{text!r}"
+            "window", expected="A:B, in frames relative to the current one, such as -30:30", found=repr(text)
         ) from None
 
 
 def parse_grid(
     res: str | None, size: str | None, preset: Preset | None, coordinates: Coordinates | None, bounds: str | None
 ) -> GridSpec:
-    """Return the grid that the options describe; degrees end here.
+    """Return the grid that the options describe. Azimuths are degrees here and radians everywhere else.
 
     Raises:
-        ArgumentError: not exactly one of the three, or values that make no grid.
+        ArgumentError: not exactly one of --res, --size and --preset, or values that are not valid for a grid.
     """
     from carlasc.core.grids import GridSpec
 
     given = [option for option, value in (("--res", res), ("--size", size), ("--preset", preset)) if value is not None]
     if len(given) != 1:
         found = " and ".join(given) or "none of them"
-        raise ArgumentError(f"expected one of --res, --size and --preset, found {found}: try --res 0.2")
+        raise ArgumentError("grid", expected="one of --res, --size and --preset", found=found, advice="try --res 0.2")
     if preset is Preset.cylindrical and coordinates is Coordinates.cartesian:
-        raise ArgumentError("--preset cylindrical", expected="no --coordinates, or cylindrical", found="cartesian")
+        raise ArgumentError("coordinates", expected="cylindrical with --preset cylindrical", found="cartesian")
     if preset is not None and bounds is not None:
-        raise ArgumentError(
-            "--bounds", expected="--res or --size with it", found="--preset, which has bounds of its own"
-        )
+        raise ArgumentError("bounds", expected="none with --preset, which has its own bounds", found=repr(bounds))
     cylindrical = preset is Preset.cylindrical or coordinates is Coordinates.cylindrical
     spec = GridSpec.published("cylindrical" if cylindrical else "cartesian")
     if bounds is not None:

@@ -24,21 +24,22 @@ from carlasc.cli.grid_options import (
     DynamicOption,
     PresetOption,
     ResOption,
+    RuleOption,
     SizeOption,
     StrideOption,
-    VoteOption,
     WindowMOption,
     WindowOption,
-    merging_of,
     parse_grid,
+    scans_of,
 )
+from carlasc.errors import ArgumentError
 
 if TYPE_CHECKING:
-    pass
+    from carlasc.groundtruth import FromScans, Observe
 
 
 class Observed(StrEnum):
-    """What grids are made of."""
+    """What grids are made from."""
 
     capture = "capture"
     scans = "scans"
@@ -53,17 +54,18 @@ class Poses(StrEnum):
 
 
 def regrid(
-    src: Annotated[
+    source: Annotated[
         Path,
         typer.Argument(
-            help="A sequence's folder, with a raw capture or with scans; or a folder of such sequences.",
-            show_default="here",
+            metavar="SOURCE",
+            help="A sequence's folder, with a raw capture or with scans, or a folder of such sequences.",
+            show_default="current folder",
         ),
     ] = Path(),
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="Where the sequences go, each with its path below SRC; SRC itself if not given."
+            "-o", "--out", help="Folder to write to, each sequence at its path below SOURCE; default: SOURCE itself."
         ),
     ] = None,
     res: ResOption = None,
@@ -71,61 +73,75 @@ def regrid(
     preset: PresetOption = None,
     coordinates: CoordinatesOption = None,
     bounds: BoundsOption = None,
-    free_step: Annotated[float, typer.Option(help="Distance between the free samples on a ray, metres.")] = 1.5,
-    vote: VoteOption = None,
+    free_step_m: Annotated[float, typer.Option(help="Distance between two free samples on a ray, in metres.")] = 1.5,
+    rule: RuleOption = None,
     frames: Annotated[
-        str | None, typer.Option(help="Frame numbers A:B of the source, B not included; either end may be left out.")
+        str | None,
+        typer.Option(help="Frame numbers A:B of the source, without B; either end may be left out.", metavar="A:B"),
     ] = None,
     workers: Workers = None,
-    keep_votes: Annotated[bool, typer.Option("--keep-votes", help="Write the votes of every class too.")] = False,
-    name: Annotated[str | None, typer.Option(help="The grid's folder; by its size if not given.")] = None,
+    keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False,
+    name: Annotated[str | None, typer.Option(help="Name of the grid's folder; default: a name by its size.")] = None,
     overwrite: Overwrite = False,
-    source: Annotated[
+    observe: Annotated[
         Observed | None,
-        typer.Option(help="What grids are made of; the capture where there is one, else scans.", show_default=False),
+        typer.Option(
+            help="What grids are made from; default: the capture if there is one, otherwise the scans.",
+            show_default=False,
+        ),
     ] = None,
     from_grid: Annotated[
-        str | None, typer.Option(help="With --source grid: the finer grid; the finest if not given.")
+        str | None, typer.Option(help="Name of the finer grid, with --observe grid; default: the finest one.")
     ] = None,
     window: WindowOption = None,
     window_m: WindowMOption = None,
     stride: StrideOption = None,
     dynamic: DynamicOption = None,
-    min_range: Annotated[
-        float | None, typer.Option(help="Leave nearer points out of grids, metres.", rich_help_panel=SCANS)
+    min_range_m: Annotated[
+        float | None, typer.Option(help="Leave out nearer points, in metres.", rich_help_panel=SCANS)
     ] = None,
-    max_range: Annotated[
-        float | None, typer.Option(help="Leave farther points out of grids, metres.", rich_help_panel=SCANS)
+    max_range_m: Annotated[
+        float | None, typer.Option(help="Leave out farther points, in metres.", rich_help_panel=SCANS)
     ] = None,
     poses: Annotated[
-        Poses, typer.Option(help="poses.txt, or estimated from the scans by KISS-ICP.", rich_help_panel=SCANS)
-    ] = Poses.file,
-    force: Annotated[bool, typer.Option("--force", help="Go on where poses jump.", rich_help_panel=SCANS)] = False,
+        Poses | None,
+        typer.Option(help="file: from poses.txt (default); kiss-icp: estimated from the scans.", rich_help_panel=SCANS),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Continue if poses jump between frames.", rich_help_panel=SCANS)
+    ] = False,
     json: Json = False,
 ) -> None:
     """Make ground truth at any resolution: from a raw capture, from the scans of one sensor merged over time, or from a finer grid.
 
-    Run it again to go on where it stopped: frames that are there are skipped. Inside a sequence's folder `carlasc regrid --res 0.2` is all.
+    Existing frames are skipped, so the same command continues an interrupted run. Inside a sequence's folder, `carlasc regrid --res 0.2` is
+    enough.
     """
+    from carlasc.groundtruth import Voting
     from carlasc.groundtruth import regrid as regrid_sequences
 
     spec = parse_grid(res, size, preset, coordinates, bounds)
+    voting = Voting(None if rule is None else rule.value, free_step_m, keep)
+    scans = scans_of(
+        window=window,
+        window_m=window_m,
+        stride=stride,
+        dynamic=dynamic,
+        min_range_m=min_range_m,
+        max_range_m=max_range_m,
+        poses=None if poses is None else poses.value,
+        force=force or None,
+    )
     with progress_bar("regrid") as progress:
         result = regrid_sequences(
-            src,
-            out,
+            source,
             spec,
-            observations=None if source is None else source.value,
-            vote=None if vote is None else vote.value,
-            free_step_m=free_step,
+            out,
+            observe=_observe(observe, scans, from_grid),
+            voting=voting,
             frames=parse_frames(frames),
             name=name,
-            keep_votes=keep_votes,
             overwrite=overwrite,
-            merging=merging_of(window, window_m, stride, dynamic, min_range, max_range),
-            from_grid=from_grid,
-            estimate_poses=poses is Poses.kiss_icp,
-            force=force,
             workers=workers,
             progress=progress,
         )
@@ -134,9 +150,29 @@ def regrid(
     else:
         for note in result.notes:
             typer.echo(f"note: {note}")
-        there = f" ({result.skipped} were there)" if result.skipped else ""
+        skipped = f" ({result.skipped} existed)" if result.skipped else ""
         for grid in result.grids:
             typer.echo(grid)
-        typer.echo(f"{spec}: {result.made} frames made{there} in {result.elapsed_s:.1f} s")
+        typer.echo(f"{spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")
     failures = [(failure.frame, failure.message) for failure in result.failures]
     report_failures(failures, result.made + result.skipped + len(failures))
+
+
+def _observe(kind: Observed | None, scans: FromScans | None, grid: str | None) -> Observe | None:
+    """Return the `observe` argument. Options for scans and for a finer grid say what is meant if --observe is not given."""
+    from carlasc.groundtruth import FromCapture, FromGrid, FromScans
+
+    if kind is None and (scans or grid) is not None:
+        kind = Observed.scans if scans is not None else Observed.grid
+    if scans is not None and kind is not Observed.scans:
+        raise ArgumentError("observe", expected="scans with the options for scans", found=str(kind))
+    if grid is not None and kind is not Observed.grid:
+        raise ArgumentError("observe", expected="grid with --from-grid", found=str(kind))
+    match kind:
+        case Observed.capture:
+            return FromCapture()
+        case Observed.scans:
+            return scans or FromScans()
+        case Observed.grid:
+            return FromGrid(grid)
+    return None

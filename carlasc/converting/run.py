@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -37,7 +37,7 @@ from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import SequenceWriter, Sink
 
 if TYPE_CHECKING:
-    from carlasc.groundtruth.from_scans.windows import Merging
+    from carlasc.groundtruth.options import FromScans
     from carlasc.groundtruth.voting.ballot import VoteRule
 
 Grids = Literal["scans", "voxels", "none"]
@@ -71,7 +71,7 @@ def convert(
     frame: FrameName = "carlasc",
     grids: Grids = "scans",
     spec: GridSpec | None = None,
-    merging: Merging | None = None,
+    merging: FromScans | None = None,
     vote: VoteRule | None = None,
     poses: PoseSource = "auto",
     flow: Flow = "instances",
@@ -360,7 +360,7 @@ def _notes(plan: _Plan, without_flow: int, flow: Flow) -> list[str]:
 def _regrid(
     plans: Sequence[_Plan],
     spec: GridSpec | None,
-    merging: Merging | None,
+    merging: FromScans | None,
     vote: VoteRule | None,
     force: bool,
     workers: int,
@@ -369,7 +369,7 @@ def _regrid(
     failures: list[Failure],
 ) -> tuple[tuple[str, ...], list[str]]:
     """Make grids of the converted scans, each frame's from the scans around it in time."""
-    from carlasc.groundtruth.run import regrid
+    from carlasc.groundtruth import FromScans, Voting, regrid
 
     paths: list[str] = []
     notes: list[str] = []
@@ -385,12 +385,10 @@ def _regrid(
 
         result = regrid(
             folder,
-            folder.parent,
             spec or GridSpec.published(),
-            observations="scans",
-            merging=merging,
-            vote=vote,
-            force=force,
+            folder.parent,
+            observe=replace(merging or FromScans(), force=force),
+            voting=Voting(vote),
             workers=workers,
             executor=executor,
             progress=advance,

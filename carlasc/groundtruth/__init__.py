@@ -1,7 +1,26 @@
-"""Observations to votes to grid: the ground truth and how a run over a data set makes it."""
+"""Ground truth: observations are turned into votes and votes into grids, and a run does so for a whole data set."""
 
+from carlasc.groundtruth.from_grid import resample
+from carlasc.groundtruth.options import Dynamic, FromCapture, FromGrid, FromScans, Observe, PoseSource, Voting
 from carlasc.groundtruth.run import FrameFailure, RegridResult, regrid
-from carlasc.groundtruth.voting.ballot import Ballot, Votes, count_votes
+from carlasc.groundtruth.voting.ballot import Ballot, VoteRule, Votes, count_votes
 from carlasc.groundtruth.voting.observations import Observation
 
-__all__ = ["Ballot", "FrameFailure", "Observation", "RegridResult", "Votes", "count_votes", "regrid"]
+__all__ = [
+    "Ballot",
+    "Dynamic",
+    "FrameFailure",
+    "FromCapture",
+    "FromGrid",
+    "FromScans",
+    "Observation",
+    "Observe",
+    "PoseSource",
+    "RegridResult",
+    "VoteRule",
+    "Votes",
+    "Voting",
+    "count_votes",
+    "regrid",
+    "resample",
+]

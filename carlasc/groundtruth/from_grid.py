@@ -1,4 +1,4 @@
-"""A grid from a finer one: each coarse voxel takes what most of the known fine cells in it are."""
+"""Grids from finer grids: each voxel takes the class of most of the known cells in it."""
 
 from __future__ import annotations
 
@@ -12,30 +12,37 @@ import numpy as np
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.groundtruth.from_scans.inputs import StoredInputs, choose_frames, scan_fields
-from carlasc.groundtruth.from_scans.windows import bare
-from carlasc.groundtruth.inputs import FrameData, FrameInputs, FrameRange, Recipe, SequenceInputs
-from carlasc.storage import open as open_source
-from carlasc.storage.protocol import Sequence
+from carlasc.groundtruth.inputs import (
+    FrameData,
+    FrameInput,
+    Plan,
+    SequenceInput,
+    StoredSequence,
+    choose_frames,
+    scan_fields,
+    without_caches,
+)
+from carlasc.groundtruth.options import FromGrid
+from carlasc.storage import as_source
+from carlasc.storage.protocol import Sequence, Source
 
 
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
-    """Make a coarser grid of a finer one.
+    """Make a coarser grid from a finer one.
 
-    A fine cell belongs to the coarse voxel that holds its centre: where the sizes divide, those are just its whole cells. The
-    class of most known cells wins, ties go to the lowest id; counts add up.
+    A fine cell belongs to the coarse voxel that contains its centre. Each voxel takes the class of most of its known cells, ties go
+    to the lowest id, and counts are added up.
 
     Args:
-        grid: the finer grid; both grids are in one frame.
-        spec: the coarser grid.
-        classes: table of the labels.
+        grid: the finer grid.
+        spec: the coarser grid, in the same frame.
+        classes: class table of the labels.
 
     Returns:
-        The coarse grid; voxels without a known cell are unknown.
+        The coarse grid. Voxels without a known cell are unknown.
 
     Raises:
-        ArgumentError: the grid asked for is finer on an axis, of other coordinates, or reaches beyond: what was never
-            measured cannot be made up.
+        ArgumentError: `spec` is finer than `grid` on an axis, of other coordinates, or extends beyond it.
     """
     check_coarser(grid.spec, spec)
     known = grid.known.reshape(-1)
@@ -45,7 +52,7 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
     labels = grid.labels.reshape(-1)[known][inside].astype(np.int64)
     weights = None if grid.counts is None else grid.counts.reshape(-1)[known][inside]
     pairs, cells = np.unique(voxel[inside] * classes.num_channels + labels, return_counts=True)
-    # Written in rising number of cells, and among equals from the highest id down: the last one stays.
+    # Sorted by increasing number of cells, then by decreasing id: the last one written wins.
     order = np.lexsort((-(pairs % classes.num_channels), cells))
     coarse = np.zeros(spec.num_voxels, classes.dtype)
     coarse[pairs[order] // classes.num_channels] = (pairs[order] % classes.num_channels).astype(classes.dtype)
@@ -54,29 +61,35 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
 
 
 def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
-    """Raise ArgumentError, saying why, where `coarse` cannot be made of `fine`."""
+    """Check that a grid `coarse` can be made from a grid `fine`.
+
+    Raises:
+        ArgumentError: it cannot; says why.
+    """
     if fine.coordinates != coarse.coordinates:
         raise ArgumentError(
-            "--source grid", expected=f"a {fine.coordinates} grid like the one there", found=f"{coarse.coordinates}"
+            "resampling", expected=f"a {fine.coordinates} grid like the finer one", found=f"a {coarse.coordinates} one"
         )
     if (coarse.voxel_size < fine.voxel_size * (1 - 1e-4)).any():
-        sizes = [" x ".join(f"{v:.4g}" for v in spec.voxel_size) for spec in (coarse, fine)]
+        wanted, available = (" x ".join(f"{v:.4g}" for v in spec.voxel_size) for spec in (coarse, fine))
         raise ArgumentError(
-            f"--source grid: voxels of {sizes[0]} cannot be made of voxels of {sizes[1]}: detail that was never measured"
-            " cannot be made up; regrid from scans or from a capture"
+            "resampling",
+            expected=f"voxels of at least {available}, the size of the finer grid's",
+            found=wanted,
+            advice="smaller voxels need new measurements: make the grid from scans or from a capture",
         )
     slack = fine.voxel_size
     if (np.array(coarse.lower) < fine.lower - slack).any() or (np.array(coarse.upper) > fine.upper + slack).any():
         raise ArgumentError(
-            "--source grid",
+            "resampling",
             expected=f"bounds within {fine.lower} .. {fine.upper}",
             found=f"{coarse.lower} .. {coarse.upper}",
         )
 
 
 @dataclass(frozen=True)
-class FinerGrid(FrameInputs):
-    """One frame of a sequence whose finer grid is resampled; it holds paths only."""
+class ResampledFrame(FrameInput):
+    """One frame whose finer grid is resampled."""
 
     sequence: Sequence
     finer: str
@@ -84,54 +97,58 @@ class FinerGrid(FrameInputs):
     source_frame: int
 
     def fields(self) -> tuple[str, ...]:
-        """Return the scan fields that the frame has."""
+        """Return the names of the scan fields that the frame has."""
         return scan_fields(self.sequence, self.number)
 
-    def make(self, recipe: Recipe) -> FrameData:
+    def make(self, plan: Plan) -> FrameData:
         """Read the frame and resample its grid."""
-        if recipe.keep_votes:
-            raise ArgumentError(
-                "--keep-votes", expected="grids that were voted on", found="--source grid, which only resamples"
-            )
         fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
-        return FrameData(
-            fields, resample(self.sequence.grid(self.finer, self.number), recipe.spec, recipe.classes), None
-        )
+        finer = self.sequence.grid(self.finer, self.number)
+        return FrameData(fields, resample(finer, plan.spec, self.sequence.metadata.classes), None)
 
 
-class GridInputs(StoredInputs):
+class ResampledSequence(StoredSequence):
     """A sequence whose finer grid is resampled."""
 
-    def __init__(self, sequence: Sequence, frames: FrameRange | None, finer: str) -> None:
-        super().__init__(sequence)
+    def __init__(self, sequence: Sequence, finer: str, plan: Plan) -> None:
+        super().__init__(sequence, plan)
         self.finer = finer
-        chosen = choose_frames(sequence, sequence.frames(f"{finer}/labels"), frames)
-        light = bare(sequence)
-        self.frames = tuple(FinerGrid(light, finer, number, number) for number in chosen)
+
+    def _find_frames(self) -> tuple[FrameInput, ...]:
+        available = self.sequence.frames(f"{self.finer}/labels")
+        light = without_caches(self.sequence)
+        return tuple(
+            ResampledFrame(light, self.finer, number, number)
+            for number in choose_frames(self.plan.frames, available, self.location)
+        )
 
     def record(self) -> dict[str, Any]:
-        """Return the kind of source and the finer grid."""
-        return {"source": "grid", "grid": self.finer}
+        """Return the name of the finer grid."""
+        return {"observe": "grid", "grid": self.finer}
 
 
-def grid_inputs(
-    source: str | os.PathLike[str], frames: FrameRange | None, spec: GridSpec, from_grid: str | None
-) -> list[SequenceInputs]:
-    """Find the sequences of a source that have a finer grid of the coordinates asked for.
+def resampled_sequences(source: str | os.PathLike[str] | Source, plan: Plan, observe: FromGrid) -> list[SequenceInput]:
+    """Find the sequences of a source that have a finer grid of the same coordinates.
 
     Raises:
         MissingDataError: no sequence has such a grid.
-        ArgumentError: the grid is not finer.
+        ArgumentError: the grid is not finer, or votes are to be kept.
     """
-    found: list[SequenceInputs] = []
-    for sequence in open_source(source).sequences().values():
-        grids = {n: s for n, s in sequence.grids.items() if s.coordinates == spec.coordinates and (from_grid or n) == n}
+    if plan.voting.keep:
+        raise ArgumentError("keep", expected="False for resampled grids, which have no votes", found="True")
+    found: list[SequenceInput] = []
+    for sequence in as_source(source).sequences().values():
+        grids = {
+            name: spec
+            for name, spec in sequence.grids.items()
+            if spec.coordinates == plan.spec.coordinates and observe.name in (None, name)
+        }
         if grids:
             finest = min(grids, key=lambda name: math.prod(grids[name].voxel_size.tolist()))
-            check_coarser(grids[finest], spec)
-            found.append(GridInputs(sequence, frames, finest))
+            check_coarser(grids[finest], plan.spec)
+            found.append(ResampledSequence(sequence, finest, plan))
     if not found:
-        wanted = f"the grid {from_grid}" if from_grid else f"a {spec.coordinates} grid"
+        wanted = f"the grid {observe.name}" if observe.name else f"a {plan.spec.coordinates} grid"
         raise MissingDataError(
             source, expected=f"{wanted} to resample", found="none", advice="make one from scans or a capture first"
         )

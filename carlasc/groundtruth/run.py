@@ -1,4 +1,4 @@
-"""A run over a data set: from observations to grids, frame by frame, side by side, again and again until all is there."""
+"""The run over a data set: it makes the grid of every frame, in parallel, and continues what an earlier run left unfinished."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-import carlasc
+from carlasc.captures.raw import RAW, find_captures
+from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
-from carlasc.errors import CarlascError, ConflictError, StorageError
-from carlasc.groundtruth.from_scans.windows import Merging
-from carlasc.groundtruth.inputs import FrameInputs, FrameRange, Recipe, SequenceInputs, check_frames, default_sink
-from carlasc.groundtruth.providers import Observations, find_inputs
-from carlasc.groundtruth.voting.ballot import Ballot, VoteRule
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, StorageError
+from carlasc.groundtruth.from_capture import capture_sequences
+from carlasc.groundtruth.from_grid import resampled_sequences
+from carlasc.groundtruth.from_scans.sequences import scan_sequences
+from carlasc.groundtruth.inputs import FrameInput, Plan, SequenceInput
+from carlasc.groundtruth.options import FromCapture, FromGrid, FromScans, Observe, Voting
 from carlasc.running.processes import count_workers, run_all
-from carlasc.storage import layout
+from carlasc.storage import as_source, layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folders.folder import FolderSink
-from carlasc.storage.protocol import SequenceWriter, Sink
+from carlasc.storage.protocol import SequenceWriter, Sink, Source
 from carlasc.storage.resuming import (
     RECORD,
+    RECORD_FORMAT,
     agree_metadata,
     agree_poses,
     agree_times,
@@ -33,6 +37,9 @@ from carlasc.storage.resuming import (
     check_name,
     check_scan,
 )
+
+RULE = 1
+"""Version of the rule by which grids are made. It changes only when the same input gives other grids."""
 
 Outputs = dict[str, NDArray[Any]]
 
@@ -42,9 +49,9 @@ class FrameFailure:
     """A frame that could not be made.
 
     Attributes:
-        sequence: where its source is.
+        sequence: location of its sequence in the source.
         frame: its number in the source.
-        message: what is wrong, in one line.
+        message: what went wrong, in one line.
     """
 
     sequence: str
@@ -57,13 +64,13 @@ class RegridResult:
     """What a run did.
 
     Attributes:
-        grids: where the grids are.
+        grids: locations of the grids.
         spec: their geometry.
-        made: frames that were made now.
-        skipped: frames that were there already.
+        made: number of frames that this run made.
+        skipped: number of frames that existed already.
         failures: frames that could not be made.
-        elapsed_s: how long it took, seconds.
-        notes: what the reader should know of how they were made.
+        elapsed_s: duration of the run, in seconds.
+        notes: remarks about how the grids were made, one line each.
     """
 
     grids: tuple[str, ...]
@@ -76,29 +83,28 @@ class RegridResult:
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """One sequence: what goes in, where to, and what is there."""
+class _Job:
+    """What this run does with one sequence: where it goes, and the documents to write first."""
 
-    inputs: SequenceInputs
+    inputs: SequenceInput
     writer: SequenceWriter
-    recipe: Recipe
     documents: dict[str, bytes]
     replaces: bool
 
 
 @dataclass(frozen=True)
 class _Task:
-    """One frame of one sequence; pickles."""
+    """One frame of one job. It holds paths and settings, and pickles into a worker."""
 
-    plan: int
-    frame: FrameInputs
-    recipe: Recipe
+    job: int
+    frame: FrameInput
+    plan: Plan
     writer: SequenceWriter
 
 
 @dataclass(frozen=True)
 class _Done:
-    """What became of a task: its outputs where the writer cannot write in workers, its error where it failed."""
+    """The result of a task: its outputs if the writer cannot write in workers, its error if it failed."""
 
     task: _Task
     outputs: Outputs = field(default_factory=dict)
@@ -106,174 +112,203 @@ class _Done:
 
 
 def regrid(
-    source: str | os.PathLike[str],
-    sink: str | os.PathLike[str] | Sink | None,
+    source: str | os.PathLike[str] | Source,
     spec: GridSpec,
+    out: str | os.PathLike[str] | Sink | None = None,
     *,
-    observations: Observations | None = None,
-    vote: VoteRule | None = None,
-    free_step_m: float = 1.5,
-    frames: FrameRange | None = None,
+    observe: Observe | None = None,
+    voting: Voting = Voting(),  # noqa: B008 (frozen)
+    frames: Frames = None,
     name: str | None = None,
-    keep_votes: bool = False,
     overwrite: bool = False,
-    merging: Merging | None = None,
-    from_grid: str | None = None,
-    estimate_poses: bool = False,
-    force: bool = False,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RegridResult:
     """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and times.
 
-    A second run skips the frames that are there; one with other settings stops. A frame that cannot be read is reported in the
-    result and the others go on. Work is done in processes that import the main module again: scripts call this under
-    `if __name__ == "__main__":`, or with `workers=1`.
+    Frames that exist already are skipped. If they were made with other settings, the run stops before it writes anything. A frame that
+    cannot be read is reported in the result, and the other frames are made. The work is done in processes that import the main
+    module again: call this under `if __name__ == "__main__":` in scripts, or with `workers=1`.
 
     Args:
-        source: a sequence's folder, or a folder of several.
-        sink: where to write: a folder, or any Sink. Each sequence goes to its path below `source`, then `<coordinates>/`. None writes
-            into `source`.
-        spec: the grid.
-        observations: what votes: "capture": every sensor of a raw capture; "scans": the ego sensor's scans of other times;
-            "grid": an existing finer grid. None takes the capture where there is one, else the scans.
-        vote: "sensor": at most one vote a sensor (scan), voxel and class, as in the published files; "sample": every sample
-            counts; "point": every point counts, free space once a scan. None: "sensor" for captures, "point" for scans.
-        free_step_m: distance between free samples on a ray, metres.
-        frames: half-open range of the source's frame numbers, None at an open end; all frames if None. A capture's frames
-            are renumbered from 0.
-        name: the grid's folder; by its size if None.
-        keep_votes: also write the votes by class.
-        overwrite: replace an earlier grid of ours that was made with other settings.
-        merging: which scans are merged, and what becomes of moving points; the defaults if None. Only with scans.
-        from_grid: name of the finer grid; the finest if None. Only with "grid".
-        estimate_poses: take poses from KISS-ICP, not from poses.txt; they are written only where there are none. Only with scans.
-        force: go on where poses jump.
-        workers: how many frames are made side by side; all cores if None. With an executor: how many its workers are.
-        executor: takes the frames instead of processes of our own; it is left open.
-        progress: called with the number of finished frames and of all.
+        source: a sequence's folder, a folder of several sequences, or, unless it holds captures, anything that `carlasc.open` takes.
+        spec: geometry of the grid.
+        out: where to write: a folder, or any Sink. Each sequence is written to its path below `source`, then `<coordinates>/`. None
+            writes into `source`.
+        observe: what observes the scene: `FromCapture()`: every sensor of a raw capture; `FromScans(...)`: one sensor's scans,
+            merged over time; `FromGrid(...)`: an existing finer grid. None: `FromCapture()` if there is a capture, otherwise
+            `FromScans()`.
+        voting: how votes are counted.
+        frames: range of the source's frame numbers; None for all. A capture's frames are renumbered from 0.
+        name: name of the grid's folder; None for a name by its size.
+        overwrite: replace a grid that `regrid` made with other settings.
+        workers: number of frames that are made in parallel; None for one per core. With an executor: the number of its workers.
+        executor: runs the work instead of processes of our own; it is not shut down.
+        progress: called with the number of finished frames and the number of all frames.
 
     Returns:
-        What was made, what was there, what failed.
+        What was made, what existed already, and what failed.
 
     Raises:
-        ArgumentError: an argument makes no sense.
-        MissingDataError: there is no sequence or no frame.
-        ConflictError: what is there is published data, or of other settings, or of other scans: nothing of it is touched.
-        StorageError: the disk is full or the output cannot be written to. What was written is whole.
+        ArgumentError: an argument is not valid.
+        MissingDataError: there is no sequence, or no frame.
+        ConflictError: the output is published data, or has other settings or other scans. Nothing in it is changed.
+        StorageError: the disk is full or the output cannot be written to. Files that were written are complete.
     """
     start, workers = time.perf_counter(), count_workers(workers)
-    sink = sink if isinstance(sink, Sink) else FolderSink(default_sink(source) if sink is None else sink)
-    tiny = GridSpec(spec.coordinates, (1, 1, 1), spec.lower, spec.upper)
-    Ballot(tiny, vote=vote or "sensor", free_step_m=free_step_m)  # checks them
-    check_frames(frames)
     grid = layout.grid_folder(spec) if name is None else check_name(name)
-
-    plans = []
-    for inputs in find_inputs(
-        source,
-        observations,
-        frames,
-        spec,
-        merging=merging,
-        from_grid=from_grid,
-        estimate_poses=estimate_poses,
-        force=force,
-    ):
-        recipe = Recipe(spec, grid, inputs.metadata.classes, vote or inputs.vote, float(free_step_m), keep_votes)
-        writer = sink.sequence("/".join(part for part in (inputs.path, spec.coordinates) if part))
-        plans.append(_plan(inputs, writer, recipe, overwrite=overwrite))
+    sink = out if isinstance(out, Sink) else FolderSink(_folder_of(source) if out is None else out)
+    plan = Plan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
+    jobs = [_prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)]
 
     with ExitStack() as writers:
-        for plan in plans:
-            _begin(plan)
-            writers.enter_context(plan.writer)
-        tasks = _unfinished(plans)
-        total = sum(len(plan.inputs.frames) for plan in plans)
+        for job in jobs:
+            _begin(job, grid)
+            writers.enter_context(job.writer)
+        tasks = _unfinished(jobs, plan)
+        total = sum(len(job.inputs.frames) for job in jobs)
         skipped, failures = total - len(tasks), []
         if progress:
             progress(skipped, total)
         with closing(run_all(_run_task, tasks, workers=workers, executor=executor)) as results:
             for number, done in enumerate(results, skipped + 1):
-                plan = plans[done.task.plan]
+                job = jobs[done.task.job]
                 if done.error is not None:
-                    failures.append(FrameFailure(plan.inputs.location, done.task.frame.source_frame, done.error))
-                _write(plan.writer, done.task.frame.number, done.outputs)
+                    failures.append(FrameFailure(job.inputs.location, done.task.frame.source_frame, done.error))
+                _write(job.writer, done.task.frame.number, done.outputs)
                 if progress:
                     progress(number, total)
 
-    grids = tuple(f"{plan.writer.location}/{grid}" for plan in plans)
+    grids = tuple(f"{job.writer.location}/{grid}" for job in jobs)
     made = len(tasks) - len(failures)
-    notes = tuple(note for plan in plans for note in plan.inputs.notes())
+    notes = tuple(note for job in jobs for note in job.inputs.notes())
     return RegridResult(grids, spec, made, skipped, tuple(failures), time.perf_counter() - start, notes)
 
 
-def make_frame(frame: FrameInputs, recipe: Recipe) -> Outputs:
-    """Make all that a frame's files hold."""
-    data = frame.make(recipe)
-    outputs: Outputs = {**data.fields, f"{recipe.grid}/labels": data.grid.labels}
-    if data.grid.counts is not None:
-        outputs[f"{recipe.grid}/counts"] = data.grid.counts
-    if recipe.keep_votes and data.votes is not None:
-        outputs[f"{recipe.grid}/votes"] = data.votes.to_sparse()
-    return outputs
+def _choose(source: str | os.PathLike[str] | Source) -> Observe:
+    """Return what observes the scene if the caller does not say: a capture if there is one, otherwise scans.
+
+    Raises:
+        MissingDataError: there is neither.
+    """
+    if not isinstance(source, Source) and Path(source).is_dir():
+        try:
+            find_captures(source)
+        except MissingDataError:
+            pass
+        else:
+            return FromCapture()
+    opened = as_source(source)
+    try:
+        opened.sequences()
+    except MissingDataError as error:
+        raise MissingDataError(
+            source,
+            expected="a capture (a folder raw/ with velodyne0/, labels0/, ...) or sequences with scans (velodyne/, poses.txt, ...)",
+            found="neither",
+            advice="give a sequence's folder, or a folder of sequences",
+        ) from error
+    return FromScans()
 
 
-def _plan(inputs: SequenceInputs, writer: SequenceWriter, recipe: Recipe, *, overwrite: bool) -> _Plan:
-    """Look at what is there, and stop before anything is written if this run may not go on with it."""
-    record = {"version": carlasc.__version__, **inputs.record(), "free_step_m": recipe.free_step_m, "vote": recipe.vote}
-    params = recipe.spec.to_params(recipe.classes.num_channels) | {RECORD: record}
+def _sequences(source: str | os.PathLike[str] | Source, plan: Plan) -> list[SequenceInput]:
+    """Return the sequences of a source.
+
+    Raises:
+        ArgumentError: the source cannot hold what observes the scene, or the plan does not fit it.
+        MissingDataError: there is no sequence.
+    """
+    match plan.observe:
+        case FromCapture():
+            return capture_sequences(source, plan)
+        case FromScans():
+            return scan_sequences(source, plan, plan.observe)
+        case FromGrid():
+            return resampled_sequences(source, plan, plan.observe)
+
+
+def _folder_of(source: str | os.PathLike[str] | Source) -> Path:
+    """Return the folder to write to if the caller does not say: the source, beside raw/ and `<coordinates>/`.
+
+    Raises:
+        ArgumentError: the source is not a folder, so nothing can be written into it.
+    """
+    if isinstance(source, Source):
+        raise ArgumentError("out", expected="where to write, as the source is not a folder", found="None")
+    folder = Path(source)
+    if not folder.is_dir() and folder.exists():
+        raise ArgumentError("out", expected=f"where to write, as {source} is a file", found="None")
+    return folder.resolve().parent if folder.resolve().name in (RAW, *layout.COORDINATES) else folder
+
+
+def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) -> _Job:
+    """Compare what exists with what this run makes, and stop before anything is written if they do not agree."""
+    writer = sink.sequence("/".join(part for part in (inputs.path, plan.spec.coordinates) if part))
+    how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
+    record = {"format": RECORD_FORMAT, "rule": RULE, **inputs.record(), **how}
+    params = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
     numbers = [frame.number for frame in inputs.frames]
-    ours = check_grid(writer, recipe.grid, params, numbers, overwrite=overwrite)
+    exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
         layout.POSES: None if (poses := inputs.poses()) is None else agree_poses(writer, poses),
         layout.TIMES: None if (times := inputs.times()) is None else agree_times(writer, times),
-        layout.params_file(recipe.grid): to_json(params),
+        layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    return _Plan(inputs, writer, recipe, needed, replaces=ours and overwrite)
+    return _Job(inputs, writer, needed, replaces=exists and overwrite)
 
 
-def _begin(plan: _Plan) -> None:
-    """Write what a sequence has once."""
-    if plan.replaces:
-        plan.writer.remove_grid(plan.recipe.grid)
-    for document, data in plan.documents.items():
-        plan.writer.write_document(document, data)
+def _begin(job: _Job, grid: str) -> None:
+    """Write the documents of a sequence."""
+    if job.replaces:
+        job.writer.remove_grid(grid)
+    for document, data in job.documents.items():
+        job.writer.write_document(document, data)
 
 
-def _unfinished(plans: list[_Plan]) -> list[_Task]:
+def _unfinished(jobs: list[_Job], plan: Plan) -> list[_Task]:
     """Return a task for each frame that lacks a file."""
     return [
-        _Task(index, frame, plan.recipe, plan.writer)
-        for index, plan in enumerate(plans)
-        for frame in plan.inputs.frames
-        if not all(plan.writer.has(name, frame.number) for name in (*frame.fields(), *plan.recipe.fields()))
+        _Task(index, frame, plan, job.writer)
+        for index, job in enumerate(jobs)
+        for frame in job.inputs.frames
+        if not all(job.writer.has(name, frame.number) for name in (*frame.fields(), *plan.fields()))
     ]
 
 
 def _run_task(task: _Task) -> _Done:
     """Make one frame, in a worker, and write it there if its writer can."""
     try:
-        outputs = make_frame(task.frame, task.recipe)
+        outputs = _make(task.frame, task.plan)
         if not task.writer.concurrent:
             return _Done(task, outputs)
         _write(task.writer, task.frame.number, outputs)
     except (ConflictError, StorageError):
-        raise  # every other frame would meet the same
+        raise  # every other frame would raise the same
     except MemoryError as error:
         raise CarlascError(
-            f"{task.recipe.spec}: out of memory: take a coarser grid, or fewer workers (`--workers`)"
+            str(task.plan.spec), problem="out of memory", advice="use a coarser grid, or fewer processes (`workers`)"
         ) from error
     except (CarlascError, OSError) as error:
         return _Done(task, error=str(error))
     return _Done(task)
 
 
+def _make(frame: FrameInput, plan: Plan) -> Outputs:
+    """Make everything that is written for a frame, the grid last."""
+    data = frame.make(plan)
+    outputs: Outputs = {**data.fields, f"{plan.grid}/labels": data.grid.labels}
+    if data.grid.counts is not None:
+        outputs[f"{plan.grid}/counts"] = data.grid.counts
+    if plan.voting.keep and data.votes is not None:
+        outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
+    return outputs
+
+
 def _write(writer: SequenceWriter, frame: int, outputs: Outputs) -> None:
-    """Write a frame's files, the grid's last; scans that are there must be the same."""
+    """Write a frame's files. Scan fields that exist already must be equal to this run's."""
     for name, array in outputs.items():
         if name in layout.SCAN_FIELDS and writer.has(name, frame):
             check_scan(writer, name, frame, array)

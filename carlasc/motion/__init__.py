@@ -1,6 +1,6 @@
-"""How each actor moves: segments of moving points in each scan, linked into tracks; scene flow from tracks.
+"""The motion of actors: moving points are grouped into segments in each scan, and segments are linked into tracks over time.
 
-World is the frame of the poses: the first scan's sensor.
+"World" is the frame of the poses, which is the sensor frame of the first scan.
 """
 
 from carlasc.motion.segments import Segment, Standing, segment_by_flow, segment_by_instances, standing_points

@@ -1,4 +1,4 @@
-"""Poses from scans alone: KISS-ICP (Vizzo et al., RA-L 2023), through its own Python API."""
+"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python API."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import invert
 from carlasc.errors import ArgumentError, import_extra
 
-MIN_POINTS = 100  # fewer say nothing about the motion
-_GROUND_M, _NEAR_M = 1.5, 8.0  # far points so deep below the sensor are ground
+MIN_POINTS = 100  # scans with fewer points do not determine the motion
+_GROUND_M, _NEAR_M = 1.5, 8.0  # points this far below the sensor, and farther away than this, are ground
 
 
 def estimate_poses(
@@ -26,24 +26,24 @@ def estimate_poses(
 ) -> NDArray[np.float64]:
     """Estimate the pose of every scan of a drive, in order.
 
-    Scans are taken as instantaneous (no deskewing): so CarlaSC's are, and SemanticKITTI's are deskewed. Far ground is left out: its
-    rings move along with the sensor and hide the first metres of a drive. On a plain straight street nothing tells how far one has
-    driven, and the estimate slips.
+    Scans are not deskewed: CarlaSC's are instantaneous, and SemanticKITTI's are deskewed already. Far ground is left out, because its
+    rings move with the sensor and hide the first metres of a drive. On a straight street without structure the distance driven is
+    not determined, and the estimate is too short.
 
     Args:
-        scans: (N, 3) points each, metres, sensor frame; right-handed or left-handed, the poses are in the same frame.
+        scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
-        voxel_size_m: of the map; None takes a hundredth of the range, as KISS-ICP does.
-        total: number of scans, for the progress.
-        progress: called with the number of finished scans and of all.
+        voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
+        total: number of scans, for `progress`.
+        progress: called with the number of finished scans and the number of all scans.
 
     Returns:
         (F, 4, 4) first_T_sensor.
 
     Raises:
         DependencyError: kiss-icp is not installed.
-        ArgumentError: a scan of several has hardly any points.
+        ArgumentError: one of several scans has fewer than `MIN_POINTS` points.
     """
     pipeline: Any = import_extra("kiss_icp.kiss_icp", "kitti")
     config: Any = import_extra("kiss_icp.config", "kitti").KISSConfig()
@@ -55,15 +55,15 @@ def estimate_poses(
     sizes: list[int] = []
     for number, points in enumerate(scans):
         sizes.append(len(points))
-        if number and min(sizes) < MIN_POINTS:  # a scan alone has moved nowhere, however few its points
+        if number and min(sizes) < MIN_POINTS:  # a single scan has not moved, however few points it has
             raise ArgumentError(
-                "odometry",
+                "scans",
                 expected=f"at least {MIN_POINTS} points in every scan",
                 found=f"{min(sizes)} in scan {sizes.index(min(sizes))}",
                 advice="leave it out",
             )
-        standing = (points[:, 2] > -_GROUND_M) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
-        odometry.register_frame(np.ascontiguousarray(points[standing, :3], np.float64), np.zeros(0))
+        used = (points[:, 2] > -_GROUND_M) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
+        odometry.register_frame(np.ascontiguousarray(points[used, :3], np.float64), np.zeros(0))
         poses.append(np.array(odometry.last_pose))
         if progress:
             progress(number + 1, total or number + 1)

@@ -1,4 +1,7 @@
-"""Paths: where an actor was and how fast it went, from its points alone, in scans that number actors and have no flow."""
+"""Paths: the positions and velocities of an actor, estimated from its points alone, for scans that number actors and have no flow.
+
+A sighting is the set of an actor's points in one scan.
+"""
 
 from __future__ import annotations
 
@@ -11,32 +14,32 @@ from carlasc.core.geometry import rotation_z
 from carlasc.motion.registration import best_sighting, follow, nearest_points
 from carlasc.motion.smoothing import resample, smooth
 
-MIN_POINTS = 10  # fewer say too little; such a sighting inherits from its track
-_FASTEST_CHANGE_M_S2 = 6.0  # of velocity: hard braking, a sharp bend
-_WALK_S = 0.6  # half width of the window in which a person walks evenly
-_DRIVE_S = 0.5  # and a vehicle
-_HEADING_SPEED_M_S = 1.0  # faster actors look where they go
-_POINTS = 200  # of a sighting are compared
-_COMPARED, _APART_S = 12, 1.0  # pairs of sightings, and how far apart in time, that tell standing from moving
-_FAR_M, _DOUBT_M = 0.5, 0.02
-_OVERLAID_M = 0.38  # sightings of what stands are nearer to each other, though each shows another side of it
+MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
+_MAX_ACCELERATION_M_S2 = 6.0  # hard braking, a sharp bend
+_WALK_S = 0.6  # half width of the window in which a person walks with constant acceleration
+_DRIVE_S = 0.5  # the same for a vehicle
+_HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
+_POINTS = 200  # number of points of a sighting that are compared
+_PAIRS, _APART_S = 12, 1.0  # pairs of sightings that are compared, and their distance in time
+_MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
+_STANDING_M = 0.38  # sightings of a standing actor are closer to each other, although they show different sides of it
 
 
 def estimate_path(
     sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], *, rigid: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Estimate where an actor was, and its velocity, at each of its sightings.
+    """Estimate the position and the velocity of an actor at each of its sightings.
 
-    Rigid actors are registered, so that it does not matter which of their sides is seen; of people, who bend as they walk, the middle is
-    followed. Sightings of too few points inherit from those around them. An actor that was seen once has velocity zero: nothing is known of it.
+    Rigid actors are registered, so that it does not matter which side of them is seen. For people, who change their shape as they walk, the
+    centre of the points is followed. Sightings with too few points are interpolated. An actor that was seen once has velocity zero.
 
     Args:
-        sightings: of each time, (M, 3) points of the actor, world.
-        seconds: (F,) times, rising.
+        sightings: (M, 3) points of the actor at each time, metres, world.
+        seconds: (F,) times, increasing.
         rigid: whether the actor keeps its shape.
 
     Returns:
-        (F, 3) middle of the actor, world, and its (F, 3) velocity over ground, m/s.
+        (F, 3) centre of the actor, metres, world, and its (F, 3) velocity, m/s, world.
     """
     counts = np.array([len(points) for points in sightings])
     enough = np.flatnonzero(counts >= max(1, min(MIN_POINTS, counts.max(initial=0))))
@@ -48,12 +51,12 @@ def estimate_path(
         follow(chosen, at) if rigid else np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in chosen])
     )
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
-    velocities = _bounded(velocities, at, best_sighting(chosen))
+    velocities = _limit_acceleration(velocities, at, best_sighting(chosen))
     return resample(seconds, at, positions, velocities)
 
 
 def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, held while the actor is slow."""
+    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow."""
     fast = np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
     if not len(fast):
         mean = velocities.mean(axis=0)
@@ -62,47 +65,49 @@ def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.interp(np.arange(len(velocities)), fast, angles)
 
 
-def stands(
+def is_standing(
     sightings: Sequence[NDArray[np.float64]],
     positions: NDArray[np.float64],
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
 ) -> bool:
-    """Whether sightings lie on each other as well without any motion as with the one found.
+    """Return whether sightings overlap as well without any motion as with the estimated motion.
 
     Args:
-        sightings: of each time, (M, 3) points of the actor, world.
-        positions: (F, 3) where the actor was found to be.
-        headings: (F,) radians.
-        seconds: (F,) times, rising.
+        sightings: (M, 3) points of the actor at each time, metres, world.
+        positions: (F, 3) estimated positions of the actor, metres, world.
+        headings: (F,) estimated headings, radians.
+        seconds: (F,) times, increasing.
     """
     thinned = [points[:: -(-len(points) // _POINTS)] for points in sightings]
     body = [(points - positions[i]) @ rotation_z(headings[i])[:3, :3] for i, points in enumerate(thinned)]
     still, moved = [], []
-    for i in np.unique(np.linspace(0, len(seconds) - 1, _COMPARED).astype(int)):
+    for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
-            still.append(_apart(thinned[i], thinned[j]))
-            moved.append(_apart(body[i], body[j]))
+            still.append(_mean_distance(thinned[i], thinned[j]))
+            moved.append(_mean_distance(body[i], body[j]))
     if not still:
         return True
-    # A path that was lost overlays badly too: standing must also look like standing.
-    return float(np.mean(still)) < min(float(np.mean(moved)) + _DOUBT_M, _OVERLAID_M)
+    # With a wrong path the sightings overlap badly too, so those of a standing actor must also be close to each other.
+    return float(np.mean(still)) < min(float(np.mean(moved)) + _DOUBT_M, _STANDING_M)
 
 
-def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return how far, in the mean, points are from the nearest of others; farther than `_FAR_M` counts as that."""
-    return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _FAR_M).mean())
+def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    """Return the mean distance of points to the nearest of others, in metres; distances above `_MAX_DISTANCE_M` count as this value."""
+    return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _MAX_DISTANCE_M).mean())
 
 
-def _bounded(velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int) -> NDArray[np.float64]:
-    """Let velocity change no faster than an actor can, going out from where it is known best: not at the ends of a track."""
+def _limit_acceleration(
+    velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int
+) -> NDArray[np.float64]:
+    """Limit the change of (F, 3) velocities to what an actor can do, starting at the index `best` and going outwards."""
     bounded = velocities.copy()
     for step, stop in ((1, len(seconds)), (-1, -1)):
         for index in range(best + step, stop, step):
             before = bounded[index - step]
             change = velocities[index] - before
-            most = _FASTEST_CHANGE_M_S2 * abs(seconds[index] - seconds[index - step])
+            most = _MAX_ACCELERATION_M_S2 * abs(seconds[index] - seconds[index - step])
             length = float(np.linalg.norm(change))
             bounded[index] = before + change * min(1.0, most / length) if length > 0 else before
     return bounded

@@ -1,8 +1,9 @@
-"""Registration: the sightings of a rigid actor laid on each other.
+"""Registration of the sightings of a rigid actor to each other.
 
-Of a car that drives by one sees a flank for long, and points laid on points slide along it. So an actor is followed from scan to scan: where it
-will be is predicted from its motion so far, and its points, laid on the planes of all that was seen of it before, correct the prediction
-only as far as those planes tell: across a flank, and along the way where its front or back is in sight.
+A passing car shows only its side for a long time, and registration of points to points slides along it. So the actor is followed from scan to
+scan: its position is predicted from its motion so far, and then corrected by registering its points to the planes of everything that was
+seen of it before. The planes correct the prediction only in the directions that they determine: across a side, and along the path if the
+front or the back is visible.
 """
 
 from __future__ import annotations
@@ -16,40 +17,40 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
 from carlasc.motion.smoothing import smooth
 
-_FIRST_LOOK_S = 0.5  # half width of the window in which the first guess of the motion is even
-_POINTS = 300  # of a sighting are laid on the model
+_INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
+_POINTS = 300  # number of points of a sighting that are registered to the model
 _MODEL_CELL_M, _MODEL_POINTS = 0.15, 1200
-_PLANE_M = 0.5  # points so near each other tell a plane
-_FLANK_M = 0.14  # points of a flank alone scatter no more across it
-_LINE_M = 0.06  # points that spread no more across are a line, which has no plane
+_PLANE_M = 0.5  # radius of the neighbourhood in which planes are estimated
+_SIDE_M = 0.14  # standard deviation, across a side, of points of this side alone
+_LINE_M = 0.06  # points with a smaller standard deviation across form a line, which has no plane
 _ITERATIONS = 8
-_FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # pairs farther apart are no pairs; the reach shrinks as the fit improves
-_POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and how many of a sighting count as errors of their own
+_FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
+_POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and the number of points with independent errors
 _PREDICTED = np.array(
     [0.2, 0.2, 0.01, 0.02]
-)  # error of a prediction over a scan: x, y, z in metres (streets are even), yaw in radians
-_UNKNOWN = 5.0  # so much greater it is while the motion is not known yet
-_ROBUST = 0.3  # of the reach: pairs farther off their plane count less and less
-_GAIN = 0.3  # how fast the motion follows what was found
+)  # error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians
+_UNKNOWN = 5.0  # factor of this error while the motion is not known yet
+_ROBUST = 0.3  # fraction of the reach; pairs farther from their plane get less weight
+_GAIN = 0.3  # weight of the last correction in the motion
 
 
 def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Register the sightings of a rigid actor that stands upright, outwards from the one that shows it best.
+    """Register the sightings of a rigid, upright actor, starting with the best sighting and going outwards.
 
     Args:
-        sightings: of each time, (M, 3) points of the actor, world.
-        seconds: (F,) times, rising.
+        sightings: (M, 3) points of the actor at each time, metres, world.
+        seconds: (F,) times, increasing.
 
     Returns:
-        (F, 3) middle of the actor, world.
+        (F, 3) centre of the actor, metres, world.
     """
     counts = np.array([len(points) for points in sightings])
     middles = np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in sightings])
     best = best_sighting(sightings)
     states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
     states[best, :3] = middles[best]
-    first_look = smooth(middles, seconds, np.minimum(counts, 200.0), _FIRST_LOOK_S)[1]
-    motion = np.append(first_look[best], 0.0)  # of these, a second
+    initial = smooth(middles, seconds, np.minimum(counts, 200.0), _INITIAL_S)[1]
+    motion = np.append(initial[best], 0.0)  # of x, y, z and yaw per second
     model = _thin(sightings[best] - middles[best])
     seen = 0
     for step, stop in ((1, len(counts)), (-1, -1)):
@@ -59,24 +60,24 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
             predicted = states[previous] + velocity * elapsed
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
             points = sightings[index][:: -(-len(sightings[index]) // _POINTS)]
-            states[index] = _lay(points, model, _normals(model), predicted, error)
+            states[index] = _register(points, model, _normals(model), predicted, error)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
-                motion = velocity  # the way back starts with what is known by then
+                motion = velocity  # the backward pass starts with this estimate
             model = _thin(np.concatenate([model, transform_points(invert(_pose(states[index])), points)]))
             previous, seen = index, seen + 1
     middle = (np.quantile(model, 0.01, axis=0) + np.quantile(model, 0.99, axis=0)) / 2
     return np.stack([transform_points(_pose(state), middle) for state in states])
 
 
-def _lay(
+def _register(
     points: NDArray[np.float64],
     model: NDArray[np.float64],
     normals: NDArray[np.float64],
     predicted: NDArray[np.float64],
     error: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the state, near the predicted one, that lays points on the planes of the model."""
+    """Return the state (x, y, z, yaw), near the predicted one, that registers points to the planes of the model."""
     state = predicted.copy()
     for iteration in range(_ITERATIONS):
         reach = _FIRST_REACH_M * (_LAST_REACH_M / _FIRST_REACH_M) ** (iteration / (_ITERATIONS - 1))
@@ -106,16 +107,16 @@ def _pose(state: NDArray[np.float64]) -> Transform:
 
 
 def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Keep one point a cell, and at most so many."""
+    """Keep one point per cell, and at most `_MODEL_POINTS`."""
     _, first = np.unique(np.floor(points / _MODEL_CELL_M).astype(np.int64), axis=0, return_index=True)
     kept = points[np.sort(first)]
     return kept[:: -(-len(kept) // _MODEL_POINTS)]
 
 
 def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (M, 3) normals of the planes around the model's points; the longer where the points around are flat.
+    """Return (M, 3) normals of the planes around the model's points. Their length, at most 1, grows with the flatness of the points.
 
-    A normal of length zero says that nothing is known: a lonely point, a line.
+    The normal of a single point or of a line has length 0.
     """
     values, vectors = np.linalg.eigh(_covariances(model, _PLANE_M))
     flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
@@ -124,12 +125,12 @@ def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
-    """Return the sighting to start with: of many points, more than a bare flank, and not at an end of the track."""
+    """Return the index of the sighting to start with: one with many points, more than one side, and not at an end of the track."""
     counts = np.array([len(points) for points in sightings])
     across = [np.linalg.eigvalsh(np.cov(p[:, :2], rowvar=False))[0] if len(p) > 2 else 0.0 for p in sightings]
     inner = np.arange(len(sightings))
     amid = np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)
-    return int(np.argmax(counts * np.clip(np.array(across) / _FLANK_M**2, 1e-6, 1.0) * amid))
+    return int(np.argmax(counts * np.clip(np.array(across) / _SIDE_M**2, 1e-6, 1.0) * amid))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,7 +158,7 @@ def _covariances(model: NDArray[np.float64], radius: float) -> NDArray[np.float6
 def nearest_points(
     points: NDArray[np.float64], model: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the index of the model point nearest to each point, and the squared distance: all pairs, they are few."""
+    """Return the index of the model point nearest to each point, and the squared distance, by comparing all pairs."""
     index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     for i in range(len(points)):
         for j in range(len(model)):

@@ -1,4 +1,4 @@
-"""Segments: the points of one actor in one scan, told apart by flow or by instance numbers."""
+"""Segments: the points of one actor in one scan, separated by flow or by instance numbers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
 
-MIN_SPEED_M_S = 0.3  # slower is standing still: an estimated flow is never exactly zero
-_CELL_M = 0.4  # moving points are joined cell by cell of this size
-_REACH_M = 2.0  # cells of one actor are this near each other: a pole in front must not split a vehicle
-_SAME_VELOCITY_M_S = 0.5  # flow within one rigid actor differs by no more
+MIN_SPEED_M_S = 0.3  # slower points count as standing, because estimated flow is never exactly zero
+_CELL_M = 0.4  # size of the cells in which moving points are grouped
+_REACH_M = 2.0  # cells of one actor are closer than this, so that a pole in front does not split a vehicle
+_SAME_VELOCITY_M_S = 0.5  # flow differs by less within one rigid actor
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Segment:
 
     Attributes:
         frame: frame number.
-        label: class of the actor: that of most of its points.
-        members: (M,) int64 indices into the scan's points.
+        label: class of the actor, which is that of most of its points.
+        members: (M,) int64 indices of the points in the scan.
         points: (M, 3) float64 metres, world.
-        velocity: (3,) m/s over ground, world; None where the scan has no flow.
-        instance: number of the actor, 0 where actors have none.
+        velocity: (3,) m/s, world; None if the scan has no flow.
+        instance: number of the actor; 0 if actors are not numbered.
     """
 
     frame: int
@@ -39,7 +39,7 @@ class Segment:
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """(3,) middle of the points' bounding box, world."""
+        """(3,) centre of the points' bounding box, metres, world."""
         center: NDArray[np.float64] = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
         return center
 
@@ -47,15 +47,15 @@ class Segment:
 def segment_by_flow(
     frame: int, scan: Scan, world_T_sensor: Transform, *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> list[Segment]:
-    """Join the moving points of a scan into actors: near each other, of one class, of one velocity.
+    """Group the moving points of a scan into actors: points that are close together, of one class and with one velocity.
 
-    Two actors side by side at the same velocity may come out as one: they move as one, so nothing is lost.
+    Two actors side by side with the same velocity may become one segment, which moves in the same way.
 
     Args:
         frame: frame number.
-        scan: points with labels and flow; points whose flow is not finite count as standing.
+        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as standing.
         world_T_sensor: (4, 4) pose of the scan.
-        min_speed_m_s: slower points stand still.
+        min_speed_m_s: slower points count as standing.
 
     Returns:
         Segments in the order of their first point.
@@ -77,7 +77,7 @@ def segment_by_flow(
 
 
 def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> list[Segment]:
-    """Take the numbered actors of a scan, moving or not: which of them move, their tracks will tell.
+    """Return the numbered actors of a scan, moving or not. Their tracks show which of them move.
 
     Args:
         frame: frame number.
@@ -103,12 +103,12 @@ def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> l
 
 @dataclass(frozen=True)
 class Standing:
-    """The points of a scan that stand still and might belong to an actor that moves at other times.
+    """The standing points of a scan that may belong to an actor that moves at other times.
 
     Attributes:
         frame: frame number.
-        members: (M,) int64 indices into the scan's points.
-        labels: (M,) class of each.
+        members: (M,) int64 indices of the points in the scan.
+        labels: (M,) their classes.
         points: (M, 3) float64 metres, world.
     """
 
@@ -118,12 +118,12 @@ class Standing:
     points: NDArray[np.float64]
 
     @classmethod
-    def none(cls, frame: int) -> Standing:
-        """Return no points at all."""
+    def empty(cls, frame: int) -> Standing:
+        """Return an object without points."""
         return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
-    def in_place_of(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
-        """Return the standing points of a segment's class where the segment was, None where there are hardly any."""
+    def segment_at(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
+        """Return the standing points of a segment's class at its place; None if there are much fewer than in the segment."""
         lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
         own = np.flatnonzero(
             (self.labels == segment.label) & ((self.points > lower) & (self.points < upper)).all(axis=1)
@@ -136,9 +136,9 @@ class Standing:
 def standing_points(
     frame: int, scan: Scan, world_T_sensor: Transform, labels: Collection[int], *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> Standing:
-    """Return the points of classes that move elsewhere, but not here."""
+    """Return the points of a scan that are of one of the classes `labels`, and slower than `min_speed_m_s`."""
     if scan.flow is None or scan.labels is None:
-        return Standing.none(frame)
+        return Standing.empty(frame)
     slow = ~(np.square(np.nan_to_num(scan.flow)).sum(axis=1) > min_speed_m_s**2)
     members = np.flatnonzero(slow & np.isin(scan.labels, sorted(labels)))
     points = transform_points(world_T_sensor, scan.points[members])
@@ -146,7 +146,7 @@ def standing_points(
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the indices of each value of `key`, in the order in which the values first stand."""
+    """Return the indices of each value of `key`, in order of the values' first occurrence."""
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(inverse))[:-1])
@@ -154,7 +154,7 @@ def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 
 def _join(points: NDArray[np.float64], velocity: NDArray[np.float64], labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return a component number a point: cells of one class and velocity that reach each other are joined."""
+    """Return the component number of each point: cells of one class and velocity that are closer than `_REACH_M` are joined."""
     keys = np.concatenate(
         [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S), labels[:, None]], axis=1
     ).astype(np.int64)
@@ -169,7 +169,7 @@ def _join(points: NDArray[np.float64], velocity: NDArray[np.float64], labels: ND
         & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
     )
     component = np.arange(len(count))
-    while True:  # each cell takes the lowest number it reaches, until nothing changes
+    while True:  # each cell takes the lowest number among those it is joined with, until nothing changes
         lowest = np.where(joined, component[None], len(count)).min(axis=1)
         lowest = lowest[lowest]
         if (lowest == component).all():

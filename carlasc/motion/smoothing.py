@@ -1,4 +1,4 @@
-"""Smoothing: an actor's acceleration is bounded, the error of where it was seen is not."""
+"""Smoothing of paths: an actor's acceleration is limited, while the error of a measured position is not."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from numpy.typing import NDArray
 def smooth(
     values: NDArray[np.float64], seconds: NDArray[np.float64], weights: NDArray[np.float64], half_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a parabola around each time, robustly; a straight line where there are few values.
+    """Fit a parabola around each time, robustly; a straight line if there are few values.
 
     Args:
         values: (F, D).
         seconds: (F,) times, rising.
         weights: (F,) of the values.
-        half_s: half width of the window of each fit, seconds.
+        half_s: half width of the window of each fit, seconds. It grows until it holds four values.
 
     Returns:
-        (F, D) values of the fits, and their (F, D) derivatives.
+        The (F, D) values of the fits, and their (F, D) derivatives per second.
     """
     smoothed, slopes = values.copy(), np.zeros_like(values)
     for index, now in enumerate(seconds):
         near = np.flatnonzero(np.abs(seconds - now) <= half_s + 1e-9)
-        if len(near) < 4:  # a window that reaches as far as it must
+        if len(near) < 4:
             near = np.sort(np.argsort(np.abs(seconds - now), kind="stable")[:4])
         offsets = seconds[near] - now
         degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
         design = offsets[:, None] ** np.arange(degree + 1)
         weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
-        for _ in range(3):  # reweighted: a sighting half hidden must not bend the path
+        for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
             root = np.sqrt(weight)[:, None]
             fit = np.linalg.lstsq(design * root, values[near] * root, rcond=None)[0]
             error = np.linalg.norm(values[near] - design @ fit, axis=1)
@@ -45,7 +45,7 @@ def resample(
     positions: NDArray[np.float64],
     velocities: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (A, 3) positions and velocities at the times `at`: linear between the (F,) times known, straight on beyond them."""
+    """Return (A, 3) positions and (A, 3) velocities at the times `at`: linear between the (F,) known times, constant velocity beyond."""
     path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
     speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)

@@ -1,4 +1,4 @@
-"""Tracks: the segments of one actor over time, and where the actor was at any moment of it."""
+"""Tracks: the segments of one actor over time, and the pose of the actor at each frame."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
-from carlasc.motion.paths import estimate_path, headings_of, stands
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment, Standing
 from carlasc.motion.smoothing import resample
 
-_REACH_M, _FASTEST_M_S = 15.0, 40.0  # a quick look first: nothing is longer or faster
-_GATE_M = 1.5  # a segment is where its track predicts it, to this
-_SAME_VELOCITY_M_S = 2.0  # an actor's velocity changes by no more between two sightings
-_STOPPING_M_S = 1.5  # slower actors may stand still in the next scan, or have stood still in the last
-_MAX_GAP = 15  # frames that an actor may be hidden and still be the same
-_EXTRAPOLATE = 5  # frames that a track goes on before its first and after its last sighting
-_STANDING_M = 0.5  # what is seen of a standing actor may wander as much
-_TRIM = 0.01  # share of points that may stick out of an actor's box: flying pixels, a neighbour's
+_REACH_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
+_GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
+_SAME_VELOCITY_M_S = 2.0  # maximum change of an actor's velocity between two segments
+_STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
+_MAX_GAP = 15  # maximum number of frames for which an actor may be hidden
+_EXTRAPOLATE = 5  # number of frames by which a track extends beyond its first and its last segment
+_STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
+_TRIM = 0.01  # fraction of points that may be outside an actor's box: outliers, points of a neighbour
 _MARGIN_M = 0.1
 
 
@@ -29,12 +29,12 @@ class Track:
     """One actor over time.
 
     Attributes:
-        label: class of the actor: that of most of its points.
-        instance: number of the actor, 0 where actors have none.
-        segments: what was seen of it, by frame.
+        label: class of the actor, which is that of most of its points.
+        instance: number of the actor; 0 if actors are not numbered.
+        segments: the actor's segments by frame.
         first: frame of `world_T_actor[0]`.
-        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x forward, origin in the middle of its box.
-        velocity: (F, 3) m/s over ground, world.
+        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x is forward, and the origin is the centre of its box.
+        velocity: (F, 3) m/s, world, at the same frames.
         lower: (3,) metres, lower corner of the actor's box, actor frame.
         upper: (3,) metres, upper corner.
     """
@@ -49,12 +49,12 @@ class Track:
     upper: NDArray[np.float64]
 
     def pose(self, frame: int) -> Transform | None:
-        """Return (4, 4) world_T_actor at a frame, None where the track does not reach."""
+        """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
         row = frame - self.first
         return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
 
     def velocity_at(self, frame: int) -> NDArray[np.float64] | None:
-        """Return (3,) m/s, world, at a frame, None where the track does not reach."""
+        """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
         row = frame - self.first
         return self.velocity[row] if 0 <= row < len(self.velocity) else None
 
@@ -65,7 +65,7 @@ class Track:
 
     @property
     def moves(self) -> bool:
-        """Whether the actor ever moves faster, and farther, than standing actors seem to."""
+        """Whether the actor moves faster and farther at some time than a standing actor seems to."""
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
         return bool(fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M)
 
@@ -79,22 +79,22 @@ def link_segments(
 ) -> list[Track]:
     """Link the segments of several scans into tracks.
 
-    Numbered actors are linked by their numbers. Others by prediction: a segment goes on with the track of its class that is
-    expected nearest to it at its velocity, hidden times bridged.
+    Numbered actors are linked by their numbers, others by prediction: a segment continues the track of its class whose
+    predicted position is nearest to it, also after the actor was hidden for some frames.
 
     Args:
-        segments: of all scans, in any order.
-        times: seconds by frame, for every frame of a segment.
-        standing: of each scan, points that stand still: an actor that stops at a crossing is found among them, until it goes on.
-        deformable: classes whose actors bend as they move: without flow, their middle is followed.
+        segments: the segments of all scans, in any order.
+        times: seconds by frame, for every frame with a segment.
+        standing: the standing points of each scan, in which an actor that stops, for example at a crossing, is found until it continues.
+        deformable: classes whose actors change their shape; without flow, the centre of their points is followed.
 
     Returns:
-        Tracks in the order of their first sighting.
+        Tracks in order of their first segment.
     """
     ordered = sorted(segments, key=lambda segment: segment.frame)
     chains = _chains(ordered, times, standing or {})
     for chain in chains:
-        _look_back(chain, standing or {})
+        _extend_backwards(chain, standing or {})
     return [_make_track(chain, times, deformable) for chain in chains]
 
 
@@ -116,20 +116,20 @@ def _chains(
                 chains.append([segment])
             else:
                 chain.append(segment)
-        for chain in alive:  # whoever was slow and did not go on may have stopped
+        for chain in alive:  # a slow actor that was not found may have stopped
             if chain[-1].frame < frame and frame in standing and _is_slow(chain[-1]):
-                rest = standing[frame].in_place_of(chain[-1])
+                rest = standing[frame].segment_at(chain[-1])
                 if rest is not None:
                     chain.append(rest)
     return [*by_instance.values(), *chains]
 
 
-def _look_back(chain: list[Segment], standing: Mapping[int, Standing]) -> None:
-    """Put before a chain the scans in which its actor stood where the chain starts."""
+def _extend_backwards(chain: list[Segment], standing: Mapping[int, Standing]) -> None:
+    """Insert segments before a chain from the scans in which its actor was standing where the chain starts."""
     if chain[0].instance:
         return
     for frame in sorted((frame for frame in standing if frame < chain[0].frame), reverse=True):
-        rest = standing[frame].in_place_of(chain[0]) if _is_slow(chain[0]) else None
+        rest = standing[frame].segment_at(chain[0]) if _is_slow(chain[0]) else None
         if rest is None:
             return
         chain.insert(0, rest)
@@ -142,13 +142,13 @@ def _is_slow(segment: Segment) -> bool:
 def _match(
     found: list[Segment], alive: list[list[Segment]], times: Mapping[int, float]
 ) -> list[tuple[Segment, list[Segment] | None]]:
-    """Pair the segments of one scan with the chains that go on: nearest prediction first, each chain once."""
+    """Pair the segments of one scan with the chains that they continue: nearest prediction first, each chain once."""
     if not found or not alive:
         return [(segment, None) for segment in found]
     candidates = []
     ends = np.stack([chain[-1].center for chain in alive])
     for i, segment in enumerate(found):
-        reach = _REACH_M + _FASTEST_M_S * np.array([times[segment.frame] - times[chain[-1].frame] for chain in alive])
+        reach = _REACH_M + _MAX_SPEED_M_S * np.array([times[segment.frame] - times[chain[-1].frame] for chain in alive])
         for j in np.flatnonzero(np.linalg.norm(ends - segment.center, axis=1) < reach).tolist():
             last = alive[j][-1]
             cost = _cost(last, segment, times[segment.frame] - times[last.frame])
@@ -162,12 +162,12 @@ def _match(
 
 
 def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
-    """Return how far a segment is from where its predecessor would be, None if it cannot be the same actor."""
+    """Return how much a segment differs from the prediction of its predecessor; None if it cannot be the same actor."""
     if last.label != segment.label or last.velocity is None or segment.velocity is None:
         return None
     change = float(np.linalg.norm(segment.velocity - last.velocity))
     predicted = last.points + (last.velocity + segment.velocity) / 2 * elapsed_s
-    # What is seen of an actor changes, so boxes are compared, not their centres: the gap between them, then the centres.
+    # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
     gap = np.maximum(
         predicted.min(axis=0) - segment.points.max(axis=0), segment.points.min(axis=0) - predicted.max(axis=0)
     )
@@ -179,13 +179,13 @@ def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
 
 
 def _make_track(chain: list[Segment], times: Mapping[int, float], deformable: Collection[int]) -> Track:
-    """Turn linked segments into a path, then into poses with the box around everything that was seen."""
+    """Return the track of linked segments: their path, the poses along it, and the box around all points."""
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
     if any(segment.velocity is None for segment in chain):
         sightings = [segment.points for segment in chain]
         positions, velocities = estimate_path(sightings, seconds, rigid=label not in deformable)
-        if stands(sightings, positions, headings_of(velocities), seconds):
+        if is_standing(sightings, positions, headings_of(velocities), seconds):
             positions, velocities = np.zeros_like(positions), np.zeros_like(velocities)
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
@@ -204,7 +204,7 @@ def _make_track(chain: list[Segment], times: Mapping[int, float], deformable: Co
 def _integrate(
     velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: list[Segment]
 ) -> NDArray[np.float64]:
-    """Integrate velocities by trapezoids, through the centre of the sighting with most points."""
+    """Integrate velocities by the trapezoidal rule, through the centre of the segment with most points."""
     steps = (velocities[1:] + velocities[:-1]) / 2 * np.diff(seconds)[:, None]
     path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     best = int(np.argmax([len(segment.members) for segment in chain]))
@@ -214,10 +214,10 @@ def _integrate(
 def _fit_box(
     chain: list[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Move the path into the middle of the actor and return it with the box's corners.
+    """Move the path to the centre of the actor, and return it with the corners of the actor's box.
 
-    The path of the actor's origin is known but for a constant offset in the world. While the actor turns, only the right
-    offset lays all sightings over each other; it is the one that puts the origin in the middle of them.
+    The path is known except for a constant offset in the world. If the actor turns, the segments overlap only with the correct
+    offset, which is the one that moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
     for _ in range(3):
@@ -235,7 +235,7 @@ def _fit_box(
 
 
 def _frame_times(frames: NDArray[np.int64], times: Mapping[int, float]) -> NDArray[np.float64]:
-    """Return the seconds of frames, those without a scan by the mean period."""
+    """Return the seconds of frames. Frames without a scan are interpolated, and extrapolated by the mean period."""
     known = np.array(sorted(times))
     seconds = np.array([times[int(frame)] for frame in known])
     period = (seconds[-1] - seconds[0]) / (known[-1] - known[0]) if len(known) > 1 else 0.1

@@ -7,6 +7,7 @@ that needs a handle opens it per process on first read.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -44,6 +45,7 @@ class Sequence(ABC):
     split: str | None
     name: str
     coordinates: Coordinates
+    _given_poses: NDArray[np.float64] | None = None
 
     @abstractmethod
     def fields(self) -> frozenset[str]:
@@ -150,6 +152,19 @@ class Sequence(ABC):
         check_format(record.get("format", 1), f"{self.location}/{layout.params_file(grid)}: carlasc")
         return record
 
+    def with_poses(self, poses: NDArray[np.float64]) -> Self:
+        """Return a copy of the sequence that has other poses than its poses.txt.
+
+        Copies and pickles of it keep these poses. Its documents are those of the sequence.
+
+        Args:
+            poses: (L, 4, 4) first_T_sensor, one per line, as `poses` returns them.
+        """
+        other = copy.copy(self)
+        vars(other).pop("poses", None)
+        other._given_poses = poses
+        return other
+
     @cached_property
     def poses(self) -> NDArray[np.float64]:
         """(F, 4, 4) first_T_sensor, a line of poses.txt each; `read_pose` finds a frame's.
@@ -157,6 +172,8 @@ class Sequence(ABC):
         Raises:
             MissingDataError: there is no poses.txt.
         """
+        if self._given_poses is not None:
+            return self._given_poses
         return layout.decode_poses(self.read_document(layout.POSES), f"{self.location}/{layout.POSES}")
 
     @cached_property

@@ -1,86 +1,113 @@
-"""What a run leaves about itself in params.json, and how it protects what is already there.
+"""How a run continues the output of an earlier one, and protects the output of others.
 
-A grid's params.json holds the five published keys and, under `carlasc`, how the grid was made. A run goes on with a grid only if both are
-equal to its own. A grid without our record is published data: it is never written to.
+A grid's params.json holds the five published keys and, under `carlasc`, a record of how the grid was made. A run continues a grid only
+if both are equal to its own. A grid without a record is published data and is never written to. See the format page,
+`docs/format.md#params-json`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import ArgumentError, ConflictError
+from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import SequenceWriter
 
 RECORD = "carlasc"
-_POSE_TOLERANCE = 1e-6  # metres, and entries of a rotation: the last digits of poses.txt change with the machine
-_MADE_AGAIN = "take another name (`--name`), or make it again (`--overwrite`)"
+RECORD_FORMAT = 1
+"""Version of the record's own layout: of the keys that it has, and of what they mean."""
+_RENAMED = {"source": "observe", "vote": "voting"}  # keys of the records without a format
+_TOLERANCE = 1e-6  # metres, entries of a rotation, seconds: the last digits of poses.txt depend on the machine
+_OTHER_SETTINGS = "choose another `name`, or replace the grid with `overwrite=True`"
+_PUBLISHED = "this is published data, which is never written to: choose another `name` or `out`"
 
 
 def check_name(name: str) -> str:
-    """Return the name of a grid's folder if it can be one.
+    """Return the name of a grid's folder if it is valid.
 
     Raises:
-        ArgumentError: it is no plain folder name, or one that the layout uses for something else.
+        ArgumentError: it is not a plain folder name, or the layout uses it for something else.
     """
     taken = layout.scan_folders() | {layout.POSES, layout.TIMES, layout.METADATA}
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*", name):
-        raise ArgumentError("name", expected="letters, digits and _ . + -", found=f"{name!r}")
+        raise ArgumentError("name", expected="letters, digits and _ . + -", found=repr(name))
     if name in taken:
-        raise ArgumentError(
-            "name", expected="a name of your own", found=f"{name!r}, which the layout uses for something else"
-        )
+        raise ArgumentError("name", expected="a name that the layout does not use for something else", found=repr(name))
     return name
 
 
 def check_grid(
     writer: SequenceWriter, grid: str, params: dict[str, Any], frames: Iterable[int], *, overwrite: bool
 ) -> bool:
-    """Find out whether a run may write to a grid.
+    """Check whether a run may write to a grid.
 
     Args:
         writer: where the grid is, or will be.
-        grid: its folder.
+        grid: name of its folder.
         params: the whole params.json of this run.
-        frames: the frames that it would write.
-        overwrite: whether our own earlier grid may be replaced.
+        frames: the frames that this run would write.
+        overwrite: whether a grid that carlasc made with other settings may be replaced.
 
     Returns:
-        Whether one of our own grids is there, of the same settings unless `overwrite` is given.
+        Whether the grid exists: made by carlasc, and with the same settings unless `overwrite` is given.
 
     Raises:
-        ConflictError: it is published data, or of other settings; names the difference.
+        ConflictError: the grid is published data, or has other settings; names the first difference.
+        FormatError: the grid was made by a newer version of carlasc, whose record this version cannot read.
     """
     where = f"{writer.location}/{layout.params_file(grid)}"
     data = writer.read_document(layout.params_file(grid))
     if data is None:
         if any(writer.has(f"{grid}/{part}", frame) for frame in frames for part in ("labels", "counts")):
-            raise ConflictError(where, expected="the record of a run", found="frames without it", advice=f"{_NOT_OURS}")
+            raise ConflictError(where, expected="the record of a run", found="frames without one", advice=_PUBLISHED)
         return False
-    there = parse_json(data, where)
-    if not isinstance(there.get(RECORD), dict):
-        raise ConflictError(where, expected="the record of a run", found="none", advice=f"{_NOT_OURS}")
-    if not overwrite and (difference := _first_difference(there, params)):
-        raise ConflictError(
-            where, expected="a grid of the same settings", found=f"{difference}", advice=f"{_MADE_AGAIN}"
-        )
+    existing = parse_json(data, where)
+    if not isinstance(existing.get(RECORD), dict):
+        raise ConflictError(where, expected="the record of a run", found="none", advice=_PUBLISHED)
+    old, new = ({**document, RECORD: read_record(document[RECORD], where)} for document in (existing, params))
+    if not overwrite and (difference := _first_difference(old, new)):
+        raise ConflictError(where, expected="a grid with the same settings", found=difference, advice=_OTHER_SETTINGS)
     return True
 
 
-_NOT_OURS = "this is published data, which is never written to: take another name (`--name`) or another place (`-o`)"
+def read_record(record: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return the record of a grid in the terms of `RECORD_FORMAT`, whichever version of carlasc wrote it.
+
+    Records of carlasc 0.1.0 have no "format". They name the version of carlasc instead of that of the rule, "source" instead of
+    "observe", and "vote" instead of "voting".
+
+    Args:
+        record: what params.json holds under `RECORD`.
+        where: the file, for errors.
+
+    Raises:
+        FormatError: the format is newer than this version of carlasc, or is not a number.
+    """
+    version = record.get("format", 0)
+    if not isinstance(version, int) or not 0 <= version <= RECORD_FORMAT:
+        raise FormatError(
+            where,
+            expected=f"a record of format {RECORD_FORMAT} or older",
+            found=f"format {version}",
+            advice="upgrade carlasc: a newer version wrote it",
+        )
+    if version == RECORD_FORMAT:
+        return dict(record)
+    kept = {_RENAMED.get(name, name): value for name, value in record.items() if name != "version"}
+    return {"format": RECORD_FORMAT, "rule": 1} | kept
 
 
-def _first_difference(there: dict[str, Any], wanted: dict[str, Any]) -> str | None:
-    """Say the first thing that differs, the five keys first."""
-    pairs = [(key, there.get(key), wanted[key]) for key in wanted if key != RECORD]
-    old, new = there[RECORD], wanted[RECORD]
+def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str | None:
+    """Describe the first difference between two params.json, the five published keys first; None if there is none."""
+    pairs = [(key, existing.get(key), wanted[key]) for key in wanted if key != RECORD]
+    old, new = existing[RECORD], wanted[RECORD]
     pairs += [(f"{RECORD}.{key}", old.get(key), new.get(key)) for key in dict.fromkeys([*new, *old])]
     for key, found, expected in pairs:
         if found != expected:
@@ -89,12 +116,12 @@ def _first_difference(there: dict[str, Any], wanted: dict[str, Any]) -> str | No
 
 
 def agree_poses(writer: SequenceWriter, poses: NDArray[np.float64]) -> bytes | None:
-    """Return the poses.txt to write, None if the one that is there says all.
+    """Return the poses.txt to write; None if the existing one is complete.
 
-    Poses that are there must be equal; lines without a pose (NaN: it could not be read) are filled in.
+    Existing poses must be equal to those of this run. Lines without a pose (NaN: it could not be read) are filled in.
 
     Raises:
-        ConflictError: another pose is there; names the frame.
+        ConflictError: an existing pose is not equal; names the frame.
     """
     data = writer.read_document(layout.POSES)
     if data is None:
@@ -105,10 +132,10 @@ def agree_poses(writer: SequenceWriter, poses: NDArray[np.float64]) -> bytes | N
 
 
 def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | None:
-    """Return the times.txt to write, None if the one that is there says all.
+    """Return the times.txt to write; None if the existing one is complete.
 
     Raises:
-        ConflictError: another time is there; names the frame.
+        ConflictError: an existing time is not equal; names the frame.
     """
     data = writer.read_document(layout.TIMES)
     if data is None:
@@ -118,19 +145,19 @@ def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | N
     return None if merged is None else layout.encode_times(merged)
 
 
-def _merge(there: NDArray[np.float64], ours: NDArray[np.float64], where: str) -> NDArray[np.float64] | None:
-    """Return what is there, completed by ours; None if nothing was missing."""
-    both = min(len(there), len(ours))
-    off = np.abs(there[:both] - ours[:both]) > _POSE_TOLERANCE  # False where either is NaN
-    if off.any():
-        raise _other_data(where, int(np.argwhere(off)[0, 0]))
-    merged = np.concatenate([there, ours[both:]])
-    merged[:both] = np.where(np.isnan(there[:both]), ours[:both], there[:both])
-    return None if np.array_equal(merged, there, equal_nan=True) else merged
+def _merge(existing: NDArray[np.float64], ours: NDArray[np.float64], where: str) -> NDArray[np.float64] | None:
+    """Return the existing rows, completed by ours; None if nothing was missing."""
+    both = min(len(existing), len(ours))
+    differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False where either is NaN
+    if differs.any():
+        raise _other_data(where, int(np.argwhere(differs)[0, 0]))
+    merged = np.concatenate([existing, ours[both:]])
+    merged[:both] = np.where(np.isnan(existing[:both]), ours[:both], existing[:both])
+    return None if np.array_equal(merged, existing, equal_nan=True) else merged
 
 
 def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
-    """Return the carlasc.json to write, None if it is there or would say nothing but the defaults.
+    """Return the carlasc.json to write; None if it exists or would hold only the defaults.
 
     Raises:
         ConflictError: what exists has other axes or other classes.
@@ -143,19 +170,19 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
             where,
             expected=f"the axes {metadata.axes} and the classes {metadata.classes.name}",
             found=f"{there.axes} and {'others called ' if there.classes.name == metadata.classes.name != there.classes else ''}{there.classes.name}",
-            advice="write to another place (`-o`)",
+            advice="choose another `out`",
         )
     return metadata.to_json() if data is None and metadata != Metadata() else None
 
 
 def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) -> None:
-    """Compare a scan field that is there already with what this run would write.
+    """Compare an existing scan field with what this run would write.
 
     Raises:
         ConflictError: they differ.
     """
-    there = writer.read(field, frame)
-    if there is not None and not np.array_equal(there, array, equal_nan=array.dtype.kind == "f"):
+    existing = writer.read(field, frame)
+    if existing is not None and not np.array_equal(existing, array, equal_nan=array.dtype.kind == "f"):
         raise _other_data(f"{writer.location}/{layout.field_named(field).file(frame)}", frame)
 
 
@@ -163,6 +190,6 @@ def _other_data(where: str, frame: int) -> ConflictError:
     return ConflictError(
         where,
         expected="the data of this run",
-        found=f"another's at frame {frame}",
-        advice="write to another place (`-o`), or move what is there away",
+        found=f"other data at frame {frame}",
+        advice="choose another `out`, or move the existing files away",
     )

@@ -21,8 +21,7 @@ from carlasc.captures.town import Drive
 from carlasc.converting import convert
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth import Observation, count_votes, regrid
-from carlasc.groundtruth.from_scans.windows import Merging
+from carlasc.groundtruth import FromScans, Observation, count_votes, regrid
 from carlasc.metrics import TruthScore, score_truth
 from carlasc.viewing.rendering import ClassColors, Panel, draw_panels, grid_scene
 
@@ -54,13 +53,12 @@ def make(folder: Path, rule: str, name: str) -> dict[int, Grid]:
     for frame in JUDGED:
         result = regrid(
             folder,
-            None,
             GRIDS[name],
-            name=f"{grid}_{frame}",
-            merging=Merging(dynamic=rule),
+            observe=FromScans(dynamic=rule),  # type: ignore[arg-type]
             frames=(frame, frame + 1),
+            name=f"{grid}_{frame}",
             workers=1,
-        )  # type: ignore[arg-type]
+        )
         if result.failures:
             raise SystemExit(result.failures[0].message)
     (sequence,) = carlasc.open(folder).sequences().values()

@@ -21,11 +21,7 @@ from carlasc import Grid, GridSpec
 from carlasc.captures.town import Drive
 from carlasc.core.geometry import invert, relative_to
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth import Observation, count_votes
-from carlasc.groundtruth.from_scans.inputs import ScanFrame
-from carlasc.groundtruth.from_scans.windows import Merging, ScanFeed
-from carlasc.groundtruth.inputs import Recipe
-from carlasc.groundtruth.voting.ballot import VoteRule
+from carlasc.groundtruth import FromScans, Observation, Voting, count_votes, regrid
 from carlasc.metrics import TruthScore, score_truth
 from carlasc.storage import FolderSink, layout
 from carlasc.viewing.rendering import ClassColors, Panel, draw_panels, grid_scene
@@ -43,16 +39,16 @@ class Run:
 
     name: str
     field: str  # what tells how things move
-    merging: Merging
-    vote: VoteRule = "point"
+    observe: FromScans
+    voting: Voting = Voting()  # noqa: RUF009 (frozen)
 
 
 RUNS = (
-    Run("tube", "flow", Merging(dynamic="tube")),
-    Run("current", "flow", Merging(dynamic="current")),
-    Run("current, plain votes", "flow", Merging(dynamic="current"), "sensor"),
-    Run("align", "flow", Merging()),
-    Run("align, by instances", "instances", Merging()),
+    Run("tube", "flow", FromScans(dynamic="tube")),
+    Run("current", "flow", FromScans(dynamic="current")),
+    Run("current, plain votes", "flow", FromScans(dynamic="current"), Voting("sensor")),
+    Run("align", "flow", FromScans()),
+    Run("align, by instances", "instances", FromScans()),
 )
 
 
@@ -82,14 +78,21 @@ def reference(drive: Drive, frame: int, spec: GridSpec) -> Grid:
 
 def make(run: Run, folder: Path) -> dict[str, dict[int, Grid]]:
     """Make the judged frames in one way: by grid, by frame."""
-    sequence = next(iter(carlasc.open(folder / run.field).sequences().values()))
-    feed = ScanFeed(sequence, run.merging)
-    grids: dict[str, dict[int, Grid]] = {name: {} for name in GRIDS}
-    for frame in JUDGED:
-        for name, spec in GRIDS.items():
-            recipe = Recipe(spec, "evaluation", CARLA, run.vote, 1.5, keep_votes=False)
-            grids[name][frame] = ScanFrame(feed, frame, frame).make(recipe).grid
-    return grids
+    out = folder / run.name
+    for name, spec in GRIDS.items():
+        for frame in JUDGED:
+            regrid(
+                folder / run.field,
+                spec,
+                out,
+                observe=run.observe,
+                voting=run.voting,
+                frames=(frame, frame + 1),
+                name=name.replace(" ", ""),
+                workers=1,
+            )
+    (sequence,) = carlasc.open(out).sequences().values()
+    return {name: {frame: sequence.grid(name.replace(" ", ""), frame) for frame in JUDGED} for name in GRIDS}
 
 
 def score(grids: dict[int, Grid], truths: dict[int, Grid]) -> TruthScore:

@@ -69,6 +69,6 @@ def build_towns(
             bev=False,
             workers=workers,
         )
-        regrid(folder, None, spec or GridSpec.published(), name="evaluation", workers=workers)
+        regrid(folder, spec or GridSpec.published(), name="evaluation", workers=workers)
         if progress:
             progress(done, len(towns))

@@ -30,7 +30,7 @@ def frame(full: bool) -> list[Observation]:
 
 
 def vote(observations: list[Observation], spec: GridSpec, rule: Any) -> Grid:
-    return count_votes(observations, spec, vote=rule).to_grid()
+    return count_votes(observations, spec, rule=rule).to_grid()
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -48,7 +48,7 @@ def test_plain_votes(benchmark: Any, case: str) -> None:
     observations = frame(benchmark.enabled)
 
     def plain() -> tuple[Any, Any]:
-        return plain_grid(plain_votes(observations, spec, vote=rule), spec)
+        return plain_grid(plain_votes(observations, spec, rule=rule), spec)
 
     labels, counts = benchmark.pedantic(plain, rounds=2 if benchmark.enabled else 1)
     grid = vote(observations, spec, rule)

@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers import passing
 from helpers.captures import read_tree, write_capture
 from typer.testing import CliRunner
 
@@ -30,7 +31,7 @@ def test_inside_a_sequences_folder_res_is_all_it_needs(capture):
     assert "cartesian 256 x 256 x 15: 3 frames made in" in result.stdout
     assert result.stderr == ""  # no bar where there is no terminal
     assert (capture / "cartesian/evaluation_256x256x15/000002.bin").stat().st_size == 256 * 256 * 15 * 4
-    assert "0 frames made (3 were there)" in _regrid("--res", 0.2).stdout
+    assert "0 frames made (3 existed)" in _regrid("--res", 0.2).stdout
 
 
 def test_the_published_cartesian_grid_is_called_evaluation_and_another_of_its_size_is_not(capture):
@@ -41,7 +42,7 @@ def test_the_published_cartesian_grid_is_called_evaluation_and_another_of_its_si
 
 
 def test_every_option_reaches_the_run(capture):
-    options = ["--size", "16,12,4", "--bounds", "-8,8,-6,6,-2,1", "--free-step", 0.5, "--vote", "sample"]
+    options = ["--size", "16,12,4", "--bounds", "-8,8,-6,6,-2,1", "--free-step-m", 0.5, "--voting", "sample"]
     result = _regrid(capture, "-o", "out", *options, "--frames", "101:", "--keep-votes", "--name", "mine", "--json")
     assert result.exit_code == 0, result.stderr
     printed = json.loads(result.stdout)
@@ -50,7 +51,7 @@ def test_every_option_reaches_the_run(capture):
     params = json.loads((capture / "out/cartesian/mine/params.json").read_bytes())
     record = params.pop("carlasc")
     assert params == GridSpec("cartesian", (16, 12, 4), (-8, -6, -2), (8, 6, 1)).to_params()
-    assert (record["free_step_m"], record["vote"], record["frames"]) == (0.5, "sample", "101:")
+    assert (record["free_step_m"], record["voting"], record["frames"]) == (0.5, "sample", "101:")
     assert sorted(name.split("/")[-1] for name in read_tree(capture / "out/cartesian/mine")) == [
         *("000000.bin", "000000.label", "000000.votes.npz", "000001.bin", "000001.label", "000001.votes.npz"),
         "params.json",
@@ -59,12 +60,12 @@ def test_every_option_reaches_the_run(capture):
 
 def test_other_settings_need_overwrite_or_another_name(capture):
     assert _regrid("--preset", "coarse").exit_code == 0
-    refused = _regrid("--preset", "coarse", "--free-step", 1)
+    refused = _regrid("--preset", "coarse", "--free-step-m", 1)
     assert refused.exit_code == 1
     (line,) = refused.stderr.splitlines()
     assert "free_step_m 1.5 where this run has 1.0" in line and "--overwrite" in line
-    assert _regrid("--preset", "coarse", "--free-step", 1, "--name", "other").exit_code == 0
-    assert _regrid("--preset", "coarse", "--free-step", 1, "--overwrite").exit_code == 0
+    assert _regrid("--preset", "coarse", "--free-step-m", 1, "--name", "other").exit_code == 0
+    assert _regrid("--preset", "coarse", "--free-step-m", 1, "--overwrite").exit_code == 0
 
 
 def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
@@ -92,14 +93,32 @@ def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
         (["--size", "1.5,10,10"], "--size: expected 3 whole numbers"),
         (["--res", 0.2, "--bounds", "1,-1,0,1,0,1"], "expected lower < upper on every axis"),
         (["--res", 0.2, "--bounds", "1,2,3"], "--bounds: expected 6 numbers"),
-        (["--preset", "coarse", "--bounds", "0,1,0,1,0,1"], "--bounds: expected --res or --size with it"),
-        (["--preset", "cylindrical", "--coordinates", "cartesian"], "expected no --coordinates, or cylindrical"),
+        (["--preset", "coarse", "--bounds", "0,1,0,1,0,1"], "--bounds: expected none with --preset"),
+        (
+            ["--preset", "cylindrical", "--coordinates", "cartesian"],
+            "--coordinates: expected cylindrical with --preset cylindrical",
+        ),
         (["--preset", "huge"], "'huge'"),
-        (["--preset", "coarse", "--vote", "twice"], "'twice'"),
-        (["--preset", "coarse", "--free-step", 0], "free step: expected a positive number"),
+        (["--preset", "coarse", "--voting", "twice"], "'twice'"),
+        (["--preset", "coarse", "--free-step-m", 0], "--free-step-m: expected a positive number"),
         (["--preset", "coarse", "--frames", "9:3"], "--frames: expected a range that holds a frame"),
-        (["--preset", "coarse", "--frames", "-3:"], "frames: expected a half-open range of frame numbers from 0"),
-        (["--preset", "coarse", "--name", "a/b"], "name: expected letters"),
+        (["--preset", "coarse", "--window", "2:9"], "--window: expected a range that contains 0"),
+        (["--preset", "coarse", "--window", "all"], "--window: expected A:B"),
+        (["--preset", "coarse", "--stride", 0], "--stride: expected at least 1"),
+        (
+            ["--preset", "coarse", "--min-range-m", 5, "--max-range-m", 2],
+            "--min-range-m: expected 0 <= minimum < maximum",
+        ),
+        (["--preset", "coarse", "--observe", "capture", "--stride", 2], "--observe: expected scans with the options"),
+        (
+            ["--preset", "coarse", "--observe", "capture", "--from-grid", "x"],
+            "--observe: expected grid with --from-grid",
+        ),
+        (
+            ["--preset", "coarse", "--from-grid", "x", "--keep-votes"],
+            "--keep-votes: expected False for resampled grids",
+        ),
+        (["--preset", "coarse", "--name", "a/b"], "--name: expected letters"),
     ],
 )
 def test_wrong_usage_is_one_line_and_2(capture, options, message):
@@ -117,6 +136,24 @@ def test_a_folder_without_a_capture_is_1(tmp_path):
         "nowhere: expected a folder, a zip or a packed store, found nothing"
         in _regrid(tmp_path / "nowhere", "--res", 0.2).stderr
     )
+
+
+def test_advice_names_options_where_the_library_names_arguments(tmp_path, capture):
+    street = passing.write_sequence(tmp_path / "street", (), frames=2, poses=False)
+    assert "`--poses kiss-icp`" in _regrid(street, "--res", 0.4).stderr
+    assert _regrid("--preset", "coarse").exit_code == 0
+    advice = _regrid("--preset", "coarse", "--voting", "sample").stderr
+    assert "choose another `--name`, or replace the grid with `--overwrite`" in advice
+    assert "`--out`" in _regrid("--preset", "coarse", "--name", "velodyne2", "-o", street, "--frames", "100").stderr
+
+
+def test_options_for_scans_and_grids_say_what_observes_the_scene(capture):
+    runs = {"capture": [], "scans": ["--stride", 2, "--force"], "grid": ["--from-grid", "capture"]}
+    for kind, options in runs.items():
+        result = _regrid("--size", "16,16,4", "--name", kind, *options)
+        assert result.exit_code == 0, result.stderr
+        record = json.loads((capture / "cartesian" / kind / "params.json").read_bytes())["carlasc"]
+        assert record["observe"] == kind
 
 
 def test_presets_are_the_published_grids_in_the_coordinates_asked_for():

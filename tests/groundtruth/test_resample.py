@@ -45,9 +45,11 @@ def test_cylindrical_grids_resample_too():
     assert (coarse.counts == 8).all()
 
 
-def test_what_was_never_measured_is_not_made_up():
+def test_a_finer_or_larger_grid_is_refused():
     fine = random_grid(2)
-    with pytest.raises(ArgumentError, match="never measured cannot be made up"):
+    with pytest.raises(
+        ArgumentError, match="expected voxels of at least 1 x 1 x 1.*found 0.5 x 1 x 1.*new measurements"
+    ):
         resample(fine, fine.spec.with_size((16, 8, 4)), CARLA)
     with pytest.raises(ArgumentError, match="expected a cartesian grid"):
         resample(fine, GridSpec("cylindrical", (2, 2, 2), (0, -math.pi, 0), (8, math.pi, 4)), CARLA)

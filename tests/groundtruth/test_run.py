@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from helpers.captures import make_recording, read_tree, write_capture
 
-import carlasc
 from carlasc.captures.raw import Capture, CaptureWriter
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
-from carlasc.groundtruth import Observation, count_votes, regrid
+from carlasc.groundtruth import FromCapture, FromScans, Observation, Voting, count_votes, regrid
 from carlasc.storage import FolderSource, Sink, layout
 from carlasc.storage.protocol import SequenceWriter
 
@@ -28,7 +27,9 @@ GOLDEN = {
 @pytest.mark.parametrize(("variant", "workers"), [(variant, 1) for variant in GOLDEN] + [("cartesian", 2)])
 def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, variant, workers):
     spec, free_step = GOLDEN[variant]
-    result = regrid(golden_capture, tmp_path, spec, free_step_m=free_step, name="evaluation", workers=workers)
+    result = regrid(
+        golden_capture, spec, tmp_path, voting=Voting(free_step_m=free_step), name="evaluation", workers=workers
+    )
     assert (result.made, result.skipped, result.failures) == (3, 0, ())
     made, golden = read_tree(tmp_path / spec.coordinates), read_tree(golden_capture / variant)
     assert set(golden) <= set(made)
@@ -45,7 +46,7 @@ def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, varia
 
 
 def test_what_we_add_stands_beside_the_published_files_only(golden_capture, tmp_path):
-    regrid(golden_capture, tmp_path, GridSpec.published(), workers=1)
+    regrid(golden_capture, GridSpec.published(), tmp_path, workers=1)
     added = set(read_tree(tmp_path / "cartesian")) - set(read_tree(golden_capture / "cartesian"))
     assert added == {f"instances/{frame:06d}.label" for frame in range(3)}
     instances = np.fromfile(tmp_path / "cartesian/instances/000001.label", "<u4")
@@ -54,21 +55,22 @@ def test_what_we_add_stands_beside_the_published_files_only(golden_capture, tmp_
 
 def test_the_run_is_recorded_in_params_json(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, None, SMALL, vote="sample", free_step_m=0.7, workers=1)
+    regrid(tmp_path, SMALL, voting=Voting("sample", 0.7), workers=1)
     params = json.loads((tmp_path / "cartesian/evaluation_32x32x4/params.json").read_bytes())
     assert params["carlasc"] == {
-        "version": carlasc.__version__,
-        "source": "capture",
+        "format": 1,
+        "rule": 1,
+        "observe": "capture",
         "frames": "100:",
         "sensors": 2,
         "free_step_m": 0.7,
-        "vote": "sample",
+        "voting": "sample",
     }
 
 
 def test_what_is_written_is_read_back_by_a_source(tmp_path):
     capture = write_capture(tmp_path)
-    regrid(tmp_path, None, SMALL, workers=1)
+    regrid(tmp_path, SMALL, workers=1)
     (sequence,) = FolderSource(tmp_path).sequences().values()
     scan, recording = sequence.scan(1), capture.read(0, 101)
     assert np.array_equal(scan.points, recording.scan.points)
@@ -95,7 +97,7 @@ def test_sensors_that_stand_turned_see_the_same_world(tmp_path):
     for writer, second in ((upright, other), (turned, rotated)):
         writer.write(0, 0, ego)
         writer.write(1, 0, second)
-        regrid(writer.raw, None, SMALL, free_step_m=1000, workers=1)  # endpoints alone: rays start elsewhere
+        regrid(writer.raw, SMALL, voting=Voting(free_step_m=1000), workers=1)  # endpoints alone: rays start elsewhere
     grids = [
         FolderSource(w.raw.parent).sequences()["cartesian"].grid("evaluation_32x32x4", 0) for w in (upright, turned)
     ]
@@ -105,8 +107,8 @@ def test_sensors_that_stand_turned_see_the_same_world(tmp_path):
 
 def test_votes_are_kept_when_asked_for_and_added_to_a_grid_that_is_there(tmp_path):
     capture = write_capture(tmp_path, frames=2)
-    regrid(tmp_path, None, SMALL, workers=1)
-    result = regrid(tmp_path, None, SMALL, workers=1, keep_votes=True)
+    regrid(tmp_path, SMALL, workers=1)
+    result = regrid(tmp_path, SMALL, voting=Voting(keep=True), workers=1)
     assert (result.made, result.skipped) == (2, 0)
     (sequence,) = FolderSource(tmp_path).sequences().values()
     votes = sequence.read("evaluation_32x32x4/votes", 1)
@@ -122,22 +124,22 @@ def test_votes_are_kept_when_asked_for_and_added_to_a_grid_that_is_there(tmp_pat
 
 def test_a_second_run_skips_what_is_there_and_makes_what_is_missing(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, None, SMALL, workers=1)
+    regrid(tmp_path, SMALL, workers=1)
     whole = read_tree(tmp_path)
-    again = regrid(tmp_path, None, SMALL, workers=1)
+    again = regrid(tmp_path, SMALL, workers=1)
     assert (again.made, again.skipped) == (0, 3)
     for name in ("evaluation_32x32x4/000001.bin", "velodyne/000002.bin"):
         (tmp_path / "cartesian" / name).unlink()
-    again = regrid(tmp_path, None, SMALL, workers=1)
+    again = regrid(tmp_path, SMALL, workers=1)
     assert (again.made, again.skipped) == (2, 1)
     assert read_tree(tmp_path) == whole
 
 
 def test_a_run_goes_on_when_the_capture_has_grown(tmp_path):
     write_capture(tmp_path, frames=2)
-    regrid(tmp_path, None, SMALL, workers=1)
+    regrid(tmp_path, SMALL, workers=1)
     write_capture(tmp_path, frames=3)
-    result = regrid(tmp_path, None, SMALL, workers=1)
+    result = regrid(tmp_path, SMALL, workers=1)
     assert (result.made, result.skipped) == (1, 2)
     assert len((tmp_path / "cartesian/poses.txt").read_text().splitlines()) == 3
 
@@ -146,7 +148,7 @@ def test_frames_are_chosen_by_their_number_in_the_capture_and_renumbered(tmp_pat
     capture = write_capture(tmp_path, frames=5)
     for chosen, expected in (((101, 103), [101, 102]), ((None, 102), [100, 101]), ((103, None), [103, 104])):
         out = tmp_path / f"out{expected[0]}"
-        regrid(tmp_path, out, SMALL, frames=chosen, workers=1)
+        regrid(tmp_path, SMALL, out, frames=chosen, workers=1)
         (sequence,) = FolderSource(out).sequences().values()
         assert sequence.scan_frames().tolist() == [0, 1]
         assert len(sequence.poses) == len(sequence.times) == 2
@@ -159,7 +161,7 @@ def test_frames_that_the_capture_skipped_keep_their_time(tmp_path):
     capture = write_capture(tmp_path, frames=4)
     for kind in ("velodyne", "labels", "instances", "velocities", "pose"):
         (capture.raw / f"{kind}0" / "101.npy").unlink()
-    regrid(tmp_path, None, SMALL, workers=1)
+    regrid(tmp_path, SMALL, workers=1)
     (sequence,) = FolderSource(tmp_path).sequences().values()
     assert sequence.scan_frames().tolist() == [0, 1, 2]
     assert np.allclose(sequence.times, [0.0, 0.2, 0.3])
@@ -169,21 +171,21 @@ def test_frames_that_the_capture_skipped_keep_their_time(tmp_path):
 def test_a_range_without_frames_says_which_there_are(tmp_path, frames):
     write_capture(tmp_path)
     with pytest.raises(MissingDataError, match="expected frames in .*, found only 100 to 102"):
-        regrid(tmp_path, None, SMALL, frames=frames)
+        regrid(tmp_path, SMALL, frames=frames)
     assert not (tmp_path / "cartesian").exists()
 
 
 def test_several_sequences_keep_their_paths(tmp_path):
     for path in ("Train/Town01_Light", "Val/Town07_Light"):
         write_capture(tmp_path / "in" / path, frames=2)
-    result = regrid(tmp_path / "in", tmp_path / "out", SMALL, workers=2)
+    result = regrid(tmp_path / "in", SMALL, tmp_path / "out", workers=2)
     assert result.made == 4
     assert list(FolderSource(tmp_path / "out").sequences()) == [
         "Train/Town01_Light/cartesian",
         "Val/Town07_Light/cartesian",
     ]
     cylindrical = GridSpec.published("cylindrical").with_size((16, 16, 4))
-    regrid(tmp_path / "in", None, cylindrical, workers=1)
+    regrid(tmp_path / "in", cylindrical, workers=1)
     assert list(FolderSource(tmp_path / "in").sequences()) == [
         "Train/Town01_Light/cylindrical",
         "Val/Town07_Light/cylindrical",
@@ -192,25 +194,25 @@ def test_several_sequences_keep_their_paths(tmp_path):
 
 def test_raw_itself_as_the_source_writes_beside_it(tmp_path):
     write_capture(tmp_path, frames=1)
-    regrid(tmp_path / "raw", None, SMALL, workers=1)
+    regrid(tmp_path / "raw", SMALL, workers=1)
     assert (tmp_path / "cartesian/velodyne/000000.bin").is_file()
 
 
 def test_progress_counts_what_was_there_and_ends_at_the_total(tmp_path):
     write_capture(tmp_path)
     seen: list[tuple[int, int]] = []
-    regrid(tmp_path, None, SMALL, workers=1, frames=(100, 102), progress=lambda *counts: seen.append(counts))
+    regrid(tmp_path, SMALL, workers=1, frames=(100, 102), progress=lambda *counts: seen.append(counts))
     assert seen == [(0, 2), (1, 2), (2, 2)]
     seen.clear()
-    regrid(tmp_path, None, SMALL, workers=1, frames=(100, 102), progress=lambda *counts: seen.append(counts))
+    regrid(tmp_path, SMALL, workers=1, frames=(100, 102), progress=lambda *counts: seen.append(counts))
     assert seen == [(2, 2)]
 
 
 def test_a_callers_executor_makes_the_same_files(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, tmp_path / "own", SMALL, workers=1)
+    regrid(tmp_path, SMALL, tmp_path / "own", workers=1)
     with ThreadPoolExecutor(2) as executor:
-        regrid(tmp_path, tmp_path / "threads", SMALL, executor=executor)
+        regrid(tmp_path, SMALL, tmp_path / "threads", executor=executor)
     assert read_tree(tmp_path / "threads") == read_tree(tmp_path / "own")
 
 
@@ -252,40 +254,60 @@ class MemoryWriter(SequenceWriter):
 def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_path):
     write_capture(tmp_path, frames=6)
     sink = MemorySink()
-    assert regrid(tmp_path, sink, SMALL, workers=2).made == 6
+    assert regrid(tmp_path, SMALL, sink, workers=2).made == 6
     (writer,) = sink.writers.values()
     assert writer.closed == 1
-    regrid(tmp_path, None, SMALL, workers=1)
+    regrid(tmp_path, SMALL, workers=1)
     (sequence,) = FolderSource(tmp_path).sequences().values()
     for name in sequence.fields():
         for frame in range(6):
             assert np.array_equal(writer.fields[name, frame], sequence.read(name, frame)), name
     with pytest.raises(ConflictError, match="memory: this store cannot replace its grid evaluation_32x32x4"):
-        regrid(tmp_path, sink, SMALL, workers=1, overwrite=True)
+        regrid(tmp_path, SMALL, sink, workers=1, overwrite=True)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"free_step_m": 0}, "free step: expected a positive number"),
-        ({"free_step_m": float("nan")}, "free step: expected a positive number"),
-        ({"vote": "majority"}, "vote rule: expected sensor, sample or point, found 'majority'"),
-        ({"observations": "dreams"}, "observations: expected one of capture.*, found 'dreams'"),
-        ({"frames": (5, 5)}, "frames: expected a half-open range of frame numbers from 0, found 5:5"),
-        ({"frames": (-3, None)}, "frames: expected a half-open range of frame numbers from 0, found -3:"),
+        ({"observe": "capture"}, "observe: expected one of FromCapture, FromScans, FromGrid, found 'capture'"),
+        ({"frames": (5, 5)}, "frames: expected a range that holds a frame, found 5:5"),
+        ({"frames": "5:7"}, "frames: expected .*, found '5:7'"),
         ({"workers": 0}, "workers: expected at least 1, found 0"),
         ({"name": "a/b"}, "name: expected letters, digits and _ . [+] -, found 'a/b'"),
         ({"name": ".."}, "name: expected letters"),
         ({"name": ""}, "name: expected letters"),
-        ({"name": "velodyne"}, "name: expected a name of your own, found 'velodyne'"),
-        ({"name": "poses.txt"}, "name: expected a name of your own, found 'poses.txt'"),
+        (
+            {"name": "velodyne"},
+            "name: expected a name that the layout does not use for something else, found 'velodyne'",
+        ),
+        ({"name": "poses.txt"}, "name: expected a name that the layout does not .*, found 'poses.txt'"),
     ],
 )
-def test_senseless_arguments_are_refused_before_anything_is_written(tmp_path, arguments, message):
+def test_arguments_that_are_not_valid_are_refused_before_anything_is_written(tmp_path, arguments, message):
     write_capture(tmp_path, frames=1)
     with pytest.raises(ArgumentError, match=message):
-        regrid(tmp_path, None, SMALL, **arguments)
+        regrid(tmp_path, SMALL, **arguments)
     assert not (tmp_path / "cartesian").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"free_step_m": 0}, "free_step_m: expected a positive number"),
+        ({"free_step_m": float("nan")}, "free_step_m: expected a positive number"),
+        ({"rule": "majority"}, "rule: expected sensor, sample or point, found 'majority'"),
+    ],
+)
+def test_voting_checks_itself(settings, message):
+    with pytest.raises(ArgumentError, match=message):
+        Voting(**settings)
+
+
+def test_a_source_object_must_be_told_where_to_write(golden_capture):
+    with pytest.raises(ArgumentError, match="out: expected where to write, as the source is not a folder, found None"):
+        regrid(FolderSource(golden_capture), SMALL, observe=FromScans())
+    with pytest.raises(ArgumentError, match="source: expected a folder with a capture"):
+        regrid(FolderSource(golden_capture), SMALL, golden_capture, observe=FromCapture())
 
 
 @pytest.mark.parametrize("coordinates", ["cartesian", "cylindrical"])
@@ -300,7 +322,7 @@ def test_a_real_scan_of_a_street_gives_a_sane_grid(real, tmp_path, coordinates):
     )
     CaptureWriter(tmp_path).write(0, 0, replace(recording, scan=scan))
     spec = GridSpec.published(coordinates).with_resolution(0.2)
-    assert regrid(tmp_path, None, spec, workers=1).failures == ()
+    assert regrid(tmp_path, spec, workers=1).failures == ()
     (sequence,) = FolderSource(tmp_path).sequences().values()
     (name,) = sequence.grids
     grid = sequence.grid(name, 0)

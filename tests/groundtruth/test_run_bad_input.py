@@ -10,7 +10,7 @@ from helpers.captures import read_tree, write_capture
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.groundtruth import regrid
+from carlasc.groundtruth import FromCapture, regrid
 from carlasc.storage import FolderSource
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
@@ -42,15 +42,15 @@ BAD = {  # the file of frame 101, what is done to it, what the message says
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_a_bad_frame_is_named_the_others_are_made_and_a_mended_one_joins_them(tmp_path, bad):
+def test_a_bad_frame_is_named_the_others_are_made_and_a_fixed_one_is_added(tmp_path, bad):
     folder, spoil, message = BAD[bad]
     capture = write_capture(tmp_path)
-    regrid(tmp_path, tmp_path / "good", SMALL, workers=1)
+    regrid(tmp_path, SMALL, tmp_path / "good", workers=1)
     path = capture.raw / folder / "101.npy"
     sound = path.read_bytes()
     spoil(path)
 
-    result = regrid(tmp_path, tmp_path / "out", SMALL, workers=1)
+    result = regrid(tmp_path, SMALL, tmp_path / "out", workers=1)
     (failure,) = result.failures
     assert (result.made, result.skipped, failure.frame) == (2, 0, 101)
     assert failure.message.startswith(str(path)) and "\n" not in failure.message
@@ -61,7 +61,7 @@ def test_a_bad_frame_is_named_the_others_are_made_and_a_mended_one_joins_them(tm
     assert np.isfinite(sequence.read_pose(2)).all() and len(sequence.times) == 3
 
     path.write_bytes(sound)
-    again = regrid(tmp_path, tmp_path / "out", SMALL, workers=1)
+    again = regrid(tmp_path, SMALL, tmp_path / "out", workers=1)
     assert (again.made, again.skipped, again.failures) == (1, 2, ())
     assert read_tree(tmp_path / "out") == read_tree(tmp_path / "good")
 
@@ -70,30 +70,30 @@ def test_the_first_pose_is_the_origin_without_which_nothing_is_written(tmp_path)
     capture = write_capture(tmp_path)
     np.save(capture.raw / "pose0" / "100.npy", np.eye(4) * 3)
     with pytest.raises(
-        FormatError, match="pose0/100.npy: .*; the first frame's pose is the origin .*start with a later"
+        FormatError, match="pose0/100.npy: .*: the first frame's pose is the origin .*start with a later"
     ):
-        regrid(tmp_path, None, SMALL, workers=1)
+        regrid(tmp_path, SMALL, workers=1)
     assert not (tmp_path / "cartesian").exists()
-    assert regrid(tmp_path, None, SMALL, workers=1, frames=(101, None)).made == 2
+    assert regrid(tmp_path, SMALL, workers=1, frames=(101, None)).made == 2
 
 
 def test_no_capture_and_no_sensor_are_said(tmp_path):
     with pytest.raises(MissingDataError, match="expected a capture .* or sequences with scans .*, found neither"):
-        regrid(tmp_path, None, SMALL)
+        regrid(tmp_path, SMALL)
     with pytest.raises(MissingDataError, match="expected a capture .*, found none"):
-        regrid(tmp_path, None, SMALL, observations="capture")
+        regrid(tmp_path, SMALL, observe=FromCapture())
     (tmp_path / "raw").mkdir()
     with pytest.raises(MissingDataError, match="expected the ego sensor's folder velodyne0, found no sensor"):
-        regrid(tmp_path, None, SMALL)
+        regrid(tmp_path, SMALL)
     assert read_tree(tmp_path, leave_out="nothing") == {}
 
 
 def test_a_file_cut_short_in_the_output_fails_its_frame_alone(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, None, SMALL, workers=1)
+    regrid(tmp_path, SMALL, workers=1)
     (tmp_path / f"cartesian/{GRID}/000001.bin").unlink()
     _cut_short(tmp_path / "cartesian/velodyne/000001.bin")
-    (failure,) = regrid(tmp_path, None, SMALL, workers=1).failures
+    (failure,) = regrid(tmp_path, SMALL, workers=1).failures
     assert failure.frame == 101
     assert "velodyne/000001.bin: expected a multiple of 16 bytes" in failure.message
 
@@ -113,7 +113,7 @@ def test_a_full_disk_stops_the_run_in_one_line_and_leaves_whole_files(tmp_path, 
     assert "evaluation/00000" in line and "cannot be written: File too large" in line
     written = read_tree(tmp_path)
     assert not [name for name in written if ".part" in name or name.startswith("cartesian/evaluation/0")]
-    result = regrid(tmp_path, None, GridSpec.published(), workers=1)
+    result = regrid(tmp_path, GridSpec.published(), workers=1)
     assert result.made == 4  # with room again it goes on
     assert written.items() <= read_tree(tmp_path).items()
 

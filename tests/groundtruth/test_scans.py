@@ -17,8 +17,9 @@ from carlasc import GridSpec
 from carlasc.cli import app
 from carlasc.core.geometry import translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
+from carlasc.groundtruth import FromGrid, FromScans, Voting
+from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import PreparedScan
-from carlasc.groundtruth.from_scans.windows import Merging, ScanFeed
 from carlasc.storage import FolderSink, layout
 
 VEHICLE = 10
@@ -40,8 +41,8 @@ def grid_of(sequence, name, frame=FRAME):
 
 
 def make(sequence, name, frames=(FRAME, FRAME + 1), spec=passing.SPEC, **options):
-    merging = options.pop("merging", None) or Merging(**options.pop("settings", {}))
-    return carlasc.regrid(sequence, None, spec, name=name, frames=frames, merging=merging, workers=1, **options)
+    observe = FromScans(**options.pop("settings", {}))
+    return carlasc.regrid(sequence, spec, name=name, frames=frames, observe=observe, workers=1, **options)
 
 
 def vehicle_score(grid, truth):
@@ -114,7 +115,7 @@ def test_a_frame_does_not_depend_on_which_frames_a_run_makes(street):
 
 def test_processes_make_the_same_grids(street):
     make(street, "one", frames=(18, 22))
-    carlasc.regrid(street, None, passing.SPEC, name="two", frames=(18, 22), observations="scans", workers=2)
+    carlasc.regrid(street, passing.SPEC, name="two", frames=(18, 22), observe=FromScans(), workers=2)
     for frame in range(18, 22):
         assert (grid_of(street, "one", frame).labels == grid_of(street, "two", frame).labels).all()
 
@@ -140,7 +141,7 @@ def test_times_that_do_not_rise_are_named(tmp_path):
     times[22] = times[21]
     path.write_bytes(layout.encode_times(times))
     with pytest.raises(
-        FormatError, match=r"times.txt: expected times that rise, found 2.1 s and 2.1 s at frames 21 and 22"
+        FormatError, match=r"times.txt: expected increasing times, found 2.1 s and 2.1 s at frames 21 and 22"
     ):
         make(street, "broken")
     path.unlink()
@@ -154,7 +155,7 @@ def test_frames_keep_their_numbers_and_the_record_says_how(street):
         f"0000{n}.label" for n in (30, 31, 32)
     ]
     record = json.loads((street / "cartesian" / "numbered" / "params.json").read_text())["carlasc"]
-    assert (record["source"], record["dynamic"], record["window"], record["stride"]) == ("scans", "align", "-4:4", 2)
+    assert (record["observe"], record["dynamic"], record["window"], record["stride"]) == ("scans", "align", "-4:4", 2)
     assert record["motion"] == "flow"
     with pytest.raises(ConflictError, match="stride|window"):
         make(street, "numbered", frames=(30, 33))
@@ -162,7 +163,7 @@ def test_frames_keep_their_numbers_and_the_record_says_how(street):
 
 
 def test_votes_for_things_and_for_free_space_are_kept_apart(street):
-    make(street, "voted", keep_votes=True)
+    make(street, "voted", voting=Voting(keep=True))
     sequence = next(iter(carlasc.open(street).sequences().values()))
     votes = sequence.read("voted/votes", FRAME)
     grid = sequence.grid("voted", FRAME)
@@ -177,7 +178,7 @@ def test_votes_for_things_and_for_free_space_are_kept_apart(street):
 class TestWindows:
     def feed(self, street, **settings):
         sequence = next(iter(carlasc.open(street / "cartesian").sequences().values()))
-        return ScanFeed(sequence, Merging(**settings))
+        return ScanFeed(sequence, FromScans(**settings))
 
     def test_a_window_is_cut_at_the_ends_of_a_sequence(self, street):
         assert self.feed(street).window_of(5) == list(range(36))
@@ -218,9 +219,9 @@ class TestWindows:
             {"min_range_m": 5.0, "max_range_m": 2.0},
         ],
     )
-    def test_senseless_settings_are_refused(self, settings):
+    def test_settings_that_are_not_valid_are_refused(self, settings):
         with pytest.raises(ArgumentError):
-            Merging(**settings)
+            FromScans(**settings)
 
 
 def test_rays_through_a_box_are_those_a_plain_look_at_all_rays_finds():
@@ -246,14 +247,14 @@ def test_rays_through_a_box_are_those_a_plain_look_at_all_rays_finds():
 class TestBadInput:
     def test_no_poses_offer_kiss_icp(self, tmp_path):
         street = passing.write_sequence(tmp_path, frames=3, poses=False)
-        with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*--poses kiss-icp"):
+        with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=\"kiss-icp\""):
             make(street, "x", frames=None)
 
     def test_kiss_icp_can_find_them(self, tmp_path):
         pytest.importorskip("kiss_icp")
         folder = write_drive(tmp_path / "Street" / "cartesian", drive(8, speed_m=0.8))
         (folder / "poses.txt").unlink()
-        make(tmp_path, "x", frames=(2, 4), estimate_poses=True)
+        make(tmp_path, "x", frames=(2, 4), settings={"poses": "kiss-icp"})
         poses = layout.decode_poses((folder / "poses.txt").read_bytes(), "poses.txt")
         assert poses.shape == (8, 4, 4)
         assert poses[7, 0, 3] == pytest.approx(5.6, abs=0.3)
@@ -286,9 +287,9 @@ class TestBadInput:
         poses = layout.decode_poses(path.read_bytes(), "poses.txt")
         poses[4:, 0, 3] += 30
         path.write_bytes(layout.encode_poses(poses))
-        with pytest.raises(FormatError, match=r"poses.txt: .*jump of 301 m/s.* at frame 4 .*--force"):
+        with pytest.raises(FormatError, match=r"poses.txt: .*jump of 301 m/s.* at frame 4 .*`force=True`"):
             make(street, "x", frames=None)
-        assert make(street, "x", frames=None, force=True).made == 6
+        assert make(street, "x", frames=None, settings={"force": True}).made == 6
 
     def test_a_scan_cut_short_fails_its_frames_and_the_command_says_which(self, tmp_path):
         street = passing.write_sequence(tmp_path, frames=30)
@@ -299,33 +300,23 @@ class TestBadInput:
         assert result.exit_code == 1
         assert "000002.bin" in result.stderr
 
-    def test_options_for_scans_are_refused_elsewhere(self, golden_capture):
-        with pytest.raises(ArgumentError, match="are for scans"):
-            make(golden_capture, "x", observations="capture")
-        with pytest.raises(ArgumentError, match="observations: expected one of"):
-            carlasc.regrid(golden_capture, None, passing.SPEC, observations="dreams")
-
 
 class TestFromFinerGrids:
     def test_a_coarser_grid_of_the_finest_there_is(self, street):
         fine = replace(passing.SPEC, size=(256, 256, 16))
         make(street, "fine", frames=(20, 22), spec=fine)
-        result = carlasc.regrid(
-            street, None, passing.SPEC, name="coarse", observations="grid", from_grid="fine", workers=1
-        )
+        result = carlasc.regrid(street, passing.SPEC, name="coarse", observe=FromGrid("fine"), workers=1)
         assert result.made == 2
         coarse, finer = grid_of(street, "coarse", 20), grid_of(street, "fine", 20)
         assert coarse.counts.sum() == finer.counts.sum()
         record = json.loads((street / "cartesian" / "coarse" / "params.json").read_text())["carlasc"]
-        assert (record["source"], record["grid"]) == ("grid", "fine")
+        assert (record["observe"], record["grid"]) == ("grid", "fine")
 
     def test_finer_than_what_is_there_is_refused_with_the_reason(self, street):
         make(street, "base")
-        with pytest.raises(ArgumentError, match="never measured"):
-            carlasc.regrid(
-                street, None, GridSpec.published().with_resolution(0.1), observations="grid", from_grid="base"
-            )
+        with pytest.raises(ArgumentError, match="new measurements"):
+            carlasc.regrid(street, GridSpec.published().with_resolution(0.1), observe=FromGrid("base"))
 
     def test_a_grid_that_is_not_there_is_named(self, street):
         with pytest.raises(MissingDataError, match="the grid ghost"):
-            carlasc.regrid(street, None, passing.SPEC, observations="grid", from_grid="ghost")
+            carlasc.regrid(street, passing.SPEC, observe=FromGrid("ghost"))

@@ -100,7 +100,7 @@ def assert_as_plain(observations: list[Observation], spec: GridSpec, **options: 
 def test_every_vote_is_that_of_the_plain_version(spec: GridSpec, seed: int, vote: str, free_step_m: float) -> None:
     rng = np.random.default_rng(seed)
     observations = [random_observation(rng, spec) for _ in range(3)]
-    assert_as_plain(observations, spec, vote=vote, free_step_m=free_step_m)
+    assert_as_plain(observations, spec, rule=vote, free_step_m=free_step_m)
 
 
 @pytest.mark.parametrize("vote", ["sensor", "sample"])
@@ -109,7 +109,7 @@ def test_ids_over_255_are_counted_apart(vote: str) -> None:
     spec = SPECS["around the sensor"]
     observations = [random_observation(rng, spec, 260, 600) for _ in range(3)]
     assert max(int(o.labels.max()) for o in observations) > 256
-    assert_as_plain(observations, spec, classes=SEMANTICKITTI, vote=vote)
+    assert_as_plain(observations, spec, classes=SEMANTICKITTI, rule=vote)
     assert count_votes(observations, spec, SEMANTICKITTI).to_sparse()["label"].dtype == np.uint16
 
 
@@ -125,7 +125,7 @@ def test_a_step_of_centimetres_is_counted_as_any_other() -> None:
     observation = random_observation(rng, spec, count=40)
     keep = np.linalg.norm(observation.points, axis=1) < 30
     observation = Observation(observation.points[keep], observation.labels[keep], observation.grid_T_sensor)
-    assert_as_plain([observation], spec, free_step_m=0.013, vote="sample")
+    assert_as_plain([observation], spec, free_step_m=0.013, rule="sample")
 
 
 def test_points_far_beyond_any_lidar_still_follow_the_rule() -> None:
@@ -137,7 +137,7 @@ def test_points_far_beyond_any_lidar_still_follow_the_rule() -> None:
     distances = rng.integers(1, 300, 400) * step + rng.uniform(0, 25, 400)
     points = (directions * distances[:, None]).astype(np.float32)
     observation = Observation(points, np.full(400, 7, np.uint8), translation((1, 2, 0)))
-    assert_as_plain([observation], spec, free_step_m=step, vote="sample")
+    assert_as_plain([observation], spec, free_step_m=step, rule="sample")
     assert count_votes([observation], spec, free_step_m=step).free.sum() > 20
 
 
@@ -162,14 +162,14 @@ def test_points_labelled_zero_cast_no_vote_of_any_kind() -> None:
     assert len(count_votes([observation], GridSpec.published()).to_sparse()) == 0
 
 
-def test_numbers_that_are_no_points_cast_no_vote() -> None:
+def test_points_that_are_not_finite_cast_no_vote() -> None:
     bad = np.array(
         [[np.nan, 1, 1], [1, np.inf, 1], [np.inf, 1, 1], [1e30, 1, 1], [1e-30, 0, 0], [1, np.nan, 2]], np.float32
     )
     observation = Observation(bad, np.full(len(bad), 7, np.uint8), np.eye(4))
     for name in ("cartesian", "cylindrical"):
         for vote in ("sensor", "sample"):
-            assert len(count_votes([observation], GridSpec.published(name), vote=vote).to_sparse()) == 0
+            assert len(count_votes([observation], GridSpec.published(name), rule=vote).to_sparse()) == 0
 
 
 def test_azimuths_of_the_fast_path_are_within_its_error() -> None:

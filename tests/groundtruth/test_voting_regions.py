@@ -16,8 +16,8 @@ def observation(seed=0, count=500, **options):
     return Observation(points.astype(np.float32), labels, np.eye(4), **options)
 
 
-def tally(observations, vote="sensor", regions=None):
-    ballot = Ballot(SPEC, vote=vote, free_step_m=0.7, regions=regions)
+def tally(observations, rule="sensor", regions=None):
+    ballot = Ballot(SPEC, rule=rule, free_step_m=0.7, regions=regions)
     for one in observations:
         ballot.add(one)
     return ballot.votes()
@@ -74,6 +74,6 @@ def test_regions_that_do_not_fit_are_refused():
     with pytest.raises(ArgumentError, match="regions: expected"):
         Ballot(SPEC, regions=np.zeros(3, np.uint16))
     with pytest.raises(ArgumentError, match="regions: expected"):
-        Ballot(SPEC, vote="sample", regions=np.zeros(SPEC.num_voxels, np.uint16))
-    with pytest.raises(ArgumentError, match="expected a ballot with regions"):
+        Ballot(SPEC, rule="sample", regions=np.zeros(SPEC.num_voxels, np.uint16))
+    with pytest.raises(ArgumentError, match="observation: expected no region, as the ballot has none"):
         count_votes([observation(free_region=0)], SPEC)

@@ -20,13 +20,13 @@ POINTS, LABELS, POSE = np.ones((4, 3), np.float32), np.full(4, 7, np.uint8), np.
 
 @pytest.mark.parametrize("free_step_m", [0.0, -1.5, float("nan"), float("inf")])
 def test_a_free_step_that_is_no_positive_number_is_refused(free_step_m: float) -> None:
-    with pytest.raises(ArgumentError, match="free step: expected a positive number"):
+    with pytest.raises(ArgumentError, match="free_step_m: expected a positive number"):
         count_votes([], GridSpec.published(), free_step_m=free_step_m)
 
 
-def test_an_unknown_vote_rule_is_refused() -> None:
+def test_an_unknown_rule_is_refused() -> None:
     with pytest.raises(ArgumentError, match="expected sensor, sample or point, found 'ray'"):
-        count_votes([], GridSpec.published(), vote="ray")  # type: ignore[arg-type]
+        count_votes([], GridSpec.published(), rule="ray")  # type: ignore[arg-type]
 
 
 def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:
@@ -40,7 +40,7 @@ def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:
 @pytest.mark.parametrize(
     ("points", "labels", "pose", "match"),
     [
-        (POINTS, LABELS[:3], POSE, r"expected shape \(4,\), one a point, found \(3,\)"),
+        (POINTS, LABELS[:3], POSE, r"expected shape \(4,\), one per point, found \(3,\)"),
         (POINTS[:, :2], LABELS, POSE, r"expected shape \(N, 3\) float32, found \(4, 2\)"),
         (POINTS.astype(np.float64), LABELS, POSE, r"float32, found \(4, 3\) float64"),
         (POINTS, LABELS.astype(np.int64), POSE, "expected unsigned integers, found int64"),

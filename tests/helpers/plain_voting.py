@@ -16,7 +16,7 @@ def plain_votes(
     spec: GridSpec,
     num_channels: int = 25,
     *,
-    vote: str = "sensor",
+    rule: str = "sensor",
     free_step_m: float = 1.5,
 ) -> NDArray[np.int64]:
     """Return the votes, (V, num_channels) int64, free votes in channel 0."""
@@ -25,7 +25,7 @@ def plain_votes(
         seen = np.zeros(len(votes), np.bool_)
         for voxels, labels in plain_samples(observation, spec, free_step_m):
             keys = (voxels * num_channels + labels)[voxels >= 0]
-            if vote == "sensor":
+            if rule == "sensor":
                 seen[keys] = True
             else:
                 np.add.at(votes, keys, 1)

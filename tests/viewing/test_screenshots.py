@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town") / "Train" / "Demo_Heavy"
     simulate(folder, frames=2, sensors=6, traffic="heavy", points=60_000, bev=False, workers=1)
-    regrid(folder, None, GridSpec.published(), workers=1)
+    regrid(folder, GridSpec.published(), workers=1)
     return folder / "cartesian"
 
 

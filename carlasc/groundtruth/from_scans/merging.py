@@ -1,15 +1,14 @@
-"""Ground truth from the scans of one sensor, merged over time, without traces of what moves.
+"""Merging the scans of one sensor over time, without traces of moving actors.
 
-Plain voting erases movers: free rays of other times outvote them. So the static world and each actor vote apart. An actor is a little
-world of its own: points and rays of every scan, carried by the actor's motion to the frame's time, vote inside its box. The
-static world's free space is none there.
+Plain voting would remove moving actors: the free space that other scans saw in their voxels has more votes. So the static scene and each
+actor are voted on separately. In the box of an actor, the points and rays of every scan vote after the actor's motion has moved them to the
+time of the frame. Free space that other scans saw of the static scene does not count there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,28 +16,26 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
+from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.observations import Observation
 from carlasc.motion import Track
 
-Dynamic = Literal["align", "current", "drop", "tube"]
-DYNAMICS: tuple[Dynamic, ...] = ("align", "current", "drop", "tube")
-
 STATIC = 0  # region of the voxels that belong to no actor
-_DEFORMABLE_WINDOW = 8  # frames for which the shape of a walking person holds
+_DEFORMABLE_WINDOW = 8  # a person's shape is used for this many frames before and after
 
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """A scan as merging needs it: decoded once, used for every frame whose window it is in.
+    """A scan that is ready for merging: decoded once, and used for every frame whose window contains it.
 
     Attributes:
         frame: frame number.
         points: (N, 3) float32, metres, sensor frame.
         labels: (N,) uint16; 0 casts no vote.
         world_T_sensor: (4, 4).
-        reach_m: distance of the farthest point.
-        order: (N,) int32, points by rising azimuth.
-        azimuth: (N,) float32 radians, in that order.
+        reach_m: distance of the farthest point, metres.
+        order: (N,) int32, indices of the points by increasing azimuth.
+        azimuth: (N,) float32, radians, in this order.
     """
 
     frame: int
@@ -53,7 +50,7 @@ class PreparedScan:
     def of(
         cls, frame: int, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger], world_T_sensor: Transform
     ) -> PreparedScan:
-        """Prepare the points of a scan that may vote."""
+        """Prepare the voting points of a scan."""
         azimuth = np.arctan2(points[:, 1], points[:, 0])
         order = np.argsort(azimuth, kind="stable").astype(np.int32)
         reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
@@ -62,10 +59,10 @@ class PreparedScan:
     def rays_through(
         self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.int32]:
-        """Return the indices of the points whose rays, from the sensor to the point, meet a box.
+        """Return the indices of the points whose rays, from the sensor to the point, intersect a box.
 
         Args:
-            box_T_sensor: (4, 4), from the sensor's frame to the one in which the box is upright.
+            box_T_sensor: (4, 4), from the sensor's frame to the frame in which the box is axis-aligned.
             lower: (3,) lower corner.
             upper: (3,) upper corner.
         """
@@ -74,7 +71,7 @@ class PreparedScan:
         rays = transform_points(box_T_sensor, self.points[candidates]) - origin
         with np.errstate(divide="ignore", invalid="ignore"):
             one, other = (lower - origin) / rays, (upper - origin) / rays
-        # A ray along an axis gives 0/0 on a face: fmin and fmax take the other bound.
+        # A ray that lies in a face gives 0/0 there: fmin and fmax ignore the NaN.
         enter = np.fmin(one, other).max(axis=1)
         leave = np.fmax(one, other).min(axis=1)
         return candidates[(enter <= leave) & (leave >= 0) & (enter <= 1)]
@@ -82,16 +79,16 @@ class PreparedScan:
     def _in_view_of(
         self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.int32]:
-        """Return the points in the range of azimuth that a box takes up."""
+        """Return the indices of the points in the range of azimuths that a box covers."""
         origin = box_T_sensor[:3, 3]
-        if ((origin > lower) & (origin < upper))[:2].all():  # the sensor is above, below or inside
+        if ((origin > lower) & (origin < upper))[:2].all():  # the sensor is above, below or inside the box
             return self.order
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
         seen = transform_points(invert(box_T_sensor), corners)
         angles = np.arctan2(seen[:, 1], seen[:, 0])
         middle = np.arctan2(np.sin(angles).sum(), np.cos(angles).sum())
         half = np.abs((angles - middle + np.pi) % (2 * np.pi) - np.pi).max() + 1e-6
-        if half > np.pi / 2:  # so near that its corners are all around
+        if half > np.pi / 2:  # the corners surround the sensor
             return self.order
         first, last = np.searchsorted(self.azimuth, [middle - half, middle + half])
         parts = [self.order[first:last]]
@@ -107,10 +104,10 @@ class Merger:
 
     Args:
         scans: prepared scans by frame.
-        tracks: how actors move; those that stand all the time are part of the static world.
-        moving: of each scan, (M,) indices of the points that move, whether a track has them or not.
-        classes: table of the labels.
-        dynamic: what becomes of moving points.
+        tracks: the actors' motion; actors that never move are part of the static scene.
+        moving: (M,) indices of the moving points of each scan, on a track or not.
+        classes: class table of the labels.
+        dynamic: what happens to moving points.
     """
 
     def __init__(
@@ -127,9 +124,9 @@ class Merger:
         self._carried: dict[tuple[int, int], Observation | None] = {}
 
     def regions(self, frame: int, spec: GridSpec) -> NDArray[np.uint16]:
-        """Return (V,) uint16: the number of the actor whose box holds each voxel at a frame, STATIC elsewhere.
+        """Return (V,) uint16: the number of the actor whose box contains each voxel at a frame, STATIC elsewhere.
 
-        A box has the voxels that it touches: a share of an actor's surface is enough. Where boxes meet, the smaller wins.
+        A box contains all voxels that it touches. Where boxes overlap, the smaller one takes precedence.
         """
         regions = np.zeros(spec.num_voxels, np.uint16)
         if self.dynamic != "align":
@@ -156,10 +153,10 @@ class Merger:
         return regions
 
     def observations(self, frame: int, window: Iterable[int], regions: NDArray[np.uint16]) -> Iterator[Observation]:
-        """Yield what votes on a frame's grid: each scan for the static world, then each actor's scans for its box.
+        """Yield the observations of a frame's grid: each scan of the static scene, then each actor's scans in its box.
 
-        Static surfaces vote everywhere, for an actor does not remove the road it stands on; but free space that was seen at other
-        times is none inside an actor's box. The frame's own rays always count.
+        Static surfaces vote everywhere, so the road below an actor is kept. Free space that was seen at other times does not count
+        inside an actor's box. The frame's own rays always count.
         """
         window = list(window)
         grid_T_world = invert(self.scans[frame].world_T_sensor)
@@ -185,7 +182,7 @@ class Merger:
                     )
 
     def static(self, frame: int) -> NDArray[np.bool_]:
-        """Return (N,) bool: which points of a scan are of nothing that moves."""
+        """Return (N,) bool: the points of a scan that do not belong to anything that moves."""
         if frame not in self._hits:
             hits = np.ones(len(self.scans[frame].points), np.bool_)
             hits[self.moving.get(frame, [])] = False
@@ -196,7 +193,7 @@ class Merger:
         return self._hits[frame]
 
     def _carry(self, index: int, frame: int) -> Observation | None:
-        """Return a scan's rays through an actor's box, in the actor's frame; None where there are none."""
+        """Return a scan's rays through an actor's box, in the actor's frame; None if there are none."""
         key = (index, frame)
         if key not in self._carried:
             self._carried[key] = self._cut(self.tracks[index], frame)
@@ -218,7 +215,7 @@ class Merger:
 
 
 def _half_cells(spec: GridSpec, columns: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
-    """Return half the greatest width of the cells of each column (C, 2), and half their height: metres."""
+    """Return half the greatest width of the cells of each column, (C,), and half their height, in metres."""
     size = spec.voxel_size
     if spec.coordinates == "cartesian":
         return np.full(len(columns), max(size[0], size[1]) / 2), float(size[2] / 2)

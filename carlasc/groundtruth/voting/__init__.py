@@ -1,4 +1,4 @@
-"""From observations to votes, and from votes to a grid."""
+"""Voting: observations are turned into votes, and votes into a grid."""
 
 from carlasc.groundtruth.voting.ballot import Ballot, VoteRule, Votes, count_votes
 from carlasc.groundtruth.voting.observations import Observation

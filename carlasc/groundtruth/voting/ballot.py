@@ -1,7 +1,8 @@
-"""Votes of observations on the voxels of a grid, and what the votes decide.
+"""Votes of observations on the voxels of a grid, and the grid that the votes decide.
 
-Every labelled point votes for its class in its voxel, and free samples on its ray vote for free (class 0) in theirs. A voxel takes the
-class with most votes, ties go to the lowest id, and a voxel without any vote is unknown (FORMAT section 4).
+Every labelled point votes for its class in its voxel, and free samples on its ray vote for free space (class 0) in their voxels. A voxel
+takes the class with most votes, ties go to the lowest id, and a voxel without votes is unknown: see the format page,
+`docs/format.md#votes`.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,43 +32,55 @@ def count_votes(
     spec: GridSpec,
     classes: ClassTable = CARLA,
     *,
-    vote: VoteRule = "sensor",
+    rule: VoteRule = "sensor",
     free_step_m: float = 1.5,
 ) -> Votes:
-    """Count the votes of observations, one at a time: memory does not grow with their number.
+    """Count the votes of observations. They are taken one at a time: memory does not grow with their number.
 
     Args:
         observations: the voters, all in one grid frame.
-        spec: the grid.
-        classes: table of the labels.
-        vote: "sensor": at most one vote an observation, voxel and class (the published files); "sample": every sample counts; "point":
-            every point counts, free space at most once an observation and voxel.
-        free_step_m: distance between the free samples of a ray, metres.
+        spec: geometry of the grid.
+        classes: class table of the labels.
+        rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample": every sample counts;
+            "point": every point counts, free space at most once per observation and voxel.
+        free_step_m: distance between two free samples on a ray, in metres.
 
     Raises:
-        ArgumentError: an unknown vote rule, or a step that is not a positive number.
+        ArgumentError: an unknown rule, or a distance that is not positive.
         FormatError: a label is not below `classes.num_channels`.
     """
-    ballot = Ballot(spec, classes, vote=vote, free_step_m=free_step_m)
+    ballot = Ballot(spec, classes, rule=rule, free_step_m=free_step_m)
     for observation in observations:
         ballot.add(observation)
     return ballot.votes()
 
 
+def check_rule(rule: str, free_step_m: float) -> None:
+    """Check how votes are to be counted.
+
+    Raises:
+        ArgumentError: an unknown rule, or a distance that is not positive.
+    """
+    if rule not in get_args(VoteRule):
+        raise ArgumentError("rule", expected="sensor, sample or point", found=repr(rule))
+    if not (math.isfinite(free_step_m) and free_step_m > 0):
+        raise ArgumentError("free_step_m", expected="a positive number of metres", found=str(free_step_m))
+
+
 class Ballot:
-    """Votes as they come in: `add` observations one by one, read the `votes` at any time.
+    """Counts votes: `add` takes one observation after the other, and `votes` can be read at any time.
 
     A ballot is used by one thread at a time; different ballots are independent, and `add` releases the GIL.
 
     Args:
-        spec: the grid.
-        classes: table of the labels.
-        vote: "sensor", "sample" or "point", as in `count_votes`.
-        free_step_m: distance between the free samples of a ray, metres.
-        regions: (V,) uint16 region of each voxel, for observations that vote in one of them; not with "sample".
+        spec: geometry of the grid.
+        classes: class table of the labels.
+        rule: "sensor", "sample" or "point", as in `count_votes`.
+        free_step_m: distance between two free samples on a ray, in metres.
+        regions: (V,) uint16, region of each voxel, for observations that vote in one region only; not with "sample".
 
     Raises:
-        ArgumentError: an unknown vote rule, or a step that is not a positive number, or regions that do not fit.
+        ArgumentError: an unknown rule, a distance that is not positive, or regions that do not fit.
     """
 
     def __init__(
@@ -75,27 +88,24 @@ class Ballot:
         spec: GridSpec,
         classes: ClassTable = CARLA,
         *,
-        vote: VoteRule = "sensor",
+        rule: VoteRule = "sensor",
         free_step_m: float = 1.5,
         regions: NDArray[np.uint16] | None = None,
     ) -> None:
         from carlasc.core.cells import Cells
         from carlasc.groundtruth.voting import kernel
 
-        if vote not in ("sensor", "sample", "point"):
-            raise ArgumentError("vote rule", expected="sensor, sample or point", found=f"{vote!r}")
-        if regions is not None and (regions.shape != (spec.num_voxels,) or vote == "sample"):
-            raise ArgumentError(
-                "regions", expected=f"({spec.num_voxels},) of them and no sample votes", found=f"{regions.shape}"
-            )
-        if not (math.isfinite(free_step_m) and free_step_m > 0):
-            raise ArgumentError("free step", expected="a positive number of metres", found=f"{free_step_m}")
-        self.spec, self.classes, self.vote, self.free_step_m = spec, classes, vote, float(free_step_m)
+        check_rule(rule, free_step_m)
+        if regions is not None and regions.shape != (spec.num_voxels,):
+            raise ArgumentError("regions", expected=f"shape ({spec.num_voxels},)", found=str(regions.shape))
+        if regions is not None and rule == "sample":
+            raise ArgumentError("regions", expected='None with the rule "sample"', found="an array")
+        self.spec, self.classes, self.rule, self.free_step_m = spec, classes, rule, float(free_step_m)
         self.num_observations = 0
-        free_once = vote != "sample"
+        free_once = rule != "sample"
         self._cells = Cells.of(spec)
         self._tally = kernel.Tally(
-            vote == "sensor",
+            rule == "sensor",
             free_once,
             free=np.zeros(spec.num_voxels + 1, np.uint32 if free_once else np.int64),
             passed=np.zeros(spec.num_voxels + 1 if free_once else 0, np.uint8),
@@ -121,7 +131,9 @@ class Ballot:
             for region in (observation.hit_region, observation.free_region)
         )
         if not len(self._tally.regions) and (hit_region, free_region) != (kernel.ANYWHERE, kernel.ANYWHERE):
-            raise ArgumentError("observation: expected a ballot with regions for one that votes in a region")
+            raise ArgumentError(
+                "observation", expected="no region, as the ballot has none", found="one that votes in a region"
+            )
         labels = np.require(observation.labels, np.uint16, ["C", "A", "W"])
         self._make_room(len(observation))
         pose = as_pose(observation.grid_T_sensor)
@@ -141,7 +153,7 @@ class Ballot:
         self.num_observations += 1
 
     def votes(self) -> Votes:
-        """Return the votes so far; later observations do not change them."""
+        """Return the votes so far, as a copy that later observations do not change."""
         candidates = self._tally.candidates[: self._tally.used[0]]
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         for name in OCCUPIED_DTYPE.names or ():
@@ -149,7 +161,7 @@ class Ballot:
         return Votes(self.spec, self.classes, self._tally.free[:-1].reshape(self.spec.size).copy(), occupied)
 
     def _make_room(self, points: int) -> None:
-        """Let the candidates grow by as many as there are points: at worst each is the first of its kind."""
+        """Make room for one more candidate per point, the most that an observation can add."""
         used, candidates = int(self._tally.used[0]), self._tally.candidates
         if used + points > len(candidates):
             grown = np.empty(2 * (used + points), candidates.dtype)
@@ -159,14 +171,14 @@ class Ballot:
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """The votes of each voxel by class, free ones apart from occupied ones.
+    """The votes of each voxel by class, with those for free space in an array of their own.
 
     Attributes:
         spec: the grid.
-        classes: table of the labels.
+        classes: class table of the labels.
         free: (X, Y, Z) unsigned integer, votes for free space.
-        occupied: (M,) structured `voxel` (int32 flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0); one row
-            a voxel and class, in no order.
+        occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0); one row
+            per voxel and class, in no particular order.
     """
 
     spec: GridSpec
@@ -175,24 +187,25 @@ class Votes:
     occupied: NDArray[Any]
 
     def to_grid(self, free_weight: NDArray[np.floating] | None = None) -> Grid:
-        """Elect a class for each voxel, and sum its votes.
+        """Return the grid: the class that the votes decide for each voxel, and the sum of its votes.
 
         Args:
-            free_weight: (K,) by class: how many votes for things one vote for free space outweighs. A voxel is occupied, by the class
-                with most votes, where its votes for things are more than that. None: free is a class among others, the class with
-                most votes wins, ties go to the lowest id (FORMAT section 4).
+            free_weight: (K,) by class: the number of occupied votes that one vote for free space outweighs. A voxel takes the class
+                with most occupied votes if all its occupied votes together are more than this number times its free votes, and
+                class 0 otherwise. None: free space is a class like the others; the class with most votes wins, and ties go to the
+                lowest id.
         """
         free = self.free.reshape(-1)
         if free_weight is None:
             labels, counts = self._elect(free)
         else:
-            labels, things = self._elect(np.zeros_like(free))
-            labels[things <= free_weight[labels] * free] = 0
-            counts = things + free
+            labels, occupied = self._elect(np.zeros_like(free))
+            labels[occupied <= free_weight[labels] * free] = 0
+            counts = occupied + free
         return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
 
     def _elect(self, free: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return (V,) the class with most votes, ties to the lowest id, and the sum of the votes, `free` being those of class 0."""
+        """Return (V,) the class with most votes, ties to the lowest id, and (V,) the sum of the votes; `free` are those of class 0."""
         from carlasc.groundtruth.voting import kernel
 
         labels, best, counts = np.empty(len(free), self.classes.dtype), np.empty_like(free), np.empty_like(free)
@@ -200,17 +213,17 @@ class Votes:
         return labels, counts
 
     def occupied_counts(self) -> NDArray[np.int64]:
-        """Return (X, Y, Z) int64: votes for any class but free."""
+        """Return (X, Y, Z) int64: votes for all classes except free space."""
         counts = np.bincount(self.occupied["voxel"], self.occupied["votes"], self.spec.num_voxels)
         return counts.astype(np.int64).reshape(self.spec.size)
 
     def to_sparse(self) -> NDArray[Any]:
-        """Return the votes as the layout stores them: only non-zero ones, sorted by voxel, then label; free is label 0.
+        """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by label; free space is label 0.
 
-        Votes beyond 65535, the most that the layout holds, are kept as 65535.
+        More than 65535 votes, the maximum of the layout, are stored as 65535.
 
         Returns:
-            (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` where class ids do not fit 8 bits.
+            (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
         """
         free = np.flatnonzero(self.free)
         columns = {

@@ -1,7 +1,8 @@
-"""The hot loop of the ground truth: the votes of one observation, and what all votes of a voxel decide.
+"""The compiled loops of the voting: they add the votes of one observation, and find the class that the votes of a voxel decide.
 
-Blocks of rays are clipped to the grid and their samples placed by the vectorised code of rays.py; whatever that is not sure of is
-placed by rule.py. Free votes are kept densely, occupied ones as chains of candidates, a few for each voxel that was hit.
+Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the voxels of their samples; where rounding
+could change the voxel, rule.py finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
+per voxel.
 """
 
 from __future__ import annotations
@@ -32,29 +33,29 @@ from carlasc.groundtruth.voting.rays import (
 )
 from carlasc.groundtruth.voting.rule import sample_voxel, unit_ray
 
-BLOCK = 256  # rays: their coordinates stay in the first cache
-NONE = -1  # end of a voxel's chain of candidates
-ANYWHERE = -1  # votes that count in all regions
+BLOCK = 256  # number of rays whose coordinates fit into the L1 cache
+NONE = -1  # end of a voxel's list of candidates
+ANYWHERE = -1  # region of votes that count in all regions
 
 CANDIDATE_DTYPE = np.dtype(
     [("votes", np.int64), ("voxel", np.int32), ("next", np.int32), ("voter", np.int32), ("label", np.uint16)],
     align=True,
 )
-"""A class that a voxel may have: its votes, who voted last, and the voxel's next candidate."""
+"""A class that a voxel may have: its votes, the observation that voted for it last, and the voxel's next candidate."""
 
 
 class Tally(NamedTuple):
     """The votes of V voxels.
 
     Attributes:
-        once: whether an observation has at most one vote a voxel and class.
-        free_once: whether it has at most one vote a voxel for free space.
-        free: (V + 1,) votes for free space; the last one takes samples outside.
-        passed: (V + 1,) uint8, voxels that the current observation saw free; all zero between observations. Only if `free_once`.
-        heads: (V,) int32, first candidate of each voxel, or NONE.
-        candidates: CANDIDATE_DTYPE, those of all voxels.
-        used: (1,) int64, how many of them are in use.
-        regions: (V,) uint16, region of each voxel; empty if there is only one.
+        once: whether an observation has at most one vote per voxel and class.
+        free_once: whether an observation has at most one vote per voxel for free space.
+        free: (V + 1,) votes for free space; the last element counts samples outside the grid.
+        passed: (V + 1,) uint8, 1 for voxels that the current observation saw free; all 0 between observations. Only with `free_once`.
+        heads: (V,) int32, index of the first candidate of each voxel, or NONE.
+        candidates: (C,) CANDIDATE_DTYPE, the candidates of all voxels.
+        used: (1,) int64, number of candidates in use.
+        regions: (V,) uint16, region of each voxel; empty if the grid has no regions.
     """
 
     once: bool
@@ -79,7 +80,7 @@ def vote_occupied(
     region: int,
     tally: Tally,
 ) -> None:
-    """Let the points of a block vote for their classes, in voxels of a region; those labelled 0 only let their rays vote."""
+    """Add the votes of a block's points for their classes, in the voxels of a region. Points labelled 0 have none."""
     for i in range(len(labels)):
         if rays.state[i] == DROPPED or labels[i] == 0:
             continue
@@ -92,7 +93,7 @@ def vote_occupied(
 
 @inlined
 def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
-    """Give a voxel a vote for a class."""
+    """Add a vote for a class to a voxel."""
     candidates = tally.candidates
     entry = tally.heads[voxel]
     while entry != NONE and candidates[entry].label != label:
@@ -122,7 +123,7 @@ def vote_free(
     free_step_m: float,
     tally: Tally,
 ) -> None:
-    """Let the samples before the points of a block vote for free space."""
+    """Add the votes of a block's free samples, which lie between the sensor and the points."""
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
         if rays.state[i] == UNSURE:
@@ -134,7 +135,7 @@ def vote_free(
         x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
         step, last = rays.first[i], rays.last[i]
         while step <= last:
-            # These loops stand here and not in a function: passing it an array would count a reference, every time.
+            # These loops are not in a function of their own: Numba would count a reference to the array at every call.
             lowest = np.int32(0)
             if view.cylindrical:
                 for j in range(CHUNK):
@@ -165,18 +166,18 @@ def vote_free(
 def vote_free_by_rule(
     x: np.float32, y: np.float32, z: np.float32, pose: Pose, view: View, cells: Cells, free_step_m: float, tally: Tally
 ) -> None:
-    """Let the samples of one ray vote for free space by the rule alone, clipped with a wide margin."""
+    """Add the votes of one ray's free samples by rule.py alone, clipped to the grid with a wide margin."""
     norm, ux, uy, uz = unit_ray(x, y, z)
     starts = transform(view.pose, x, y, z)
     units = transform(view.pose, ux, uy, uz)
-    # Rounding adds less than this, in cells or metres: it grows as the distance, and is below the margin within reach.
+    # Bound on the rounding error, in cells or metres. It grows with the distance and is below MARGIN within `reach`.
     slack = 1.0 + MARGIN * norm / view.reach if view.reach > 0.0 else math.inf
     step, last = 1.0, math.inf
     for axis in range(3):
         stride = (units[axis] - view.pose[4 * axis + 3]) * free_step_m
         step, last = narrow(step, last, starts[axis], stride, view.low[axis] - slack, view.high[axis] + slack)
     step = np.floor(step)
-    kept = step < 2.0**52  # beyond that one step more is no other number
+    kept = step < 2.0**52  # above it, step + 1 may be equal to step
     while kept and step <= last + 1.0:
         kept, voxel = sample_voxel(x, y, z, step, free_step_m, pose, cells)
         if tally.free_once:
@@ -190,14 +191,14 @@ def vote_free_by_rule(
 def elect(
     free: NDArray[Any], candidates: NDArray[Any], labels: NDArray[Any], best: NDArray[Any], counts: NDArray[Any]
 ) -> None:
-    """Find the class with most votes of each voxel, ties to the lowest id, and the sum of all votes.
+    """Find the class with most votes of each voxel, where ties go to the lowest id, and the sum of its votes.
 
     Args:
         free: (V,) votes of class 0.
-        candidates: `voxel`, `label`, `votes` of the other classes, in any order.
-        labels: (V,) output.
-        best: (V,) scratch.
-        counts: (V,) output.
+        candidates: (M,) `voxel`, `label`, `votes` of the other classes, in any order.
+        labels: (V,) output, the classes.
+        best: (V,) working memory.
+        counts: (V,) output, the sums.
     """
     for v in range(len(free)):
         labels[v] = 0
@@ -212,7 +213,7 @@ def elect(
 
 
 def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
-    """Return the function below. Closing over `sources` makes Numba's cache, which knows only this file, notice the others too."""
+    """Return the function below. Its closure over `sources` invalidates Numba's cache, which knows only this file, when others change."""
 
     @cached
     def vote(
@@ -231,13 +232,13 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
         """Add the votes of one observation.
 
         Args:
-            points: (3 N,) float32 x, y, z of each point, sensor frame.
-            labels: (N,) uint16; 0 takes no part.
-            hit_labels: (N,) uint16, what the points themselves vote for; 0 leaves them their rays alone.
+            points: (3 N,) float32, metres, x, y, z of each point in the sensor's frame.
+            labels: (N,) uint16; points labelled 0 and their rays do not vote.
+            hit_labels: (N,) uint16, the classes that the points vote for; 0 where only the ray votes.
             pose: grid_T_sensor.
-            view: the grid from there.
-            cells: the grid.
-            free_step_m: distance between free samples.
+            view: the grid as seen from the sensor.
+            cells: the cells of the grid.
+            free_step_m: distance between two free samples, metres.
             voter: number of the observation.
             hit_region: region in which points vote, or ANYWHERE.
             free_region: region in which rays vote, or ANYWHERE.

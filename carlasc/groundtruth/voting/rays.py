@@ -1,9 +1,9 @@
-"""The same samples as rule.py's, many at a time: vectorised, and sure of every answer that it gives.
+"""The fast twin of rule.py: it finds the voxels of many samples at once, in vectorised code, and never another voxel than rule.py.
 
-Rays are clipped to the grid's box, and samples placed in working coordinates: cells (of a cylindrical grid: metres across, cells upwards)
-counted from the grid's lower corner. There a sample is `start - step * stride`, off from the rule's by rounding alone, far less than
-`MARGIN` cells. So one that is farther than that from the edges of its cell is in the rule's voxel, and the few others (some in a million)
-are DOUBTFUL: the rule itself places them.
+Rays are clipped to the grid's box. Samples are computed in working coordinates: cells, counted from the grid's lower corner (for a
+cylindrical grid: metres in x and y, cells in z). There a sample is `start - step * stride`, which differs from rule.py's only by rounding, by
+far less than `MARGIN` cells. So a sample that is farther than this from the edges of its cell is in the same voxel as by rule.py. The few
+others, some in a million, are DOUBTFUL, and rule.py finds their voxels.
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ from carlasc.core.cells import (
 )
 from carlasc.groundtruth.voting.rule import before_sensor, unit_ray
 
-DOUBTFUL = -1  # index of a sample too near a cell's edge to be sure of
+DOUBTFUL = -1  # index of a sample that is too near an edge of its cell
 
-# What `clip` says of a ray:
+# The states of a ray:
 SURE = 0.0
-DROPPED = 1.0  # it takes no part
-UNSURE = 2.0  # its samples must be counted by the rule: they are too far away, or one lies on the sensor
+DROPPED = 1.0  # it does not vote
+UNSURE = 2.0  # rule.py must find its samples: they are too far away, or one is at the sensor
 
-CHUNK = 8  # samples of a ray placed at once: the width of a vector
+CHUNK = 8  # number of samples of a ray that are processed at once: the width of a vector register
 MARGIN = 1e-7  # cells
-_ROUNDING = 2.0**-48  # bound on the relative error of a coordinate: 16 times what its dozen operations can do
-_NEAR_AXIS = 256.0  # azimuths are trusted to the margin this many times nearer to the axis than a cell is deep
+_ROUNDING = 2.0**-48  # bound on the relative error of a coordinate: 16 times the error of its dozen operations
+_NEAR_AXIS = 256.0  # azimuths are exact to the margin down to 1 / 256 of the radius at which cells are as wide as deep
 
 
 class View(NamedTuple):
-    """The grid as one sensor's rays meet it, in working coordinates.
+    """The grid as seen from one sensor, in working coordinates.
 
     Attributes:
-        cylindrical: whether radius and azimuth are to be found.
+        cylindrical: whether the grid is cylindrical.
         pose: work_T_sensor: a scaled grid_T_sensor.
-        low: lower corner of the box that rays are clipped to, a margin outside the grid.
+        low: lower corner of the box that rays are clipped to, which is the grid enlarged by a margin.
         high: its upper corner.
-        top: number of cells an axis.
-        scale: cells a working unit, for radius and azimuth.
-        offset: cells of radius and azimuth from zero to the lower bound.
-        turn: cells of azimuth in a whole turn.
-        axis: nearest to the axis of a cylinder that an azimuth can be trusted, metres.
-        sure: greatest distance from a cell's middle, in cells, at which a sample is surely inside.
-        reach: farthest point, metres, that these errors hold for.
+        top: number of cells per axis.
+        scale: cells per metre of radius, and per radian of azimuth.
+        offset: cells from zero to the lower bound, of radius and azimuth.
+        turn: cells of azimuth in a full circle.
+        axis: smallest radius at which azimuths are exact to the margin, metres.
+        sure: greatest distance from the middle of a cell, in cells, at which a sample is certainly inside.
+        reach: distance of the farthest point for which these errors hold, metres.
     """
 
     cylindrical: bool
@@ -75,7 +75,7 @@ class View(NamedTuple):
         """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
         size, lower, upper = (np.array(v, np.float64) for v in (cells.size, cells.lower, cells.upper))
         voxel = np.array(cells.voxel_size)
-        # The published size of a cell is a float32 difference over n, so n cells may end a little off the upper bound.
+        # The published size of a cell is a float32 difference divided by n, so n cells may not end exactly at the upper bound.
         ends = (upper - lower) / voxel
         margin = MARGIN + np.abs(ends - size).max() + (AZIMUTH_ERROR / voxel[1] if cells.cylindrical else 0.0)
         low, high = np.full(3, -MARGIN / 2), np.maximum(ends, size) + MARGIN / 2
@@ -86,7 +86,7 @@ class View(NamedTuple):
         matrix = np.array(pose).reshape(3, 4).copy()
         matrix[:, 3] -= origin
         matrix *= scale[:, None]
-        # What rounding may add, at most a quarter of the margin, says how far a point may be, and how near the axis.
+        # Rounding may add at most a quarter of the margin. This limits how far a point may be, and how near to the axis.
         allowed = MARGIN / 4 * finest / (_NEAR_AXIS if cells.cylindrical else 1.0)
         known = np.abs(np.array(pose)[3::4]).max() + np.abs(lower).max() + np.abs(upper).max()
         reach = (allowed / _ROUNDING - known) / 4
@@ -110,10 +110,10 @@ class Rays(NamedTuple):
     """A block of rays in working coordinates, (n,) float64 each.
 
     Attributes:
-        x: the point; y and z alike.
-        dx: from a sample to the one before it, towards the point; dy and dz alike.
-        first: step of the first free sample inside the box, counted from the point.
-        last: step of the last one; before the first if there is none.
+        x: x of the point; likewise y and z.
+        dx: difference in x from a sample to its neighbour nearer to the point; likewise dy and dz.
+        first: number of the first free sample inside the box, counted from the point.
+        last: number of the last one; less than `first` if there is none.
         state: SURE, DROPPED or UNSURE.
     """
 
@@ -130,7 +130,7 @@ class Rays(NamedTuple):
 
 @jit
 def empty_rays(n: int) -> Rays:
-    """Return room for a block of `n` rays."""
+    """Return memory for a block of `n` rays."""
     x, y, z, dx, dy, dz = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     return Rays(x, y, z, dx, dy, dz, np.empty(n), np.empty(n), np.empty(n))
 
@@ -139,7 +139,7 @@ def empty_rays(n: int) -> Rays:
 def narrow(first: Real, last: Real, start: float, stride: Real, low: Real, high: Real) -> tuple[Real, Real]:
     """Return the steps from `first` to `last` at which `start - step * stride` is between `low` and `high`.
 
-    No step at all gives an empty range; a coordinate that stays on a bound (0 / 0) leaves the range as it is.
+    The range is empty if there is no such step. A coordinate that stays on a bound (0 / 0) does not change the range.
     """
     inverse = 1.0 / stride
     a, b = (start - low) * inverse, (start - high) * inverse
@@ -149,7 +149,7 @@ def narrow(first: Real, last: Real, start: float, stride: Real, low: Real, high:
 
 @jit
 def clip(points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: float, view: View, rays: Rays) -> None:
-    """Take points (3 n,) with labels (n,) to working coordinates, and find the free samples inside the grid's box."""
+    """Transform points (3 n,) with labels (n,) to working coordinates, and find the free samples inside the grid's box."""
     low, high = view.low, view.high
     for i in range(len(labels)):
         x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
@@ -159,7 +159,7 @@ def clip(points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: f
         px, py, pz = transform(view.pose, ux, uy, uz)
         dx, dy, dz = (px - ox) * free_step_m, (py - oy) * free_step_m, (pz - oz) * free_step_m
 
-        # A step is before the sensor while it is less than this, whole steps not being sure.
+        # Samples up to this step are in front of the sensor; it is not certain for one that is almost at the sensor.
         length = (np.float64(x) / np.float64(ux)) / free_step_m
         whole = np.floor(length)
         slack = length * 1e-14 + 1e-12
@@ -178,7 +178,7 @@ def clip(points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: f
 
 @jit
 def place_points(rays: Rays, view: View, voxels: NDArray[np.int32]) -> None:
-    """Find the voxels of the points of a block: index, number of voxels if outside, or DOUBTFUL."""
+    """Find the voxels of the points of a block: their index, the number of voxels for points outside the grid, or DOUBTFUL."""
     if view.cylindrical:
         for i in range(len(voxels)):
             voxels[i] = place_cylindrical(rays.x[i], rays.y[i], rays.z[i], view)
@@ -189,24 +189,24 @@ def place_points(rays: Rays, view: View, voxels: NDArray[np.int32]) -> None:
 
 @fused
 def place_cartesian(u: float, v: float, w: float, view: View) -> np.int32:
-    """Return the voxel of a sample given in cells: its index, the number of voxels if outside, or DOUBTFUL."""
-    return settle(u, v, w, 0.0, view)
+    """Return the voxel of a sample given in cells: its index, the number of voxels for a sample outside the grid, or DOUBTFUL."""
+    return voxel_of(u, v, w, 0.0, view)
 
 
 @fused
 def place_cylindrical(x: float, y: float, w: float, view: View) -> np.int32:
-    """Return the same for a sample given in metres across and cells upwards."""
+    """Return the voxel of a sample given in metres in x and y, and cells in z, as `place_cartesian` does."""
     radius = np.sqrt(x * x + y * y)
     v = fast_azimuth(x, y) * view.scale[1] - view.offset[1]
     off = from_middle(v)
     off = off if radius > view.axis else 1.0
     v = v + view.turn if v < 0.0 else (v - view.turn if v >= view.top[1] else v)
-    return settle(radius * view.scale[0] - view.offset[0], v, w, off, view)
+    return voxel_of(radius * view.scale[0] - view.offset[0], v, w, off, view)
 
 
 @fused
-def settle(u: float, v: float, w: float, off: float, view: View) -> np.int32:
-    """Return the voxel of a sample given in cells, DOUBTFUL too where `off`, in cells from a middle, is too much."""
+def voxel_of(u: float, v: float, w: float, off: float, view: View) -> np.int32:
+    """Return the voxel of a sample given in cells; DOUBTFUL also if `off`, a distance from the middle of a cell, is too large."""
     i, j, k = np.floor(u), np.floor(v), np.floor(w)
     a, b, c = from_middle(u), from_middle(v), from_middle(w)
     a = a if a > b else b

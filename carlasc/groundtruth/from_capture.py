@@ -1,0 +1,128 @@
+"""Grids from raw captures: every sensor of the capture votes on the instant of each frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.captures.raw import Capture, Recording, find_captures
+from carlasc.core.geometry import relative_to
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.groundtruth.inputs import FrameData, FrameInput, Plan, SequenceInput, choose_frames
+from carlasc.groundtruth.voting.ballot import count_votes
+from carlasc.groundtruth.voting.observations import Observation
+from carlasc.storage import layout
+from carlasc.storage.protocol import Metadata, Source
+
+
+@dataclass(frozen=True)
+class CaptureFrame(FrameInput):
+    """One frame of a capture: each sensor is a voter, and the grid is in the frame of the ego sensor."""
+
+    capture: Capture
+    sensors: tuple[int, ...]
+    number: int
+    source_frame: int
+
+    def fields(self) -> tuple[str, ...]:
+        """Return points, labels, flow and instances, and bev if the frame has a picture."""
+        always = ("points", "labels", "flow", "instances")
+        return (*always, "bev") if self.capture.has_bev(self.source_frame) else always
+
+    def make(self, plan: Plan) -> FrameData:
+        """Read the ego sensor's recording, which is the scan, and count the votes of all sensors.
+
+        The other recordings are read one at a time, so memory does not grow with the number of sensors.
+        """
+        ego = self.capture.read(self.sensors[0], self.source_frame)
+        fields: dict[str, NDArray[Any]] = {
+            "points": np.column_stack([ego.scan.points, np.zeros(len(ego.scan), np.float32)]),
+            "labels": _present(ego.scan.labels),
+            "flow": ego.flow(),
+            "instances": _present(ego.scan.instances),
+        }
+        picture = self.capture.read_bev(self.source_frame)
+        if picture is not None:
+            fields["bev"] = np.frombuffer(picture, np.uint8)
+        step = plan.voting.free_step_m
+        votes = count_votes(self._observations(ego), plan.spec, self.capture.classes, rule=plan.rule, free_step_m=step)
+        return FrameData(fields, votes.to_grid(), votes)
+
+    def _observations(self, ego: Recording) -> Iterator[Observation]:
+        for sensor in self.sensors:
+            recording = ego if sensor == self.sensors[0] else self.capture.read(sensor, self.source_frame)
+            ego_T_sensor = relative_to(ego.world_T_sensor, recording.world_T_sensor)
+            yield Observation(recording.scan.points, _present(recording.scan.labels), ego_T_sensor)
+
+
+class CaptureSequence(SequenceInput):
+    """A capture as a sequence: its frames are renumbered from 0."""
+
+    def __init__(self, capture: Capture, path: str, plan: Plan) -> None:
+        self.path, self.location, self.metadata = path, capture.location, Metadata(classes=capture.classes)
+        self.capture, self.plan = capture, plan
+
+    def _find_frames(self) -> tuple[FrameInput, ...]:
+        capture = self.capture
+        numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
+        # Frames hold another Capture: this one caches its listing, which would be pickled with every frame.
+        light = Capture(capture.raw, capture.classes)
+        return tuple(CaptureFrame(light, capture.sensors, i, number) for i, number in enumerate(numbers))
+
+    def poses(self) -> NDArray[np.float64]:
+        """Return inv(pose0[first]) @ pose0[f] for each frame f.
+
+        Raises:
+            FormatError: the first frame's pose, which is the origin, is not valid.
+            MissingDataError: the first frame's pose does not exist.
+        """
+        first = self.frames[0].source_frame
+        try:
+            world_T_first = self.capture.read_pose(0, first)
+        except (FormatError, MissingDataError) as error:
+            error.advice = "the first frame's pose is the origin of poses.txt: fix it, or start with a later frame"
+            raise
+        return relative_to(world_T_first, np.stack([self._read_pose(frame.source_frame) for frame in self.frames]))
+
+    def _read_pose(self, frame: int) -> NDArray[np.float64]:
+        try:
+            return self.capture.read_pose(0, frame)
+        except (FormatError, MissingDataError):
+            return np.full((4, 4), np.nan)  # reading the frame raises the same error, and that one is reported
+
+    def times(self) -> NDArray[np.float64]:
+        """Return (f - first) * 0.1 for each frame f: see the format page, `docs/format.md#votes`."""
+        numbers = np.array([frame.source_frame for frame in self.frames])
+        return (numbers - numbers[0]) * layout.FRAME_PERIOD_S
+
+    def record(self) -> dict[str, Any]:
+        """Return the frames and the number of sensors.
+
+        An open end of the range stays open, so that a run continues after the capture has grown.
+        """
+        first, last = self.frames[0].source_frame, self.frames[-1].source_frame
+        frames = f"{first}:" if self.plan.frames.stop is None else f"{first}:{last + 1}"
+        return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
+
+
+def capture_sequences(source: str | os.PathLike[str] | Source, plan: Plan) -> list[SequenceInput]:
+    """Find the captures in or below a folder.
+
+    Raises:
+        ArgumentError: the source is not a path.
+        MissingDataError: there is no capture.
+    """
+    if isinstance(source, Source):
+        raise ArgumentError("source", expected="a folder with a capture", found=repr(source))
+    return [CaptureSequence(capture, path, plan) for path, capture in find_captures(source).items()]
+
+
+def _present(array: NDArray[Any] | None) -> NDArray[Any]:
+    if array is None:  # does not happen: Capture.read refuses recordings without labels or instances
+        raise FormatError("recording", expected="labels and instances", found="none")
+    return array

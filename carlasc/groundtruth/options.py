@@ -1,0 +1,111 @@
+"""The options of `regrid`: what observes the scene, and how its votes are counted. All of them check themselves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from carlasc.errors import ArgumentError
+from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
+
+Dynamic = Literal["align", "current", "drop", "tube"]
+PoseSource = Literal["file", "kiss-icp"]
+
+
+@dataclass(frozen=True)
+class FromCapture:
+    """Grids from a raw capture: every sensor observes the scene at the instant of the frame."""
+
+
+@dataclass(frozen=True)
+class FromScans:
+    """Grids from the scans of one sensor, merged over time.
+
+    Attributes:
+        window: first and last scan that are merged into a frame, relative to it, in frames; the range contains 0.
+        window_m: use only those scans of the window that lie within this driven distance, in metres, and skip scans from
+            nearly the same place; None for no limit.
+        stride: use every N-th scan of the window, counted from the frame itself.
+        dynamic: what happens to moving points. "align": each moving actor is completed from all scans, at its position in the
+            frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
+            were seen, as in SemanticKITTI, and moving actors leave traces.
+        poses: "file": from poses.txt; "kiss-icp": estimated from the scans (needs the extra `kitti`). Estimated poses are
+            written only if the sequence has no poses.txt.
+        min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
+        max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no limit.
+        min_speed_m_s: slower actors count as standing, in metres per second.
+        force: continue if consecutive poses are farther apart than a vehicle can move or turn.
+
+    Raises:
+        ArgumentError: a value is out of its range.
+    """
+
+    window: tuple[int, int] = (-30, 30)
+    window_m: float | None = None
+    stride: int = 1
+    dynamic: Dynamic = "align"
+    poses: PoseSource = "file"
+    min_range_m: float | None = None
+    max_range_m: float | None = None
+    min_speed_m_s: float = 0.3
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        first, last = self.window
+        if first > 0 or last < 0:
+            raise ArgumentError("window", expected="a range that contains 0, such as -30:30", found=f"{first}:{last}")
+        if self.stride < 1:
+            raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
+        if self.window_m is not None and not self.window_m > 0:
+            raise ArgumentError("window_m", expected="a positive number of metres", found=str(self.window_m))
+        for name, kind in (("dynamic", Dynamic), ("poses", PoseSource)):
+            value = getattr(self, name)
+            if value not in get_args(kind):
+                raise ArgumentError(name, expected=f"one of {', '.join(get_args(kind))}", found=repr(value))
+        low, high = self.min_range_m or 0.0, math.inf if self.max_range_m is None else self.max_range_m
+        if not 0 <= low < high:
+            raise ArgumentError(
+                "min_range_m",
+                expected="0 <= minimum < maximum, in metres",
+                found=f"minimum {low:g} and maximum {high:g}",
+            )
+        if not self.min_speed_m_s > 0:
+            raise ArgumentError("min_speed_m_s", expected="a positive number", found=str(self.min_speed_m_s))
+
+
+@dataclass(frozen=True)
+class FromGrid:
+    """Grids from a finer grid of the same frames: each voxel takes the class of most of the known cells in it.
+
+    Attributes:
+        name: folder of the finer grid; None for the finest one of the same coordinates.
+    """
+
+    name: str | None = None
+
+
+Observe = FromCapture | FromScans | FromGrid
+"""What the `observe` argument of `regrid` takes."""
+
+
+@dataclass(frozen=True)
+class Voting:
+    """How votes are counted.
+
+    Attributes:
+        rule: "sensor": at most one vote per sensor (scan), voxel and class, as in the published files; "sample": every sample
+            counts; "point": every point counts, free space once per scan. None: "point" for scans, otherwise "sensor".
+        free_step_m: distance between two free samples on a ray, in metres.
+        keep: also write the votes of every class.
+
+    Raises:
+        ArgumentError: an unknown rule, or a distance that is not positive.
+    """
+
+    rule: VoteRule | None = None
+    free_step_m: float = 1.5
+    keep: bool = False
+
+    def __post_init__(self) -> None:
+        check_rule(self.rule or "sensor", self.free_step_m)

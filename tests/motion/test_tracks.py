@@ -1,0 +1,118 @@
+"""Which segments become one track, and what the track says between and beyond them."""
+
+import numpy as np
+import pytest
+
+from carlasc.motion import Segment, Standing, link_segments
+
+CAR, PERSON = 10, 4
+TIMES = {frame: 0.1 * frame for frame in range(100)}
+
+
+def segment(frame, x, speed=8.0, *, y=0.0, label=CAR, instance=0, size=(4.0, 2.0, 1.5)):
+    """The corners of a box, and its centre, at a place."""
+    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)] + [[0, 0, 0]]) / 2
+    points = corners * size + (x, y, 0.0)
+    return Segment(frame, label, np.arange(9), points, np.array([speed, 0.0, 0.0]), instance)
+
+
+def drive(frames, speed=8.0, **options):
+    return [segment(frame, speed * 0.1 * frame, speed, **options) for frame in frames]
+
+
+@pytest.mark.parametrize(("gap", "tracks"), [(15, 1), (16, 2)])
+def test_an_actor_may_be_hidden_for_a_second_and_a_half(gap, tracks):
+    assert len(link_segments(drive([0, 1, 2, 2 + gap, 3 + gap]), TIMES)) == tracks
+
+
+@pytest.mark.parametrize(
+    ("next_one", "tracks"),
+    [
+        (segment(1, 0.8), 1),
+        (segment(1, 0.8, label=PERSON), 2),
+        (segment(1, 0.8, 9.9), 1),
+        (segment(1, 0.8, 10.1), 2),
+        (segment(1, 0.8 + 4.0 + 1.4), 1),  # the boxes are 1.4 m apart
+        (segment(1, 0.8 + 4.0 + 1.6), 2),
+        (segment(1, 0.8, y=2.0 + 1.4), 1),
+        (segment(1, 0.8, y=2.0 + 1.6), 2),
+    ],
+)
+def test_a_segment_continues_a_track_of_its_class_velocity_and_place(next_one, tracks):
+    assert len(link_segments([segment(0, 0.0), next_one], TIMES)) == tracks
+
+
+def test_each_track_continues_with_one_segment_the_nearest():
+    first, second = link_segments([segment(0, 0.0), segment(1, 1.0, y=0.9), segment(1, 0.8)], TIMES)
+    assert [found.center[1] for found in first.segments.values()] == [0.0, 0.0]
+    assert [found.center[1] for found in second.segments.values()] == [pytest.approx(0.9)]
+
+
+def test_a_track_extends_five_frames_beyond_its_segments_at_constant_velocity():
+    (track,) = link_segments(drive(range(10, 20)), TIMES)
+    assert track.first == 5
+    assert track.pose(4) is None and track.pose(25) is None
+    assert track.velocity_at(4) is None and track.velocity_at(25) is None
+    for frame in (5, 10, 19, 24):
+        assert track.pose(frame)[0, 3] == pytest.approx(0.8 * frame)
+        assert track.velocity_at(frame)[0] == pytest.approx(8.0)
+
+
+def test_times_beyond_the_scans_go_on_at_their_mean_period():
+    times = {frame: 0.2 * frame for frame in range(10)}
+    (track,) = link_segments([segment(frame, 1.6 * frame) for frame in range(10)], times)
+    for frame in (-5, 0, 9, 14):
+        assert track.pose(frame)[0, 3] == pytest.approx(1.6 * frame)
+
+
+def test_the_box_holds_the_points_and_a_margin_but_not_single_outliers():
+    (track,) = link_segments(drive(range(40)), TIMES)
+    assert np.allclose(track.size, (4.2, 2.2, 1.7))
+    segments = drive(range(40))
+    outlier = np.concatenate([segments[20].points, [[16.0, 9.0, 0.0]]])
+    segments[20] = Segment(20, CAR, np.arange(10), outlier, np.array([8.0, 0.0, 0.0]))
+    (track,) = link_segments(segments, TIMES)
+    assert np.allclose(track.size, (4.2, 2.2, 1.7), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("speed", "frames", "moves"), [(8.0, 10, True), (0.29, 60, False), (0.31, 60, True), (0.6, 3, True)]
+)
+def test_an_actor_moves_if_it_is_fast_and_gets_somewhere(speed, frames, moves):
+    (track,) = link_segments(drive(range(frames), speed), TIMES)
+    assert track.moves == moves
+
+
+def test_an_actor_that_stays_in_place_does_not_move_however_fast_its_points_are():
+    jitter = [segment(frame, 0.02 * (frame % 2), 0.4 if frame % 2 else -0.4) for frame in range(30)]
+    assert not any(track.moves for track in link_segments(jitter, TIMES))
+
+
+def standing(frame, x):
+    found = segment(frame, x)
+    return Standing(frame, np.arange(9), np.full(9, CAR), found.points)
+
+
+def test_a_track_is_extended_back_to_where_its_actor_was_standing():
+    moving = drive(range(10, 15), 1.0)
+    still = {frame: standing(frame, 1.0) for frame in range(10)}
+    (track,) = link_segments(moving, TIMES, still)
+    assert sorted(track.segments) == list(range(15))
+    fast = drive(range(10, 15), 8.0)  # it cannot have been standing a moment before
+    (track,) = link_segments(fast, TIMES, {frame: standing(frame, 8.0) for frame in range(10)})
+    assert sorted(track.segments) == list(range(10, 15))
+
+
+def test_a_slow_actor_that_stops_is_followed_and_a_fast_one_is_not():
+    for speed, last in ((1.0, 19), (8.0, 14)):
+        still = {frame: standing(frame, speed * 1.4) for frame in range(15, 20)}
+        (track,) = link_segments(drive(range(10, 15), speed), TIMES, still)
+        assert max(track.segments) == last
+
+
+def test_numbered_actors_are_linked_by_their_numbers_wherever_they_are():
+    first, second = link_segments(
+        [segment(0, 0.0, instance=3), segment(30, 500.0, instance=3), segment(0, 0.5, instance=4)], TIMES
+    )
+    assert (first.instance, len(first.segments)) == (3, 2)
+    assert (second.instance, len(second.segments)) == (4, 1)
