@@ -169,7 +169,7 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
         raise ConflictError(
             where,
             expected=f"the axes {metadata.axes} and the classes {metadata.classes.name}",
-            found=f"{there.axes} and {'others called ' if there.classes.name == metadata.classes.name != there.classes else ''}{there.classes.name}",
+            found=f"{there.axes} and {'others called ' if there.classes.name == metadata.classes.name and there.classes != metadata.classes else ''}{there.classes.name}",
             advice="choose another `out`",
         )
     return metadata.to_json() if data is None and metadata != Metadata() else None
