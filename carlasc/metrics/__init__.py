@@ -1,5 +1,6 @@
 """How good a grid is: confusion matrix, IoU, completeness, the masks that say where it counts, and scores over data sets."""
 
+from carlasc.metrics.comparison import Outcome, compare_grids
 from carlasc.metrics.confusion import Completeness, ConfusionMatrix
 from carlasc.metrics.evaluation import Evaluation, evaluate
 from carlasc.metrics.masks import distance_band, field_of_view, known, semantickitti
@@ -10,8 +11,10 @@ __all__ = [
     "Completeness",
     "ConfusionMatrix",
     "Evaluation",
+    "Outcome",
     "Table",
     "TruthScore",
+    "compare_grids",
     "distance_band",
     "evaluate",
     "field_of_view",

@@ -4,7 +4,7 @@ import pytest
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI, TABLES
 from carlasc.errors import ArgumentError
-from carlasc.viewing.rendering.colors import (
+from carlasc.viewing.colors import (
     AFTER_CLASSES,
     ClassColors,
     Entry,
@@ -89,5 +89,5 @@ def test_higher_is_lighter():
 
 
 def test_an_unknown_palette_is_refused():
-    with pytest.raises(ArgumentError, match="palette 'rainbow'"):
+    with pytest.raises(ArgumentError, match="palette: .* found 'rainbow'"):
         ClassColors(CARLA, "rainbow")

@@ -6,18 +6,19 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA, CARLASC11
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.viewing.rendering import (
+from carlasc.viewing import (
     Panel,
     Viewpoint,
     draw_panels,
-    grid_scene,
+    error_drawing,
+    grid_drawing,
     render_comparison,
     render_grid,
     render_scan,
 )
-from carlasc.viewing.rendering import colors as palette
-from carlasc.viewing.rendering.colors import ClassColors
-from carlasc.viewing.rendering.scenes import motion_arrows
+from carlasc.viewing import colors as palette
+from carlasc.viewing.colors import ClassColors
+from carlasc.viewing.rendering.drawings import motion_arrows
 
 SIZE = (320, 180)
 PUBLISHED = [GridSpec.published(name) for name in ("cartesian", "cartesian_fine", "cylindrical")]
@@ -82,11 +83,11 @@ def test_free_and_unknown_voxels_are_not_drawn():
 def test_an_empty_grid_says_so_above_its_ground():
     spec = PUBLISHED[0]
     empty = Grid(spec, np.zeros(spec.size, np.uint8))
-    scene = grid_scene(empty, ClassColors())
+    scene = grid_drawing(empty, ClassColors())
     assert scene.note == "no voxel is occupied"
     picture = render_grid(empty, size=SIZE, ego=False)
     silent = draw_panels(
-        [Panel(type(scene)(scene.extent, grid_scene(empty, ClassColors(), ego=False).mesh))], size=SIZE
+        [Panel(type(scene)(scene.extent, grid_drawing(empty, ClassColors(), ego=False).mesh))], size=SIZE
     )
     assert (silent < 250).any()  # the ground
     assert (silent != picture).any() and picture.min() < 130 < silent.min()  # the words
@@ -221,10 +222,9 @@ def test_errors_are_right_wrong_missed_and_invented_where_the_truth_is_known():
     truth = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 10, (-10, 10, -0.5): 10}, size_m=4.0)
     prediction = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 4, (-10, -10, -0.5): 10, (0, 0, -0.5): 4}, size_m=4.0)
     truth.counts[54:74, 54:74] = 0  # the last one of the prediction's is where nobody knows
-    quarters = {(1, 1): palette.RIGHT, (1, -1): palette.WRONG, (-1, 1): palette.MISSED, (-1, -1): palette.INVENTED}
-    from carlasc.viewing.rendering import error_scene
-
-    scene = error_scene(prediction, truth, ego=False)
+    right, wrong, missed, invented = (palette.ERRORS.colors[outcome] for outcome in (1, 2, 3, 4))
+    quarters = {(1, 1): right, (1, -1): wrong, (-1, 1): missed, (-1, -1): invented}
+    scene = error_drawing(prediction, truth, ego=False)
     picture = draw_panels([Panel(scene, "bev")], size=(400, 400), legend=False)
     for (ahead, right), color in quarters.items():
         y, x = 200 - round(ahead * 10 * 392 / 51.2), 200 + round(right * 10 * 392 / 51.2)
