@@ -36,6 +36,32 @@ def test_a_page_holds_the_grids_as_they_are(golden_capture, tmp_path):
         assert np.array_equal(arrays["panel0/votes"], grid.counts.reshape(-1)[index])
 
 
+def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
+    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0)
+    _, scene, frames = read_page(write_page(prediction, tmp_path / "a.html", truth=blocks).out)
+    assert scene["leftHanded"] is True
+    assert scene["tables"]["carla"][4] == ["Pedestrian", "#dc143c"]
+    assert scene["tables"]["errors"][1:] == [
+        ["right class", "#cdd1d6"],
+        ["wrong class", "#d54600"],
+        ["missed: predicted free", "#105abe"],
+        ["invented: free in truth", "#f0c828"],
+    ]
+    assert [panel["title"] for panel in scene["panels"]] == ["prediction", "truth", "errors"]
+    assert [panel["table"] for panel in scene["panels"]] == ["carla", "carla", "errors"]
+    assert scene["panels"][0]["upper"] == pytest.approx([25.6, 25.6, 1.0], abs=1e-3)
+    assert (scene["pointTable"], scene["hasPoints"], scene["hasFlow"], scene["pointCell"]) == ("carla", True, True, 0.2)
+    own, truth, errors = (frames[1][f"panel{number}/label"] for number in range(3))
+    assert (own == 4).sum() == (truth == 4).sum() > 0 and set(np.unique(errors)) == {1, 3, 4}
+    assert {"scan/arrows", "scan/label"} <= set(frames[1])
+
+
+def test_data_with_y_on_the_left_say_so_in_the_page(tmp_path):
+    folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
+    _, scene, _ = read_page(write_page(folder, tmp_path / "scene.html").out)
+    assert (scene["leftHanded"], scene["hasPoints"], scene["hasFlow"]) == (False, False, False)
+
+
 def test_a_page_asks_the_network_for_nothing(golden_capture, tmp_path):
     text, _, _ = read_page(write_page(golden_capture / "cartesian", tmp_path / "scene.html", frames=(0, 1)).out)
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=[\"'](?!data:)", text)

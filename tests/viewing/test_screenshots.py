@@ -33,7 +33,7 @@ def test_the_page_of_a_street(browser, street, tmp_path):
     canvas = page.canvas("docs_page")
     for name in ("Road", "Sidewalk", "Vehicle"):  # open, level faces in the sun have the legend's colours
         assert color_is_there(canvas, CARLA.colors[CARLA.id_of(name)])
-    page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.look('top')")
+    page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.setView('top')")
     above = page.canvas("docs_page_dark")
     assert np.median(above.reshape(-1, 3)[:, 0]) < 140
     assert page.complaints() == []

@@ -342,3 +342,32 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(drive, tmp_pat
         draw(drive, tmp_path / "a.mp4", frames=(0, 1), size=SIZE)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_panels_are_titled_by_what_they_show(drive, tmp_path, monkeypatch):
+    from carlasc.viewing.rendering import pictures
+
+    titles = []
+    original = pictures.draw_page
+    monkeypatch.setattr(pictures, "draw_page", lambda *a, **k: titles.append(a[2]) or original(*a, **k))
+    for options in ({"truth": drive}, {"what": "grid,scan,flow"}, {"view": "both"}, {}):
+        draw(drive, tmp_path / "a.png", size=(160, 90), overwrite=True, **options)
+    cells = "cartesian 128 x 128 x 8"
+    assert titles[0] == ["prediction", "truth", "errors"]
+    assert titles[1][1:] == ["scan", "scene flow"] and titles[1][0].endswith(cells.split(maxsplit=1)[1])
+    assert titles[2] == ["", ""] and titles[3] == [""]
+
+
+def test_both_views_are_the_perspective_one_and_beside_it_the_one_from_above(drive, tmp_path):
+    options = {"ego": False, "legend": False}
+    both = picture(draw(drive, tmp_path / "a.png", view="both", size=(361, 180), **options).out)
+    above = picture(draw(drive, tmp_path / "b.png", view="bev", size=(175, 180), **options).out)
+    places = [middle_of(red_pixels(part)) for part in (both[:, -175:], above)]
+    np.testing.assert_allclose(places[0], places[1], atol=3)
+
+
+def test_a_picture_shows_the_first_frame_and_every_chooses_others(drive, tmp_path):
+    first = draw(drive, tmp_path / "a.png", size=SIZE).out.read_bytes()
+    assert first == draw(drive, tmp_path / "b.png", size=SIZE, frames=(0, 1)).out.read_bytes()
+    assert first != draw(drive, tmp_path / "c.png", size=SIZE, frames=(3, 4)).out.read_bytes()
+    assert draw(drive, tmp_path / "d.gif", size=(160, 90), every=3).frames == (0, 3)
