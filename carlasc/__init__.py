@@ -51,9 +51,9 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.storage import open as open
     from carlasc.storage import pack as pack
     from carlasc.storage import unpack as unpack
-    from carlasc.viewing import make_page as make_page
+    from carlasc.viewing import Scene as Scene
     from carlasc.viewing import render as render
-    from carlasc.viewing import show as show
+    from carlasc.viewing import view as view
 else:
 
     def __getattr__(name: str) -> object:
@@ -123,9 +123,9 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
         "export",
     ),
     "viewing": (
-        "make_page",
+        "Scene",
         "render",
-        "show",
+        "view",
     ),
 }
 

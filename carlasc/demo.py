@@ -16,6 +16,7 @@ from carlasc.errors import ConflictError
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
     from carlasc.inspection.statistics import Statistics
+    from carlasc.viewing import Scene
 
 Progress = Callable[[int, int], None]
 Step = Callable[[str], AbstractContextManager[Progress]]
@@ -76,7 +77,7 @@ def demonstrate(
     from carlasc.groundtruth import regrid
     from carlasc.inspection.statistics import stats
     from carlasc.inspection.validation import validate
-    from carlasc.viewing.rendering import render
+    from carlasc.viewing import render
 
     start, out, step = time.perf_counter(), Path(out), step or _silently
     sequence = out / SEQUENCE
@@ -102,9 +103,9 @@ def demonstrate(
         statistics = stats(out, progress=progress)
     pictures = []
     with step("draw") as progress:
-        jobs = _pictures(out, sequence, grids, frames - 1)
-        for number, (path, source, options) in enumerate(jobs, 1):
-            render(source, path, frame=frames - 1, overwrite=True, **options)  # type: ignore[arg-type]
+        jobs = _pictures(out, grids, frames - 1)
+        for number, (path, scene, what, view) in enumerate(jobs, 1):
+            render(scene, path, what=what, view=view, overwrite=True)
             pictures.append(path)
             progress(number, len(jobs))
     return DemoResult(sequence, tuple(grids), tuple(pictures), validation, statistics, time.perf_counter() - start)
@@ -119,14 +120,18 @@ def _demo_grids() -> dict[str, GridSpec]:
     }
 
 
-def _pictures(out: Path, sequence: Path, grids: list[Path], frame: int) -> list[tuple[Path, Path, dict[str, object]]]:
-    """Return file, source and options of each picture."""
-    jobs: list[tuple[Path, Path, dict[str, object]]] = []
-    for grid, name in zip(grids, ("coarse", "fine", "cylindrical"), strict=True):
-        jobs.append((out / f"{name}.png", grid.parent, {"grid": grid.name}))
-    jobs.append((out / "birdseye.png", grids[1].parent, {"grid": grids[1].name, "view": "bev"}))
-    jobs.append((out / "scan.png", grids[0].parent, {"what": "scan"}))
-    return jobs
+def _pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, str]]:
+    """Return file, scene, contents and view of each picture."""
+    from carlasc.viewing import Scene
+
+    coarse, fine, cylindrical = (Scene(grid, frames=(frame, frame + 1)) for grid in grids)
+    return [
+        (out / "coarse.png", coarse, "grid", "perspective"),
+        (out / "fine.png", fine, "grid", "perspective"),
+        (out / "cylindrical.png", cylindrical, "grid", "perspective"),
+        (out / "birdseye.png", fine, "grid", "bev"),
+        (out / "scan.png", coarse, "scan", "perspective"),
+    ]
 
 
 @contextmanager

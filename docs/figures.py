@@ -22,7 +22,7 @@ from carlasc.core.geometry import relative_to
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, REMAPS
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.viewing.rendering import ClassColors, Panel, Viewpoint, draw_panels, grid_scene, render_grid
+from carlasc.viewing import ClassColors, Panel, Viewpoint, draw_panels, grid_drawing, render_grid
 
 IMAGES = Path(__file__).parent / "images"
 SENSORS, FRAME = 20, 60
@@ -120,7 +120,9 @@ def draw_town() -> bytes:
 def draw_grids() -> bytes:
     """The published grids, coarse, fine and cylindrical, of one frame."""
     panels = [
-        Panel(grid_scene(_ground_truth(GridSpec.published(name)), ClassColors(REMAPS["carlasc11"].target)), title=title)
+        Panel(
+            grid_drawing(_ground_truth(GridSpec.published(name)), ClassColors(REMAPS["carlasc11"].target)), title=title
+        )
         for name, title in (("cartesian", "coarse"), ("cartesian_fine", "fine"), ("cylindrical", "cylindrical"))
     ]
     return _png(draw_panels(panels, size=(1500, 470)))

@@ -7,93 +7,100 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Json, Overwrite, parse_frames, print_json, progress_bar
+from carlasc.cli.common import Json, print_json, progress_bar
 from carlasc.cli.scene_options import (
     ClassesOption,
+    EveryOption,
+    FramesOption,
     GridOption,
-    PathClassesOption,
+    OverwriteOption,
     SequenceOption,
+    SourceArgument,
+    SourceClassesOption,
     TruthGridOption,
     TruthOption,
+    describe_frames,
 )
+from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError
 
 
 def render(
-    path: Annotated[
-        str,
-        typer.Argument(
-            help="A sequence or data set (folder, zip, packed store, URL), a grid's folder, or a frame's file."
-        ),
-    ],
+    source: SourceArgument,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="A .png, .gif or .mp4; named after the sequence if not given.")
+        Path | None, typer.Option("-o", "--out", help="A .png, .gif or .mp4. Default: named after the sequence.")
     ] = None,
-    frame: Annotated[int | None, typer.Option(help="The frame; the first if not given.", min=0)] = None,
-    frames: Annotated[str | None, typer.Option(help="Frames A:B of a film (B not included).")] = None,
+    frames: FramesOption = None,
+    every: EveryOption = 1,
     what: Annotated[
         str | None,
-        typer.Option(help="grid, scan, flow, truth, errors; several with commas between stand side by side."),
+        typer.Option(help="grid, scan, flow, truth, errors; several, separated by commas, are drawn side by side."),
     ] = None,
     view: Annotated[
-        Literal["perspective", "bev", "both"], typer.Option(help="From behind and above, from straight above, or both.")
+        Literal["perspective", "bev", "both"],
+        typer.Option(help="From behind and above, from straight above (bird's-eye view), or both."),
     ] = "perspective",
     grid: GridOption = None,
     truth: TruthOption = None,
     truth_grid: TruthGridOption = None,
     sequence: SequenceOption = None,
     classes: ClassesOption = None,
-    path_classes: PathClassesOption = None,
+    source_classes: SourceClassesOption = None,
     palette: Annotated[
         Literal["class", "colorblind", "height"],
-        typer.Option(help="The classes' own colours, ones that the colour-blind tell apart, or by height."),
+        typer.Option(help="Colours of the class table, colours for colour-blind readers, or colours by height."),
     ] = "class",
-    size: Annotated[str, typer.Option(help="Pixels of the picture, WIDTHxHEIGHT.")] = "1280x720",
-    camera: Annotated[
+    size: Annotated[str, typer.Option(help="Size of the picture in pixels, WIDTHxHEIGHT.")] = "1280x720",
+    viewpoint: Annotated[
         str | None,
         typer.Option(
-            help="'azimuth=DEG elevation=DEG distance=M fov=DEG target=X,Y,Z', or 'position=X,Y,Z target=X,Y,Z': any of these."
+            help="Any of azimuth=DEG elevation=DEG distance=M fov=DEG target=X,Y,Z position=X,Y,Z, in one pair of quotes."
         ),
     ] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="Go once around the scene (a film).")] = False,
+    orbit: Annotated[bool, typer.Option("--orbit", help="Circle the scene once (a film).")] = False,
     still: Annotated[
         bool, typer.Option("--still", help="The camera does not follow the ego vehicle (needs poses).")
     ] = False,
-    fps: Annotated[float | None, typer.Option(help="Pictures a second; 10 if not given, the data's own rate.")] = None,
-    no_legend: Annotated[bool, typer.Option("--no-legend", help="Leave the legend out.")] = False,
-    no_ego: Annotated[bool, typer.Option("--no-ego", help="Leave the ego vehicle out.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that draw a film; all cores if not given.", min=1)
+    fps: Annotated[
+        float | None, typer.Option(help="Pictures per second of a film. Default: 10, the rate of the data.")
     ] = None,
-    overwrite: Overwrite = False,
+    legend: Annotated[bool, typer.Option("--legend/--no-legend", help="Draw a legend.")] = True,
+    ego: Annotated[bool, typer.Option("--ego/--no-ego", help="Draw the ego vehicle.")] = True,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that draw the pictures of a film. Default: all cores.", min=1)
+    ] = None,
+    overwrite: OverwriteOption = False,
     as_json: Json = False,
 ) -> None:
-    """Picture a frame (PNG) or a range of frames (GIF, MP4): grids, scans, flow, predictions beside the truth, errors.
+    """Draw a frame (PNG) or several frames (GIF, MP4): grids, scans, scene flow, predictions with ground truth and errors.
 
-    No screen and no GPU are needed. The camera stands behind and above the ego vehicle and follows it.
+    No screen and no GPU are needed. The camera is behind and above the ego vehicle and follows it. Without --frames, a picture shows the first
+    frame and a film shows all frames.
     """
-    from carlasc.viewing.rendering import Viewpoint
-    from carlasc.viewing.rendering import render as draw
+    from carlasc import viewing
 
+    scene = viewing.Scene(
+        source,
+        sequence=sequence,
+        frames=None if frames is None else FrameRange.parse(frames),
+        every=every,
+        grid=grid,
+        truth=truth,
+        truth_grid=truth_grid,
+        classes=classes,
+        source_classes=source_classes,
+        palette=palette,
+    )
     with progress_bar("Rendering", "pictures") as progress:
-        result = draw(
-            path,
+        result = viewing.render(
+            scene,
             out,
-            sequence=sequence,
-            frame=frame,
-            frames=parse_frames(frames),
             what=what,
             view=view,
-            grid=grid,
-            truth=truth,
-            truth_grid=truth_grid,
-            classes=classes,
-            path_classes=path_classes,
-            palette=palette,
             size=_parse_size(size),
-            legend=not no_legend,
-            ego=not no_ego,
-            viewpoint=None if camera is None else Viewpoint.parse(camera),
+            legend=legend,
+            ego=ego,
+            viewpoint=None if viewpoint is None else viewing.Viewpoint.parse(viewpoint),
             orbit=orbit,
             still=still,
             fps=fps,
@@ -106,15 +113,13 @@ def render(
         return
     for note in result.notes:
         typer.echo(note)
-    shown = f"frame {result.frames[0]}" if len(result.frames) == 1 else f"{len(result.frames)} frames"
-    typer.echo(
-        f"{result.out}: {', '.join(result.what)} of {result.sequence}, {shown}, {result.size[0]} x {result.size[1]}"
-    )
+    shown = f"{', '.join(result.what)} of {result.sequence}, {describe_frames(result.frames)}"
+    typer.echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")
 
 
 def _parse_size(text: str) -> tuple[int, int]:
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:
-        raise ArgumentError("--size", expected="WIDTHxHEIGHT such as 1280x720", found=f"{text!r}") from None
+        raise ArgumentError("size", expected="WIDTHxHEIGHT, such as 1280x720", found=repr(text)) from None
     return width, height

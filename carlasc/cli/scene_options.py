@@ -1,4 +1,4 @@
-"""What `render` and `view` are told of what they show: options that both take."""
+"""Arguments and options that `render` and `view` share: the choice of a scene."""
 
 from __future__ import annotations
 
@@ -6,20 +6,42 @@ from typing import Annotated
 
 import typer
 
-GridOption = Annotated[str | None, typer.Option("--grid", help="The grid's folder; `evaluation` if not given.")]
-TruthOption = Annotated[
-    str | None, typer.Option("--truth", help="Ground truth to show beside PATH, a prediction; and where it errs.")
-]
-TruthGridOption = Annotated[
-    str | None, typer.Option("--truth-grid", help="The truth's grid; `evaluation` if not given.")
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame."
+    ),
 ]
 SequenceOption = Annotated[
-    str | None, typer.Option("--sequence", help="The sequence, where there are several; the first if not given.")
+    str | None, typer.Option("--sequence", help="Name of the sequence if there are several. Default: the first.")
+]
+FramesOption = Annotated[
+    str | None, typer.Option("--frames", help="Frames A:B (B not included), or one frame A. Default: see above.")
+]
+EveryOption = Annotated[int, typer.Option("--every", help="Take every N-th frame.", min=1)]
+GridOption = Annotated[
+    str | None, typer.Option("--grid", help="Name of the grid. Default: `evaluation`, or the first grid.")
+]
+TruthOption = Annotated[
+    str | None,
+    typer.Option("--truth", help="Ground truth: SOURCE is then a prediction, shown with it and with its errors."),
+]
+TruthGridOption = Annotated[
+    str | None, typer.Option("--truth-grid", help="Name of the ground truth's grid. Default: as for --grid.")
 ]
 ClassesOption = Annotated[
     str | None,
-    typer.Option("--classes", help="Classes to show: carlasc11 for the paper's eleven; the data's own if not given."),
+    typer.Option(
+        "--classes", help="Class table to show, such as carlasc11 (the paper's eleven). Default: that of the data."
+    ),
 ]
-PathClassesOption = Annotated[
-    str | None, typer.Option("--path-classes", help="Class table of PATH's labels, where nothing beside them says.")
+SourceClassesOption = Annotated[
+    str | None,
+    typer.Option("--source-classes", help="Class table of the labels in SOURCE, if its metadata do not say it."),
 ]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+
+
+def describe_frames(frames: tuple[int, ...]) -> str:
+    """Return "frame 3" or "12 frames"."""
+    return f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"

@@ -3,78 +3,84 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Json, parse_frames, print_json, progress_bar
+from carlasc.cli.common import Json, print_json, progress_bar
 from carlasc.cli.scene_options import (
     ClassesOption,
+    EveryOption,
+    FramesOption,
     GridOption,
-    PathClassesOption,
+    OverwriteOption,
     SequenceOption,
+    SourceArgument,
+    SourceClassesOption,
     TruthGridOption,
     TruthOption,
+    describe_frames,
 )
+from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError
 
 
 def view(
-    path: Annotated[
-        str,
-        typer.Argument(
-            help="A sequence or data set (folder, zip, packed store, URL), a grid's folder, or a frame's file."
+    source: SourceArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Write a self-contained .html page for any browser, instead of opening a window."
         ),
-    ],
-    html: Annotated[
-        Path | None, typer.Option(help="Write one self-contained page for any browser, instead of opening a window.")
     ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="Frames A:B (B not included); all if not given, the first 60 in a page.")
-    ] = None,
-    every: Annotated[int, typer.Option(help="Take each N-th of them.", min=1)] = 1,
+    frames: FramesOption = None,
+    every: EveryOption = 1,
     grid: GridOption = None,
     truth: TruthOption = None,
     truth_grid: TruthGridOption = None,
     sequence: SequenceOption = None,
     classes: ClassesOption = None,
-    path_classes: PathClassesOption = None,
+    source_classes: SourceClassesOption = None,
     palette: Annotated[
         Literal["class", "colorblind"],
-        typer.Option(help="The classes' own colours, or ones that the colour-blind tell apart."),
+        typer.Option(help="Colours of the class table, or colours for colour-blind readers."),
     ] = "class",
-    thin: Annotated[float, typer.Option(help="A page's points are thinned to one a cell of this side, metres.")] = 0.2,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a page that is there.")] = False,
+    thin_m: Annotated[
+        float, typer.Option("--thin", help="Thin the points of a page to one per cell of this side length, metres.")
+    ] = 0.2,
+    overwrite: OverwriteOption = False,
     as_json: Json = False,
 ) -> None:
-    """Look at a sequence: in a window (Open3D), or in a page that any browser opens (--html), without a network.
+    """Show a sequence in a window (Open3D), or write it as a page that any browser opens without a network (--out).
 
-    Keys and mouse step, play, and show or hide the grid, points, flow and classes.
+    Both can be turned and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes. Without --frames, a
+    window shows all frames and a page shows the first 60.
     """
-    from carlasc.viewing import make_page, show
+    from carlasc import viewing
 
-    chosen: dict[str, Any] = {
-        "sequence": sequence,
-        "frames": parse_frames(frames),
-        "every": every,
-        "grid": grid,
-        "truth": truth,
-        "truth_grid": truth_grid,
-        "classes": classes,
-        "path_classes": path_classes,
-        "palette": palette,
-    }
-    if html is None:
+    scene = viewing.Scene(
+        source,
+        sequence=sequence,
+        frames=None if frames is None else FrameRange.parse(frames),
+        every=every,
+        grid=grid,
+        truth=truth,
+        truth_grid=truth_grid,
+        classes=classes,
+        source_classes=source_classes,
+        palette=palette,
+    )
+    if out is None:
         if as_json:
-            raise ArgumentError("--json: expected --html beside it: a window has no figures")
-        show(path, **chosen, report=typer.echo)
+            raise ArgumentError("--json", problem="a window has no figures to print", advice="write a page with `out`")
+        viewing.view(scene, report=typer.echo)
         return
     with progress_bar("Writing the page") as progress:
-        result = make_page(path, html, **chosen, thin_m=thin, overwrite=overwrite, progress=progress)
+        result = viewing.view(scene, out, thin_m=thin_m, overwrite=overwrite, progress=progress)
     if as_json:
         print_json(result)
         return
     for note in result.notes:
         typer.echo(note)
-    shown = f"frame {result.frames[0]}" if len(result.frames) == 1 else f"{len(result.frames)} frames"
-    typer.echo(f"{result.out}: {result.sequence}, {shown}, {result.size_bytes / 1e6:.1f} MB: open it in a browser")
+    size = f"{result.size_bytes / 1e6:.1f} MB"
+    typer.echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: open it in a browser")

@@ -1,5 +1,6 @@
 """How good a grid is: confusion matrix, IoU, completeness, masks of the voxels that count, and scores of data sets."""
 
+from carlasc.metrics.comparison import Outcome, compare_grids
 from carlasc.metrics.confusion import Completeness, ConfusionMatrix
 from carlasc.metrics.evaluation import evaluate
 from carlasc.metrics.masks import distance_band, field_of_view, known, semantickitti
@@ -11,8 +12,10 @@ __all__ = [
     "Completeness",
     "ConfusionMatrix",
     "Evaluation",
+    "Outcome",
     "Table",
     "TruthScore",
+    "compare_grids",
     "distance_band",
     "evaluate",
     "field_of_view",

@@ -1,23 +1,37 @@
-"""Looking at sequences: pictures and films, a page that any browser opens, a window on the desktop."""
+"""Looking at sequences: pictures and films, a page for any browser, a window on the desktop."""
 
-from carlasc.viewing.clip import Clip, FrameContent, PanelSpec, open_clip
-from carlasc.viewing.page.page import PageResult, make_page
-from carlasc.viewing.rendering import RenderResult, Viewpoint, render, render_comparison, render_grid, render_scan
-from carlasc.viewing.window.window import Window, show
+from carlasc.viewing.colors import ClassColors, Entry, colorblind_palette
+from carlasc.viewing.page.page import PageResult
+from carlasc.viewing.rendering.cameras import Viewpoint
+from carlasc.viewing.rendering.drawings import Drawing, error_drawing, flow_drawing, grid_drawing, scan_drawing
+from carlasc.viewing.rendering.pictures import Panel, draw_panels, render_comparison, render_grid, render_scan
+from carlasc.viewing.rendering.run import RenderResult, render
+from carlasc.viewing.scene import FrameContent, GridPanel, Scene, SceneReader
+from carlasc.viewing.viewer import view
+from carlasc.viewing.window.window import Window
 
 __all__ = [
-    "Clip",
+    "ClassColors",
+    "Drawing",
+    "Entry",
     "FrameContent",
+    "GridPanel",
     "PageResult",
-    "PanelSpec",
+    "Panel",
     "RenderResult",
+    "Scene",
+    "SceneReader",
     "Viewpoint",
     "Window",
-    "make_page",
-    "open_clip",
+    "colorblind_palette",
+    "draw_panels",
+    "error_drawing",
+    "flow_drawing",
+    "grid_drawing",
     "render",
     "render_comparison",
     "render_grid",
     "render_scan",
-    "show",
+    "scan_drawing",
+    "view",
 ]

@@ -23,7 +23,7 @@ from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, count_votes, regrid
 from carlasc.metrics import TruthScore, score_truth
-from carlasc.viewing.rendering import ClassColors, Panel, draw_panels, grid_scene
+from carlasc.viewing import ClassColors, Panel, draw_panels, grid_drawing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.kitti import write_kitti
@@ -107,7 +107,7 @@ def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) 
         "carlasc convert (align)": made["align, by instances"][frame],
         "reference: 60 sensors at that instant": truths[frame],
     }
-    panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
+    panels = [Panel(grid_drawing(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
     picture = Image.fromarray(draw_panels(panels, size=(1800, 640)))
     picture.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
 

@@ -24,7 +24,7 @@ from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, Voting, count_votes, regrid
 from carlasc.metrics import TruthScore, score_truth
 from carlasc.storage import FolderSink, layout
-from carlasc.viewing.rendering import ClassColors, Panel, draw_panels, grid_scene
+from carlasc.viewing import ClassColors, Panel, draw_panels, grid_drawing
 
 FRAMES = 101
 JUDGED = [int(frame) for frame in np.linspace(0, FRAMES - 1, 10)]
@@ -142,7 +142,7 @@ def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) 
         "carlasc (align)": made["align"][frame],
         "reference: 60 sensors at that instant": truths[frame],
     }
-    panels = [Panel(grid_scene(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
+    panels = [Panel(grid_drawing(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
     Image.fromarray(draw_panels(panels, size=(1800, 430))).quantize(128).save(path, optimize=True)
 
 

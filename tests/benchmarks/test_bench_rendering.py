@@ -7,7 +7,7 @@ import pytest
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.viewing.rendering import render_grid, render_scan
+from carlasc.viewing import render_grid, render_scan
 
 
 def street(spec):

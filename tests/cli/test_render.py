@@ -27,7 +27,7 @@ def test_a_picture_of_the_golden_grids(golden_capture, tmp_path, grid):
 def test_frames_become_a_film_and_figures_are_json(golden_capture, tmp_path):
     result = call(
         golden_capture / "cartesian", "--frames", "0:2", "-o", tmp_path / "drive.mp4", "--size", "321x180",
-        "--workers", 1, "--json", "--view", "bev", "--camera", "azimuth=20",
+        "--workers", 1, "--json", "--view", "bev", "--viewpoint", "azimuth=20",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     figures = json.loads(result.stdout)
@@ -38,13 +38,16 @@ def test_frames_become_a_film_and_figures_are_json(golden_capture, tmp_path):
 @pytest.mark.parametrize(
     ("options", "code", "word"),
     [
-        (["--frame", 9], 1, "expected frame 9"),
-        (["-o", "a.bmp"], 2, "a.bmp"),
+        (["--frames", 9], 1, "expected frames 9:10"),
+        (["-o", "a.bmp"], 2, "--out: expected a file name that ends in .png or .gif or .mp4, found a.bmp"),
         (["--size", "big"], 2, "--size"),
-        (["--camera", "zoom=3"], 2, "camera"),
-        (["--what", "errors"], 2, "--truth"),
+        (["--viewpoint", "zoom=3"], 2, "--viewpoint: expected"),
+        (["--what", "errors"], 2, "give it with `--truth`"),
         (["--frames", "3:1"], 2, "--frames"),
         (["--grid", "fine"], 1, "fine"),
+        (["--classes", "mine"], 2, "--classes: expected"),
+        (["--source-classes", "mine"], 2, "--source-classes: expected"),
+        (["--orbit", "-o", "a.png"], 2, "--orbit: expected a film"),
     ],
 )
 def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):

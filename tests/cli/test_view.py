@@ -13,16 +13,14 @@ def call(*options):
 
 
 def test_a_page_is_written_and_named(golden_capture, tmp_path):
-    result = call(golden_capture / "cartesian", "--html", tmp_path / "scene.html")
+    result = call(golden_capture / "cartesian", "-o", tmp_path / "scene.html")
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith(f"{tmp_path}/scene.html: ") and "3 frames" in result.stdout
     assert (tmp_path / "scene.html").read_text().startswith("<!doctype html>")
 
 
 def test_figures_are_json(golden_capture, tmp_path):
-    result = call(
-        golden_capture / "cylindrical", "--html", tmp_path / "a.html", "--frames", "1:3", "--every", 2, "--json"
-    )
+    result = call(golden_capture / "cylindrical", "-o", tmp_path / "a.html", "--frames", "1:3", "--every", 2, "--json")
     figures = json.loads(result.stdout)
     assert figures["frames"] == [1] and figures["size_bytes"] == (tmp_path / "a.html").stat().st_size
 
@@ -30,12 +28,13 @@ def test_figures_are_json(golden_capture, tmp_path):
 @pytest.mark.parametrize(
     ("options", "code", "word"),
     [
-        (["--html", "a.txt"], 2, ".html"),
-        (["--html", "a.html", "--frames", "9:12"], 1, "expected frames 9:12"),
-        (["--html", "a.html", "--grid", "fine"], 1, "fine"),
-        (["--html", "a.html", "--thin", "0"], 2, "thin"),
-        (["--html", "a.html", "--classes", "mine"], 2, "mine"),
-        (["--json"], 2, "--html"),
+        (["-o", "a.txt"], 2, ".html"),
+        (["-o", "a.html", "--frames", "9:12"], 1, "choose others with `--frames`"),
+        (["-o", "a.html", "--grid", "fine"], 1, "fine"),
+        (["-o", "a.html", "--thin", "0"], 2, "--thin"),
+        (["-o", "a.html", "--classes", "mine"], 2, "--classes: expected"),
+        (["-o", "a.html", "--frames", "x"], 2, "--frames: expected"),
+        (["--json"], 2, "--out"),
     ],
 )
 def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
@@ -49,9 +48,9 @@ def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path,
 def test_a_page_that_is_there_is_only_replaced_when_asked(tmp_path):
     data = write_blocks(tmp_path / "data" / "cartesian", frames=1)
     (tmp_path / "a.html").write_text("mine")
-    assert call(data, "--html", tmp_path / "a.html").exit_code == 1
+    assert call(data, "-o", tmp_path / "a.html").exit_code == 1
     assert (tmp_path / "a.html").read_text() == "mine"
-    assert call(data, "--html", tmp_path / "a.html", "--overwrite").exit_code == 0
+    assert call(data, "-o", tmp_path / "a.html", "--overwrite").exit_code == 0
     assert (tmp_path / "a.html").read_text() != "mine"
 
 
@@ -63,7 +62,7 @@ def test_without_a_screen_the_window_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     result = call(write_blocks(tmp_path / "data" / "cartesian", frames=1))
     assert result.exit_code == 1
-    assert "DISPLAY" in result.stderr and "--html" in result.stderr and result.stderr.count("\n") == 1
+    assert "DISPLAY" in result.stderr and "`--out page.html`" in result.stderr and result.stderr.count("\n") == 1
 
 
 def test_without_open3d_the_window_names_the_extra(tmp_path, monkeypatch):

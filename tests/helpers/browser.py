@@ -36,7 +36,7 @@ def start_chromium(profile: Path) -> Any:
 
 
 class Page:
-    """A page that `carlasc view --html` wrote, opened."""
+    """A page that `carlasc view --out` wrote, opened."""
 
     def __init__(self, browser: Any, path: Path, size: tuple[int, int] = (1000, 640)) -> None:
         self.browser = browser

@@ -28,13 +28,13 @@ def test_the_package_of_a_missing_library_is_named(monkeypatch, message, package
     with pytest.raises(DependencyError) as error:
         import_open3d()
     said = str(error.value)
-    assert f"apt-get install {package} " in said and message.split(":")[0] in said and "--html" in said
+    assert f"apt-get install {package} " in said and message.split(":")[0] in said and '`out="page.html"`' in said
     assert "\n" not in said
 
 
 def test_a_library_that_is_not_known_is_named_as_it_is():
     assert missing_library("libstrange.so.3: cannot open shared object file: No such file") == "libstrange.so.3"
-    assert "--html" in libraries.advice("libstrange.so.3")
+    assert "page.html" in libraries.advice("libstrange.so.3")
     assert missing_library("undefined symbol: foo") is None
 
 

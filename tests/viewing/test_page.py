@@ -1,18 +1,15 @@
 import base64
 import json
 import re
-import shutil
 
 import numpy as np
 import pytest
 from helpers.blocks import write_blocks
+from helpers.viewing import write_page
 
-from carlasc.core.grids import Grid, GridSpec
-from carlasc.core.tables import REMAPS
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.storage import open as open_source
-from carlasc.viewing import make_page, open_clip
-from carlasc.viewing.clip import INVENTED, MISSED, RIGHT, WRONG, compare
 from carlasc.viewing.page.coding import unpack_arrays
 
 
@@ -25,7 +22,7 @@ def read_page(path):
 
 
 def test_a_page_holds_the_grids_as_they_are(golden_capture, tmp_path):
-    result = make_page(golden_capture / "cartesian", tmp_path / "scene.html")
+    result = write_page(golden_capture / "cartesian", tmp_path / "scene.html")
     _, scene, frames = read_page(result.out)
     (sequence,) = open_source(golden_capture / "cartesian").sequences().values()
     assert scene["frames"] == [0, 1, 2] == list(result.frames)
@@ -39,8 +36,34 @@ def test_a_page_holds_the_grids_as_they_are(golden_capture, tmp_path):
         assert np.array_equal(arrays["panel0/votes"], grid.counts.reshape(-1)[index])
 
 
+def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
+    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0)
+    _, scene, frames = read_page(write_page(prediction, tmp_path / "a.html", truth=blocks).out)
+    assert scene["leftHanded"] is True
+    assert scene["tables"]["carla"][4] == ["Pedestrian", "#dc143c"]
+    assert scene["tables"]["errors"][1:] == [
+        ["right class", "#cdd1d6"],
+        ["wrong class", "#d54600"],
+        ["missed: predicted free", "#105abe"],
+        ["invented: free in truth", "#f0c828"],
+    ]
+    assert [panel["title"] for panel in scene["panels"]] == ["prediction", "truth", "errors"]
+    assert [panel["table"] for panel in scene["panels"]] == ["carla", "carla", "errors"]
+    assert scene["panels"][0]["upper"] == pytest.approx([25.6, 25.6, 1.0], abs=1e-3)
+    assert (scene["pointTable"], scene["hasPoints"], scene["hasFlow"], scene["pointCell"]) == ("carla", True, True, 0.2)
+    own, truth, errors = (frames[1][f"panel{number}/label"] for number in range(3))
+    assert (own == 4).sum() == (truth == 4).sum() > 0 and set(np.unique(errors)) == {1, 3, 4}
+    assert {"scan/arrows", "scan/label"} <= set(frames[1])
+
+
+def test_data_with_y_on_the_left_say_so_in_the_page(tmp_path):
+    folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
+    _, scene, _ = read_page(write_page(folder, tmp_path / "scene.html").out)
+    assert (scene["leftHanded"], scene["hasPoints"], scene["hasFlow"]) == (False, False, False)
+
+
 def test_a_page_asks_the_network_for_nothing(golden_capture, tmp_path):
-    text, _, _ = read_page(make_page(golden_capture / "cartesian", tmp_path / "scene.html", frames=(0, 1)).out)
+    text, _, _ = read_page(write_page(golden_capture / "cartesian", tmp_path / "scene.html", frames=(0, 1)).out)
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=[\"'](?!data:)", text)
     assert "default-src 'none'" in text
     assert "Permission is hereby granted" in text  # three.js's licence goes with it
@@ -49,71 +72,38 @@ def test_a_page_asks_the_network_for_nothing(golden_capture, tmp_path):
 
 def test_a_name_cannot_break_the_page(tmp_path):
     folder = write_blocks(tmp_path / "a<script>alert(1)<b" / "cartesian", frames=1, points=False)
-    text, scene, _ = read_page(make_page(folder, tmp_path / "scene.html").out)
+    text, scene, _ = read_page(write_page(folder, tmp_path / "scene.html").out)
     assert scene["name"] == "a<script>alert(1)<b"
     assert "<script>alert" not in text
 
 
-def test_the_first_sixty_frames_are_taken_where_no_range_is_given(tmp_path):
+def test_a_page_shows_the_first_sixty_frames_unless_a_range_is_given(tmp_path):
     folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, points=False)
     for frame in range(1, 65):
         for kind in ("label", "bin"):
             (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(folder / "evaluation" / f"000000.{kind}")
-    clip = open_clip(folder, at_most=60)
-    assert clip.frames == tuple(range(60)) and "65 frames there: took the first 60" in clip.notes[0]
-    assert open_clip(folder, frames=(3, 64), every=20, at_most=2).frames == (3, 23, 43, 63)
-    assert len(open_clip(folder).frames) == 65
+    result = write_page(folder, tmp_path / "a.html")
+    assert result.frames == tuple(range(60)) and result.notes == ("65 frames found, showing the first 60",)
+    ranged = write_page(folder, tmp_path / "b.html", frames=(1, 65))
+    assert ranged.frames == tuple(range(1, 65)) and ranged.notes == ()
 
 
-def test_errors_are_told_where_the_truth_is_known():
-    spec = GridSpec("cartesian", (6, 1, 1), (0, 0, 0), (6, 1, 1))
-
-    def grid(labels, counts=None):
-        return Grid(
-            spec,
-            np.array(labels, np.uint8).reshape(spec.size),
-            None if counts is None else np.array(counts).reshape(spec.size),
-        )
-
-    found = compare(grid([7, 7, 0, 7, 0, 7]), grid([7, 10, 7, 0, 0, 7], [1, 1, 1, 1, 1, 0]))
-    assert found.labels.reshape(-1).tolist() == [RIGHT, WRONG, MISSED, INVENTED, 0, 0]
-    with pytest.raises(ArgumentError, match="prediction's grid"):
-        compare(grid([0] * 6), Grid(spec.with_size((3, 1, 1)), np.zeros((3, 1, 1), np.uint8)))
-
-
-def test_a_prediction_in_eleven_classes_is_shown_beside_its_truth_in_the_same(blocks, tmp_path):
-    prediction = write_blocks(tmp_path / "Town01_Light" / "cartesian", metadata={"classes": "carlasc11"}, points=False)
-    clip = open_clip(prediction, truth=blocks)
-    assert {panel.colors.table.name for panel in clip.panels} == {"carlasc11", "errors"}
-    assert clip.read(0).grids[1].labels.max() <= 10
-
-
-def test_a_prediction_beside_the_data_brings_points_and_truth_to_its_classes(tmp_path):
-    folder = write_blocks(tmp_path / "Train" / "Town01_Light" / "cartesian")
-    shutil.copytree(folder / "evaluation", folder / "completion")
-    params = json.loads((folder / "evaluation" / "params.json").read_text())
-    (folder / "completion" / "params.json").write_text(json.dumps(params | {"carlasc": {"classes": "carlasc11"}}))
-    for path in (folder / "completion").glob("*.label"):
-        path.write_bytes(REMAPS["carlasc11"](np.fromfile(path, np.uint32)).astype(np.uint32).tobytes())
-    clip = open_clip(folder, grid="completion", truth=folder)
-    content = clip.read(0)
-    assert [panel.colors.table.name for panel in clip.panels] == ["carlasc11", "carlasc11", "errors"]
-    assert clip.colors.table.name == "carlasc11"
-    assert set(np.unique(content.grids[2].labels)) == {0, RIGHT}
-    assert content.scan is not None and content.scan.labels.max() <= 10
-    assert open_clip(folder).colors.table.name == "carla"
-
-
-def test_what_is_not_there_is_named(blocks, tmp_path):
+def test_what_cannot_be_written_is_refused(blocks, tmp_path):
     with pytest.raises(MissingDataError, match="expected frames 7:9, found 0 to 2"):
-        make_page(blocks, tmp_path / "a.html", frames=(7, 9))
+        write_page(blocks, tmp_path / "a.html", frames=(7, 9))
     with pytest.raises(ArgumentError, match=r"\.html"):
-        make_page(blocks, tmp_path / "a.pdf")
+        write_page(blocks, tmp_path / "a.pdf")
     with pytest.raises(ArgumentError, match="every"):
-        make_page(blocks, tmp_path / "a.html", every=0)
+        write_page(blocks, tmp_path / "a.html", every=0)
+    with pytest.raises(ArgumentError, match="palette: expected class or colorblind"):
+        write_page(blocks, tmp_path / "a.html", palette="height")
+    for thin_m in (0, 11):
+        with pytest.raises(ArgumentError, match="thin_m: expected 0.01 to 10 metres"):
+            write_page(blocks, tmp_path / "a.html", thin_m=thin_m)
+    assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.html").write_text("mine")
-    with pytest.raises(ConflictError, match="--overwrite"):
-        make_page(blocks, tmp_path / "a.html")
+    with pytest.raises(ConflictError, match="overwrite=True"):
+        write_page(blocks, tmp_path / "a.html")
 
 
 def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
@@ -141,7 +131,7 @@ def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     writer.write("points", 0, np.column_stack([points, np.zeros(len(points), np.float32)]))
     writer.write("labels", 0, labels.astype(np.uint32))
     assert len(points) > 90_000 and (grid > 0).sum() > 15_000
-    result = make_page(tmp_path / "cartesian", tmp_path / "scene.html")
+    result = write_page(tmp_path / "cartesian", tmp_path / "scene.html")
     text, _, _ = read_page(result.out)
     frame = len(re.search(r'id="frame0">(.*?)</script>', text)[1])
     assert result.size_bytes + 59 * frame < 15e6

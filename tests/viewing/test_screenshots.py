@@ -8,12 +8,12 @@ import pytest
 from helpers.browser import OUTPUT, Page
 from helpers.pixels import color_is_there
 from helpers.screens import virtual_screen
+from helpers.viewing import write_page
 
 from carlasc import regrid, simulate
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError
-from carlasc.viewing import make_page
 from carlasc.viewing.window.libraries import import_open3d
 
 pytestmark = pytest.mark.slow
@@ -28,12 +28,12 @@ def street(tmp_path_factory):
 
 
 def test_the_page_of_a_street(browser, street, tmp_path):
-    page = Page(browser, make_page(street, tmp_path / "scene.html").out, (1280, 860))
+    page = Page(browser, write_page(street, tmp_path / "scene.html").out, (1280, 860))
     page.run("carlasc.panels.setShadows(true)")
     canvas = page.canvas("docs_page")
     for name in ("Road", "Sidewalk", "Vehicle"):  # open, level faces in the sun have the legend's colours
         assert color_is_there(canvas, CARLA.colors[CARLA.id_of(name)])
-    page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.look('top')")
+    page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.setView('top')")
     above = page.canvas("docs_page_dark")
     assert np.median(above.reshape(-1, 3)[:, 0]) < 140
     assert page.complaints() == []
@@ -46,8 +46,8 @@ def test_the_window_of_a_street(street):
         pytest.skip(str(error))
     OUTPUT.mkdir(exist_ok=True)
     script = (
-        "import sys; from PIL import Image; from carlasc.viewing import Window, open_clip;"
-        "window = Window(open_clip(sys.argv[1]), size=(1280, 720)); Image.fromarray(window.picture()).save(sys.argv[2]); window.close()"
+        "import sys; from PIL import Image; from carlasc.viewing import Scene, Window;"
+        "window = Window(Scene(sys.argv[1]).open(), size=(1280, 720)); Image.fromarray(window.picture()).save(sys.argv[2]); window.close()"
     )
     target = OUTPUT / "docs_window.png"
     target.unlink(missing_ok=True)

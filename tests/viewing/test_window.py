@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,27 +12,28 @@ from helpers.browser import OUTPUT
 from helpers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.screens import virtual_screen
 
-from carlasc.errors import CarlascError
+from carlasc.errors import CarlascError, DependencyError
+from carlasc.viewing import Scene, Window
 from carlasc.viewing.window.libraries import import_open3d
+from carlasc.viewing.window.window import KEYS, help_lines
 
 STEPS = """
 import json, sys
 import numpy as np
-from carlasc.viewing import open_clip
-from carlasc.viewing.window.window import Window
+from carlasc.viewing import Scene, Window
 
 data, out, actions = sys.argv[1], sys.argv[2], json.loads(sys.argv[3])
 truth = sys.argv[4] if len(sys.argv) > 4 else None
 said = []
-window = Window(open_clip(data, truth=truth), size=(900, 600), report=said.append)
+window = Window(Scene(data, truth=truth).open(), size=(900, 600), report=said.append)
 pictures = {"start": window.picture()}
 for name, method, arguments in actions:
     getattr(window, method)(*arguments)
     pictures[name] = window.picture()
-look = window.look
+state = window.state
 window.close()
 np.savez_compressed(out, **pictures)
-print(json.dumps({"said": said, "position": look.position, "hidden": sorted(look.hidden), "panel": look.panel}))
+print(json.dumps({"said": said, "position": state.position, "hidden": sorted(state.hidden), "panel": state.panel}))
 """
 
 
@@ -102,43 +104,101 @@ def test_prediction_truth_and_errors_follow_each_other(blocks, tmp_path):
     assert state["said"] == ["truth", "errors"] and state["panel"] == 2
 
 
-def test_keys_are_bound_to_what_they_say(blocks, tmp_path):
-    from carlasc.viewing.clip import open_clip
-    from carlasc.viewing.window.window import Look, Window
+@pytest.fixture
+def open_window(monkeypatch):
+    """Opens a window whose Open3D only records what it is told; returns the window and a function that presses keys."""
+    monkeypatch.setenv("DISPLAY", ":0")
+    o3d = MagicMock()
+    monkeypatch.setattr("carlasc.viewing.window.window.import_open3d", lambda: o3d)
 
-    class Recorder:
-        """Takes the place of Open3D's window: remembers which keys are bound."""
+    def start(*arguments, **options):
+        said = []
+        window = Window(Scene(*arguments, **options).open(), report=said.append)
+        visualizer = o3d.visualization.VisualizerWithKeyCallback.return_value
+        simple = {call.args[0]: call.args[1] for call in visualizer.register_key_callback.call_args_list}
+        digits = {call.args[0]: call.args[1] for call in visualizer.register_key_action_callback.call_args_list}
 
-        def __init__(self):
-            self.keys = {}
+        def press(key, *modifiers):
+            code = ord(key) if isinstance(key, str) else key
+            assert (digits[code](visualizer, *modifiers) if modifiers else simple[code](visualizer)) is True
 
-        def register_key_callback(self, key, action):
-            self.keys[key] = action
+        return window, press, said
 
-        def register_key_action_callback(self, key, action):
-            self.keys[key] = action
+    return start
 
-        def __getattr__(self, _):
-            return lambda *arguments, **options: self
 
-    window = object.__new__(Window)
-    window.clip, window.look, window._visualizer, window._shown, said = open_clip(blocks), Look(), Recorder(), {}, []
-    window.report, window._draw, window._content = said.append, lambda: None, None
-    window._bind_keys()
-    press = window._visualizer.keys
-    press[262](None)
-    assert window.look.position == 1
-    press[263](None)
-    press[263](None)
-    assert window.look.position == 2
-    press[32](None)
-    assert window.look.playing
-    press[ord("G")](None)
-    press[ord("P")](None)
-    assert window.look.layers == {"flow", "vehicle"}
-    press[ord("4")](None, 1, 0)
-    press[ord("4")](None, 0, 0)  # let go
-    press[ord("2")](None, 1, 1)
-    assert window.look.hidden == {4, 12} and said[-2:] == ["Pedestrian: hidden", "TrafficSign: hidden"]
-    press[ord("A")](None)
-    assert window.look.hidden == set()
+def test_keys_do_what_the_help_says(blocks, open_window):
+    window, press, said = open_window(blocks)
+    press(262)
+    assert window.state.position == 1 and said[-1] == "frame 1"
+    press(263)
+    press(263)
+    assert window.state.position == 2 and said[-1] == "frame 2"
+    press(" ")
+    assert window.state.playing
+    press(" ")
+    assert not window.state.playing
+    assert window.state.layers == {"grid", "flow", "vehicle"}
+    for key, layer in (("G", "grid"), ("P", "points"), ("F", "flow"), ("V", "vehicle")):
+        before = set(window.state.layers)
+        press(key)
+        assert window.state.layers ^ before == {layer}
+    press("4", 1, 0)
+    press("4", 0, 0)  # the key is released
+    press("2", 1, 1)
+    press("0", 1, 0)
+    press("1", 1, 2)
+    assert window.state.hidden == {4, 12, 10, 21}
+    assert said[-4:] == ["Pedestrian: hidden", "TrafficSign: hidden", "Vehicle: hidden", "Water: hidden"]
+    press("4", 1, 0)
+    assert said[-1] == "Pedestrian: shown"
+    press("A")
+    assert window.state.hidden == set()
+
+
+def test_the_panel_key_switches_between_prediction_truth_and_errors(blocks, open_window):
+    window, press, said = open_window(blocks, truth=blocks)
+    press("4", 1, 0)
+    for panel in (1, 2, 0):
+        press("T")
+        assert window.state.panel == panel and window.state.hidden == set()
+    assert said[-3:] == ["truth", "errors", "prediction"]
+    press("T")
+    press("T")
+    assert [entry.name for entry in window.classes][:2] == ["right class", "wrong class"]
+
+
+def test_the_help_names_every_key_and_the_class_of_every_digit(blocks, open_window):
+    window, _, _ = open_window(blocks)
+    *keys, classes = help_lines(window)
+    assert [line.split("  ")[0] for line in keys] == list(KEYS)
+    named = dict(part.split(" ", 1) for part in classes.split(", "))
+    assert (named["1"], named["0"], named["Shift+1"], named["Ctrl+1"]) == ("Building", "Vehicle", "Wall", "Water")
+
+
+def test_playing_goes_to_the_next_frame_when_it_is_due_and_starts_again_after_the_last(
+    blocks, open_window, monkeypatch
+):
+    clock = [100.0]
+    monkeypatch.setattr("carlasc.viewing.window.window.time.monotonic", lambda: clock[0])
+    window, press, said = open_window(blocks)
+    press(" ")
+    positions = []
+    for _ in range(4):
+        window.tick()
+        positions.append(window.state.position)
+        window.tick()  # not due yet
+        assert window.state.position == positions[-1]
+        clock[0] += 0.11
+    assert positions == [1, 2, 0, 1]
+    assert said == []  # frames are not named while playing
+
+
+def test_without_a_screen_the_window_says_what_to_do(blocks, monkeypatch):
+    if sys.platform != "linux":
+        pytest.skip("screens are named by DISPLAY on Linux only")
+    monkeypatch.setattr("carlasc.viewing.window.window.import_open3d", MagicMock())
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(DependencyError, match=r"window: expected a screen, found no DISPLAY: .*`out=\"page.html\"`"):
+        Window(Scene(blocks).open())

@@ -1,1 +1,1 @@
-"""A page to share: one HTML file that any browser opens."""
+"""One self-contained HTML file that any browser opens."""

@@ -1,4 +1,4 @@
-"""How a frame becomes few bytes that a browser reads: sparse voxels, thinned points, delta-coded, split in byte planes, deflated."""
+"""Encoding a frame in few bytes for a browser: sparse voxels and thinned points, delta-coded, in byte planes, deflated."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 
 from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
-from carlasc.viewing.rendering.scenes import motion_arrows
+from carlasc.viewing.rendering.drawings import motion_arrows
 
 Arrays = dict[str, NDArray[Any]]
 
-OFFSET_STEPS = 8  # a point's place within its cell, an axis: 2.5 cm in a 0.2 m cell, near the sensor's own noise
+OFFSET_STEPS = (
+    8  # positions of a point within its cell, per axis: 2.5 cm in a 0.2 m cell, about the noise of the sensor
+)
 
 
 def encode_grid(grid: Grid) -> Arrays:
-    """Return the occupied voxels of a grid.
+    """Encode the occupied voxels of a grid.
 
     Returns:
-        `index` gaps between rising C-order indices; `label` of each voxel; `votes` of each voxel and `unknown` gaps between
-        the runs of known and unknown cells (known first), both where the grid has counts.
+        `index`: differences of the rising C-order indices of the voxels. `label`: of each voxel. If the grid has counts, also
+        `votes` of each voxel, and `unknown`: lengths of the alternating runs of known and unknown cells, known ones first.
     """
     flat = grid.labels.reshape(-1)
     occupied = np.flatnonzero(flat)
@@ -39,11 +41,12 @@ def encode_grid(grid: Grid) -> Arrays:
 
 
 def encode_scan(scan: Scan, cell_m: float) -> Arrays:
-    """Return a scan thinned to one point a cell, and an arrow for each thing that moves.
+    """Encode a scan, thinned to one point per cell, and an arrow for each moving actor.
 
     Returns:
-        `box` (3,) int32 first cell an axis and (3,) int32 numbers of cells; `index` gaps between rising C-order cells of the box; `offset` (3 N,) steps within
-        the cell, axis by axis; `label` of each point where there are labels; `arrows` (6 M,) float32: tail and vector (m, m/s).
+        `box` (6,) int32: first cell and number of cells along each axis. `index`: differences of the rising C-order indices of the cells
+        in the box. `offset` (3 N,): position within the cell in steps, axis by axis. `label` of each point, if the scan has labels.
+        `arrows` (6 M,) float32: start point (m) and vector (m/s) of each arrow, if the scan has flow.
     """
     cells = np.floor(scan.points.astype(np.float64) / cell_m).astype(np.int64)
     lower = cells.min(0) if len(cells) else np.zeros(3, np.int64)
@@ -68,8 +71,8 @@ def encode_scan(scan: Scan, cell_m: float) -> Arrays:
 def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Return named flat arrays as one deflated block.
 
-    The block is the length of a JSON header (uint32, little-endian), the header ([name, type, length], ...), and the arrays one
-    after the other, each as the first bytes of all values, then the second ones: neighbouring bytes are alike then.
+    The block holds the length of a JSON header (uint32, little-endian), the header ([name, type, length], ...) and the arrays one after
+    the other. An array is stored as the first bytes of all its values, then the second bytes, and so on, which compresses better.
     """
     header = json.dumps([[name, array.dtype.name, array.size] for name, array in arrays.items()]).encode()
     parts = [struct.pack("<I", len(header)), header]
@@ -80,7 +83,7 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def unpack_arrays(block: bytes) -> Arrays:
-    """Return what `pack_arrays` packed."""
+    """Return the arrays of a block that `pack_arrays` made."""
     data = zlib.decompress(block)
     (length,) = struct.unpack_from("<I", data)
     start, arrays = 4 + length, {}

@@ -1,8 +1,8 @@
-"""Where a picture is taken from.
+"""Cameras: where a picture is taken from.
 
-Everything is in the frame of the data. Only the camera knows its handedness: in CarlaSC's left-handed frame (y right) the
-camera's right is `up x forward`, in a right-handed one (y left) `forward x up`. So left is left in either, and no geometry is ever
-mirrored.
+All coordinates are in the frame of the data. Only the camera depends on the handedness of that frame: in CarlaSC's left-handed frame
+(y right) the camera's right is `up x forward`, in a right-handed one (y left) it is `forward x up`. What is on the vehicle's left is on
+the left of the picture in both, and no geometry is mirrored.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ _NEAREST_M = 1.0
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """What a caller may say of the camera; None leaves it to the fit around the scene.
+    """From where a perspective view is taken. What is None is chosen so that the whole drawing is in the picture.
 
     Attributes:
-        azimuth_rad: where the camera stands around the target: 0 behind the ego vehicle, positive towards its right.
-        elevation_rad: how high it stands above the horizon.
-        distance_m: how far from the target; None: so that the whole scene is in the picture.
-        target: (3,) point that is looked at, metres; None: the middle of the scene.
-        position: (3,) where the camera stands; azimuth, elevation and distance then play no part.
+        azimuth_rad: direction from the target to the camera: 0 is behind the ego vehicle, positive is towards its right.
+        elevation_rad: angle of the camera above the horizon, seen from the target.
+        distance_m: distance from the target; None takes the least distance from which everything is visible.
+        target: (3,) point that the camera looks at, metres; None takes the middle of the drawing.
+        position: (3,) position of the camera, metres; azimuth, elevation and distance are then ignored.
         fov_rad: vertical field of view.
 
     Raises:
-        ArgumentError: a number that makes no camera.
+        ArgumentError: a number that is not finite, or out of range.
     """
 
     azimuth_rad: float = 0.0
@@ -51,24 +51,26 @@ class Viewpoint:
         flat = [self.azimuth_rad, self.elevation_rad, self.fov_rad, self.distance_m or 0.0]
         flat += [*(self.target or ()), *(self.position or ())]
         if not np.isfinite(flat).all():
-            raise ArgumentError("camera", expected="finite numbers", found=f"{self}")
+            raise ArgumentError("viewpoint", expected="finite numbers", found=str(self))
         if not 0 < self.fov_rad < np.pi:
             raise ArgumentError(
-                "camera", expected="a field of view of 0 to 180 degrees", found=f"{np.rad2deg(self.fov_rad):g}"
+                "viewpoint", expected="a field of view between 0 and 180 degrees", found=f"{np.rad2deg(self.fov_rad):g}"
             )
         if abs(self.elevation_rad) > np.pi / 2:
             raise ArgumentError(
-                "camera", expected="an elevation of -90 to 90 degrees", found=f"{np.rad2deg(self.elevation_rad):g}"
+                "viewpoint", expected="an elevation of -90 to 90 degrees", found=f"{np.rad2deg(self.elevation_rad):g}"
             )
         if self.distance_m is not None and self.distance_m <= 0:
-            raise ArgumentError("camera", expected="a distance over 0 m", found=f"{self.distance_m:g}")
+            raise ArgumentError("viewpoint", expected="a distance above 0 m", found=f"{self.distance_m:g}")
 
     @classmethod
     def parse(cls, text: str) -> Viewpoint:
-        """Read `key=value` words: azimuth, elevation, fov in degrees, distance in metres, position and target as x,y,z.
+        """Read "azimuth=30 elevation=20": words `key=value`, separated by spaces.
+
+        Keys are azimuth, elevation and fov (degrees), distance (metres), position and target (x,y,z in metres).
 
         Raises:
-            ArgumentError: an unknown key, or no number.
+            ArgumentError: an unknown key, or a value that is not a number.
         """
         names = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "fov": "fov_rad", "distance": "distance_m"}
         values: dict[str, Any] = {}
@@ -84,20 +86,20 @@ class Viewpoint:
                 values[names[key]] = numbers[0] if key == "distance" else float(np.deg2rad(numbers[0]))
             else:
                 raise ArgumentError(
-                    "camera",
+                    "viewpoint",
                     expected="azimuth=DEG, elevation=DEG, fov=DEG, distance=M, position=X,Y,Z or target=X,Y,Z",
-                    found=f"{word!r}",
+                    found=repr(word),
                 )
         return cls(**values)
 
     def turned(self, angle_rad: float) -> Viewpoint:
-        """Return the viewpoint moved around the target by an angle, positive towards the right.
+        """Return the viewpoint turned around the target by an angle, positive towards the vehicle's right.
 
         Raises:
-            ArgumentError: a fixed position cannot turn.
+            ArgumentError: the viewpoint has a fixed position.
         """
         if self.position is not None:
-            raise ArgumentError("camera", expected="azimuth, elevation and distance for an orbit", found="a position")
+            raise ArgumentError("viewpoint", expected="an azimuth for an orbit", found="a fixed position")
         return replace(self, azimuth_rad=self.azimuth_rad + angle_rad)
 
 
@@ -108,8 +110,8 @@ class Camera:
     Attributes:
         position: (3,) metres.
         axes: (3, 3) rows right, up, forward: unit vectors in the data's frame.
-        half_height: tangent of half the vertical field of view; orthographic: half the height that is seen, metres.
-        orthographic: parallel rays.
+        half_height: tangent of half the vertical field of view; for an orthographic camera half the visible height, metres.
+        orthographic: whether rays are parallel.
     """
 
     position: Floats
@@ -118,9 +120,9 @@ class Camera:
     orthographic: bool = False
 
     def rays(self, width: int, height: int, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return origins and directions (n, 3) float32 through the pixels of some rows, row by row.
+        """Return origins and directions, (n, 3) float32 each, of the rays through the pixels of some rows, row by row.
 
-        Directions have length 1 along the camera's forward axis, so a ray's parameter is the depth.
+        Directions have length 1 along the camera's forward axis, so that the distance along a ray is the depth.
         """
         x = (np.arange(width) + 0.5 - width / 2) * (2 * self.half_height / height)
         y = (height / 2 - np.arange(height)[rows] - 0.5) * (2 * self.half_height / height)
@@ -133,15 +135,15 @@ class Camera:
         return np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
 
     def project(self, points: ArrayLike, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-        """Return pixel column, row and depth of (N, 3) points; only those with a depth over 0 are before a pinhole."""
+        """Return pixel column, row and depth of (N, 3) points; a pinhole camera sees only points with a depth above 0."""
         x, y, depth = self.axes @ (np.asarray(points, np.float64) - self.position).T
         scale = height / (2 * self.half_height)
-        with np.errstate(divide="ignore", invalid="ignore"):  # points beside a pinhole; their depth is not over 0
+        with np.errstate(divide="ignore", invalid="ignore"):  # points with depth 0
             zoom = scale if self.orthographic else scale / depth
             return width / 2 + x * zoom, height / 2 - y * zoom, depth
 
     def footprint(self, height: int) -> float:
-        """Return how wide a pixel is at depth 1 (pinhole), or everywhere (orthographic), metres."""
+        """Return the width of a pixel in metres, at depth 1 (pinhole) or at any depth (orthographic)."""
         return 2 * self.half_height / height
 
     def moved(self, dst_T_src: Transform) -> Camera:
@@ -152,24 +154,27 @@ class Camera:
 
 
 def perspective_camera(
-    scene: Floats, viewpoint: Viewpoint, aspect: float, *, left_handed: bool = True, margin: float = 0.02
+    extent: Floats, viewpoint: Viewpoint, aspect: float, *, left_handed: bool = True, margin: float = 0.02
 ) -> Camera:
-    """Return the camera of a viewpoint; what the viewpoint leaves open is fitted to the scene.
+    """Return the camera of a viewpoint; what the viewpoint leaves open is fitted to the extent.
 
     Args:
-        scene: (N, 3) points that should be in the picture, metres.
-        viewpoint: what is asked for.
-        aspect: width over height.
-        left_handed: the data's frame has y on the right.
-        margin: part of the picture left free on each side by the fit.
+        extent: (N, 3) points that should be in the picture, metres.
+        viewpoint: what is given.
+        aspect: width over height of the picture.
+        left_handed: whether y points to the right in the frame of the data.
+        margin: share of the picture that is left free on each side.
+
+    Raises:
+        ArgumentError: position and target of the viewpoint are equal.
     """
     tan_y = float(np.tan(viewpoint.fov_rad / 2))
-    target = np.asarray(viewpoint.target if viewpoint.target is not None else (scene.min(0) + scene.max(0)) / 2)
+    target = np.asarray(viewpoint.target if viewpoint.target is not None else (extent.min(0) + extent.max(0)) / 2)
     if viewpoint.position is not None:
         position = np.asarray(viewpoint.position, np.float64)
         if np.allclose(position, target):
             raise ArgumentError(
-                "camera", expected="a target away from the position", found=f"both at {target.tolist()}"
+                "viewpoint", expected="a target away from the position", found=f"both at {target.tolist()}"
             )
         return Camera(position, _axes(target - position, left_handed), tan_y)
 
@@ -183,25 +188,25 @@ def perspective_camera(
         return Camera(target - viewpoint.distance_m * axes[2], axes, tan_y)
     seen = 1 - 2 * margin
     if viewpoint.target is None:
-        distance, shift = _fit(scene - target, axes, tan_y * aspect * seen, tan_y * seen)
+        distance, shift = _fit(extent - target, axes, tan_y * aspect * seen, tan_y * seen)
         target = target + shift[0] * axes[0] + shift[1] * axes[1]
     else:
-        distance = max(_fit(scene - target, axes, tan_y * aspect * seen, tan_y * seen)[0], 1.0)
+        distance = max(_fit(extent - target, axes, tan_y * aspect * seen, tan_y * seen)[0], 1.0)
     return Camera(target - distance * axes[2], axes, tan_y)
 
 
-def birdseye_camera(scene: Floats, aspect: float, *, left_handed: bool = True, margin: float = 0.01) -> Camera:
-    """Return an orthographic camera straight above the scene: x is up in the picture, the vehicle's right on the right."""
-    lower, upper = scene.min(0), scene.max(0)
-    extent = np.maximum(upper - lower, 1e-3)
+def birdseye_camera(extent: Floats, aspect: float, *, left_handed: bool = True, margin: float = 0.01) -> Camera:
+    """Return an orthographic camera above the extent: x points up in the picture, the vehicle's right is on the right."""
+    lower, upper = extent.min(0), extent.max(0)
+    size = np.maximum(upper - lower, 1e-3)
     axes = np.array([[0.0, 1.0 if left_handed else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    half_height = max(extent[0], extent[1] / aspect) / 2 / (1 - 2 * margin)
+    half_height = max(size[0], size[1] / aspect) / 2 / (1 - 2 * margin)
     middle = (lower + upper) / 2
     return Camera(np.array([middle[0], middle[1], upper[2] + 10.0]), axes, float(half_height), orthographic=True)
 
 
 def _axes(forward: Floats, left_handed: bool, azimuth: float = 0.0) -> Floats:
-    """Rows right, up, forward of a camera that stands upright; straight down, its top points where `azimuth` looks."""
+    """Return rows right, up, forward of an upright camera; if it looks straight down, its top points along `azimuth`."""
     forward = forward / np.linalg.norm(forward)
     side = 1.0 if left_handed else -1.0
     right = side * np.cross((0.0, 0.0, 1.0), forward)
@@ -214,9 +219,8 @@ def _axes(forward: Floats, left_handed: bool, azimuth: float = 0.0) -> Floats:
 def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[float, tuple[float, float]]:
     """Return the least distance, and the shift along right and up, from which all points are inside the picture.
 
-    No point comes nearer than `_NEAREST_M`: a very wide angle would have the camera stand in the scene's corner.
-
-    A point at (x, y, z) along right, up and forward is inside when |y - shift| <= tan_y (distance + z): two lines an axis.
+    No point is nearer than `_NEAREST_M`: with a very wide field of view the camera would otherwise be at a corner of the points.
+    A point at (x, y, z) along right, up and forward is inside if |y - shift| <= tan_y (distance + z): two lines per axis.
     """
     x, y, z = axes @ points.T
     distances, shifts = [], []

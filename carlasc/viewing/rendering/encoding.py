@@ -1,4 +1,4 @@
-"""Pictures into files: PNG, GIF, and MP4 by the encoder that imageio-ffmpeg brings along. Whole files or none."""
+"""Writing pictures as PNG, GIF and MP4 (with the encoder that imageio-ffmpeg includes). A file is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -19,39 +19,32 @@ STILLS = (".png",)
 FILMS = (".gif", ".mp4")
 
 
-def check_ending(path: Path) -> None:
-    """Raise ArgumentError where a file name tells no format that can be written."""
-    if path.suffix.lower() not in STILLS + FILMS:
-        raise ArgumentError(path, expected=f"a name that ends in {', '.join(STILLS + FILMS)}", found=f"{path.name!r}")
-
-
 def is_film(path: Path) -> bool:
-    """Whether a file name tells a format of many pictures."""
+    """Whether a file name has the ending of a format that holds several pictures."""
     return path.suffix.lower() in FILMS
 
 
 def encodable_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the size a picture for a file must have: H.264 in yuv420p wants even ones, so odd ones grow by a pixel."""
+    """Return the (width, height) of pictures for a file: H.264 in yuv420p needs even numbers, so odd ones grow by one pixel."""
     width, height = size
     return (width + width % 2, height + height % 2) if path.suffix.lower() == ".mp4" else size
 
 
 def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> None:
-    """Write pictures as they come: the first into a PNG, all of them into a GIF or MP4.
+    """Write pictures one after the other: the first one into a PNG, all of them into a GIF or MP4.
 
     Args:
-        path: its ending tells the format.
-        pictures: (H, W, 3) uint8, all of one size, see `encodable_size`; at least one.
-        fps: pictures a second.
+        path: a file name that ends in .png, .gif or .mp4.
+        pictures: (H, W, 3) uint8, all of one size (see `encodable_size`); at least one.
+        fps: pictures per second, above 0.
 
     Raises:
-        ArgumentError: an ending that is no format, or no positive `fps`.
+        ArgumentError: an impossible `fps`.
         StorageError: it cannot be written; nothing is left behind.
         CarlascError: the encoder failed; nothing is left behind.
     """
-    check_ending(path)
     if not 0 < fps <= 240:
-        raise ArgumentError("fps", expected="over 0 to 240 pictures a second", found=f"{fps:g}")
+        raise ArgumentError("fps", expected="above 0 and at most 240 pictures per second", found=f"{fps:g}")
     writers = {".png": _write_png, ".gif": _write_gif, ".mp4": _write_mp4}
     write = writers[path.suffix.lower()]
     write_atomic(path, lambda file: write(file, iter(pictures), fps))
@@ -63,12 +56,12 @@ def _write_png(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
 
 def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
     first, rest = _to_palette(next(pictures)), (_to_palette(picture) for picture in pictures)
-    hundredths = max(2, round(100 / fps))  # what the format counts in; viewers slow down below 2
+    hundredths = max(2, round(100 / fps))  # the unit of the format; viewers slow down below 2
     first.save(file, format="GIF", save_all=True, append_images=rest, duration=10 * hundredths, loop=0, disposal=1)
 
 
 def _to_palette(picture: NDArray[np.uint8]) -> Any:
-    """Return a picture in 256 colours, chosen so that small things keep theirs: a colour weighs less than it is frequent."""
+    """Return a picture in 256 colours. Rare colours weigh more than their frequency, so that small things keep their colour."""
     module = import_extra("PIL.Image", "render")
     packed = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     colors, counts = np.unique(packed, return_counts=True)
@@ -93,7 +86,7 @@ def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=messages,
-            start_new_session=True,  # Ctrl-C is ours to handle
+            start_new_session=True,  # Ctrl-C ends this process, which then ends the encoder
         )
         try:
             _feed(process, picture, pictures)
@@ -103,18 +96,16 @@ def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
             raise
         if process.wait() != 0:
             messages.seek(0)
-            said = messages.read().decode(errors="replace").strip().splitlines() or ["no word"]
-            raise CarlascError(
-                encoder, expected="a film", found=f"exit code {process.returncode}", advice=f"{said[-1]}"
-            )
+            lines = messages.read().decode(errors="replace").strip().splitlines() or ["the encoder printed no message"]
+            raise CarlascError(encoder, problem=f"failed with exit code {process.returncode}", advice=lines[-1])
         with target.open("rb") as film:
             shutil.copyfileobj(film, file)
 
 
 def _feed(process: subprocess.Popen[bytes], first: NDArray[np.uint8], rest: Iterator[NDArray[np.uint8]]) -> None:
-    """Hand pictures to the encoder; one that has died says why by its exit code."""
+    """Write pictures to the encoder's input. If the encoder ends early, its exit code is checked by the caller."""
     if process.stdin is None:
-        raise CarlascError("the film's encoder", expected="a pipe to it", found="none")
+        raise CarlascError("the video encoder", expected="a pipe to its input", found="none")
     with process.stdin as pipe:
         try:
             pipe.write(np.ascontiguousarray(first).data)

@@ -1,4 +1,4 @@
-"""What is ray-cast: meshes of quads. A grid becomes the exposed faces of its occupied voxels, an arrow a few quads."""
+"""Meshes of quads for ray casting: the exposed faces of a grid's occupied voxels, boxes and arrows."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.grids import GridSpec
 
-_WIDEST_ARC_RAD = np.deg2rad(4.0)  # wider cylindrical cells are drawn as several flat pieces
+_WIDEST_ARC_RAD = np.deg2rad(4.0)  # wider cylindrical cells are drawn in several flat pieces
 _SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))  # corners of a face, in order around it
 
 
 @dataclass(frozen=True)
 class QuadMesh:
-    """Flat four-cornered faces.
+    """Flat faces with four corners.
 
     Attributes:
         corners: (Q, 4, 3) float32, metres, in order around each face.
         normals: (Q, 3) float32 unit vectors, outward.
         colors: (Q, 3) uint8 RGB.
-        openness: (Q, 4) float32 0..1: how much of the sky the immediate neighbours leave to each corner.
+        openness: (Q, 4) float32, 0 to 1: share of the sky that the adjacent voxels leave free at each corner.
         edges: (Q, 4) bool: whether the edge from corner i to i + 1 is drawn.
-        open_sky: (Q,) bool: the face counts as seeing the whole sky (one too large for one value all over it).
+        open_sky: (Q,) bool: whether the face counts as seeing the whole sky, because it is too large for a single value.
     """
 
     corners: NDArray[np.float32]
@@ -45,7 +45,7 @@ class QuadMesh:
 
 
 def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
-    """Return one mesh of several."""
+    """Return several meshes as one."""
     return QuadMesh(
         *(
             np.concatenate([getattr(mesh, name) for mesh in meshes])
@@ -55,7 +55,7 @@ def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
 
 
 def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky: bool = False) -> QuadMesh:
-    """Return a mesh of (Q, 4, 3) faces of one colour or (Q, 3) colours; normals by the order of their corners."""
+    """Return a mesh of (Q, 4, 3) faces with one colour or (Q, 3) colours; the order of the corners gives the normals."""
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
     normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -74,7 +74,7 @@ def grid_mesh(spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bo
     """Return the exposed faces of a grid's occupied cells: boxes, or wedges in a cylindrical grid.
 
     Args:
-        spec: where the cells lie.
+        spec: geometry of the grid.
         colors: (X, Y, Z, 3) uint8 RGB of each cell.
         occupied: (X, Y, Z) bool.
     """
@@ -88,7 +88,7 @@ def grid_mesh(spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bo
 
 
 def _surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The cells with a rim of one: empty, but a full turn of azimuth closes on itself."""
+    """Return the cells padded by one empty cell on each side; a full turn of azimuth continues on its other side."""
     solid = np.pad(occupied, 1)
     if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
         solid[:, 0], solid[:, -1] = solid[:, -2], solid[:, 1]
@@ -98,14 +98,14 @@ def _surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_
 def _faces(
     spec: GridSpec, colors: NDArray[np.uint8], solid: NDArray[np.bool_], axis: int, side: int, pieces: int
 ) -> QuadMesh:
-    """The exposed faces towards one side of one axis."""
+    """Return the exposed faces towards one side of one axis."""
     step = np.zeros(3, np.int64)
     step[axis] = 2 * side - 1
     inner = tuple(slice(1, n + 1) for n in spec.size)
     outer = tuple(slice(1 + s, n + 1 + s) for n, s in zip(spec.size, step, strict=True))
     exposed = solid[inner] & ~solid[outer]
     if spec.coordinates == "cylindrical" and axis == 0 and side == 0 and spec.lower[0] == 0:
-        exposed[0] = False  # at the axis the wedge ends in a line
+        exposed[0] = False  # at radius 0 the wedge ends in a line
     cells = np.argwhere(exposed)
 
     across, along = (axis + 1) % 3, (axis + 2) % 3
@@ -135,7 +135,7 @@ def _faces(
 def _corner_openness(
     solid: NDArray[np.bool_], front: NDArray[np.int64], across: int, along: int, first: int, second: int
 ) -> NDArray[np.float32]:
-    """How open a face's corner is, by the three cells around it in the layer in front of the face."""
+    """Return the openness of a corner of each face, from the three cells next to it in the layer in front of the face."""
     one, two = front.copy(), front.copy()
     one[:, across] += first
     two[:, along] += second
@@ -147,7 +147,7 @@ def _corner_openness(
 
 
 def _drawn_edges(cells: NDArray[np.int64], across: int, along: int, pieces: int) -> NDArray[np.bool_]:
-    """Every edge of a face but those between the flat pieces of one wide wedge."""
+    """Return which edges of a face are drawn: all except those between the flat pieces of one wide wedge."""
     drawn = np.ones((len(cells), 4), np.bool_)  # edge 0: along low, 1: across high, 2: along high, 3: across low
     if pieces > 1:
         piece = cells[:, 1] % pieces
@@ -159,9 +159,9 @@ def _drawn_edges(cells: NDArray[np.int64], across: int, along: int, pieces: int)
 
 
 def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
-    """Return (Q, 4, 3) faces, upwards, of the ground plan of a grid at a height, metres."""
+    """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height in metres."""
     pieces = (1, 1)
-    if spec.coordinates == "cylindrical":  # several along the radius too: slivers cost Embree dear
+    if spec.coordinates == "cylindrical":  # several along the radius too: Embree is slow with very thin faces
         pieces = (16, int(np.ceil((spec.upper[1] - spec.lower[1]) / _WIDEST_ARC_RAD)))
     first, second = (np.linspace(spec.lower[a], spec.upper[a], pieces[a] + 1) for a in range(2))
     corners = [
@@ -173,7 +173,7 @@ def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
 
 
 def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 0.0) -> QuadMesh:
-    """Return an axis-aligned box, its top drawn in by `taper` metres on every side."""
+    """Return an axis-aligned box whose top is smaller by `taper` metres on every side."""
     low_high = np.array([lower, upper], np.float32)
     inwards = np.array([[taper, taper, 0.0], [-taper, -taper, 0.0]], np.float32)
     faces = []
@@ -189,13 +189,13 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 
 
 
 def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: ArrayLike, width: float) -> QuadMesh:
-    """Return arrows as six-sided shafts with cones.
+    """Return arrows: shafts with six sides, and cones.
 
     Args:
-        tails: (N, 3) where they begin, metres.
+        tails: (N, 3) start points, metres.
         vectors: (N, 3) from tail to tip, metres, none of length 0.
         color: RGB.
-        width: of the shaft, metres; the head is three times as wide, or shorter arrows in proportion.
+        width: width of the shaft, metres; the head is three times as wide. Short arrows are thinner in proportion.
     """
     lengths = np.linalg.norm(vectors, axis=1)[:, None]
     forward = vectors / lengths

@@ -1,7 +1,7 @@
-"""The page around the pictures: where panels, titles and the legend go, and drawing them. Nothing overlaps, nothing is clipped.
+"""The layout of a picture: panels, their titles and the legend, without overlaps and without clipping.
 
-The page is planned first, so that every panel is rendered at its final size: titles above the panels, the legend in a column on
-the right of square pictures, in rows below wide ones. The font is Pillow's own.
+The layout is computed first, so that every panel is rendered at its final size. Titles are above the panels; the legend is in a column
+to the right of square panels, and in rows below wide ones. The font is the one that Pillow includes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, import_extra
-from carlasc.viewing.rendering.colors import Entry
+from carlasc.viewing.colors import Entry
 
 SMALLEST = (64, 64)
 LARGEST = 16384
@@ -23,7 +23,7 @@ _INK, _FAINT = (40, 42, 48), (110, 114, 122)
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle of the page, pixels from its top left corner."""
+    """A rectangle of the page, in pixels from the top left corner of the page."""
 
     x: int
     y: int
@@ -33,47 +33,44 @@ class Box:
 
 @dataclass(frozen=True)
 class Page:
-    """Where everything goes.
+    """The positions of all parts of a picture.
 
     Attributes:
         size: (width, height) of the whole picture.
         font_size: pixels.
-        panels: where each picture goes.
-        titles: where the title of each goes; empty where there are none.
-        places: (x, y) of the top left corner of each entry of the legend.
-        entries: the legend; those that found no room are left out, and the last one says how many.
+        panels: rectangle of each panel.
+        titles: rectangle of each panel's title; empty if there are no titles.
+        entry_boxes: rectangle of each entry of the legend: a swatch and a name.
+        entries: the legend. Entries for which there is no space are left out; the last entry then says how many.
     """
 
     size: tuple[int, int]
     font_size: int
     panels: list[Box]
     titles: list[Box]
-    places: list[tuple[int, int]]
+    entry_boxes: list[Box]
     entries: list[Entry]
 
 
 def plan_page(
     size: tuple[int, int], panels: int, *, titled: bool, legend: Sequence[Entry], aspect: float = 16 / 9
 ) -> Page:
-    """Lay a page out.
+    """Compute the layout of a picture.
 
     Args:
         size: (width, height) of the whole picture, pixels.
-        panels: how many pictures.
+        panels: number of panels.
         titled: whether they have titles.
-        legend: what stands in the legend; empty for none.
-        aspect: width over height that suits the pictures.
+        legend: entries of the legend; empty for no legend.
+        aspect: preferred width over height of a panel.
 
     Raises:
-        ArgumentError: a size that is no picture.
+        ArgumentError: a size that is too small or too large.
     """
+    check_size(size)
     width, height = size
-    if not (SMALLEST[0] <= width <= LARGEST and SMALLEST[1] <= height <= LARGEST):
-        raise ArgumentError(
-            "size", expected=f"{SMALLEST[0]}x{SMALLEST[1]} to {LARGEST}x{LARGEST} pixels", found=f"{width}x{height}"
-        )
     font_size = int(np.clip(round(min(width / 72, height / 40)), 9, 40))
-    entries, places, area = _place_legend(size, font_size, list(legend), panels, aspect)
+    entries, positions, area = _place_legend(size, font_size, list(legend), panels, aspect)
     columns, rows = _tiling(area.width, area.height, panels, aspect)
     title_height = round(font_size * 1.9) if titled else 0
     gap = max(2, font_size // 2) if panels > 1 else 0
@@ -87,19 +84,34 @@ def plan_page(
         boxes.append(
             Box(area.x + left, area.y + top + title_height, max(1, right - left), max(1, bottom - top - title_height))
         )
-    return Page(size, font_size, boxes, titles if titled else [], places, entries)
+    font = _font(font_size) if entries else None
+    entry_boxes = [
+        Box(x, y, _entry_width(entry, font, font_size), _line(font_size))
+        for entry, (x, y) in zip(entries, positions, strict=True)
+    ]
+    return Page(size, font_size, boxes, titles if titled else [], entry_boxes, entries)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raise ArgumentError if (width, height) in pixels is not a size that a picture can have."""
+    if len(size) != 2 or not all(low <= value <= LARGEST for low, value in zip(SMALLEST, size, strict=True)):
+        raise ArgumentError(
+            "size",
+            expected=f"{SMALLEST[0]}x{SMALLEST[1]} to {LARGEST}x{LARGEST} pixels",
+            found="x".join(map(str, size)),
+        )
 
 
 def draw_page(
     page: Page, pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), notes: Sequence[str | None] = ()
 ) -> NDArray[np.uint8]:
-    """Return the page, (height, width, 3) uint8.
+    """Return the whole picture, (height, width, 3) uint8.
 
     Args:
-        page: the plan.
-        pictures: one a panel, of its size.
-        titles: one a panel, shortened where too long.
-        notes: a line into the middle of a panel, or None.
+        page: the layout.
+        pictures: the picture of each panel, in the panel's size.
+        titles: the title of each panel; shortened if it is too long.
+        notes: for each panel, a line to write into its middle, or None.
     """
     image_module = import_extra("PIL.Image", "render")
     canvas = np.full((page.size[1], page.size[0], 3), 255, np.uint8)
@@ -114,14 +126,14 @@ def draw_page(
         if note:
             text = _shortened(note, font, box.width - 8)
             draw.text((box.x + box.width / 2, box.y + box.height / 2), text, _FAINT, font, anchor="mm")
-    for entry, (x, y) in zip(page.entries, page.places, strict=True):
-        _draw_entry(draw, font, page.font_size, entry, x, y)
+    for entry, box in zip(page.entries, page.entry_boxes, strict=True):
+        _draw_entry(draw, font, page.font_size, entry, box)
     return np.asarray(image)
 
 
-def _draw_entry(draw: Any, font: Any, size: int, entry: Entry, x: int, y: int) -> None:
-    swatch = round(size * 0.95)
-    middle = y + _line(size) / 2
+def _draw_entry(draw: Any, font: Any, size: int, entry: Entry, box: Box) -> None:
+    x, swatch = box.x, round(size * 0.95)
+    middle = box.y + box.height / 2
     top = round(middle - swatch / 2)
     if entry.color != _NO_SWATCH:
         draw.rounded_rectangle(
@@ -141,7 +153,7 @@ def _outline(color: tuple[int, int, int]) -> tuple[int, int, int]:
 def _place_legend(
     size: tuple[int, int], font_size: int, entries: list[Entry], panels: int, aspect: float
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
-    """Return the entries that find room, where they go, and what is left of the page for the panels."""
+    """Return the entries for which there is space, their positions, and the part of the page that is left for the panels."""
     width, height = size
     page = Box(0, 0, width, height)
     if not entries:
@@ -149,11 +161,11 @@ def _place_legend(
     columns, rows = _tiling(width, height, panels, aspect)
     font, pad = _font(font_size), font_size
     widest = max(_entry_width(entry, font, font_size) for entry in entries)
-    if columns * rows > panels:  # the last place of the tiling is free
+    if columns * rows > panels:  # the last cell of the tiling is free
         room = Box(width - width // columns, height - height // rows, width // columns, height // rows)
         if _legend_columns(len(entries), room.height - 2 * pad, font_size) * (widest + pad) + pad <= room.width:
             return entries, _place_in_columns(room, font_size, len(entries), widest), page
-    picture = min(round(aspect * columns / rows * height), width)  # as wide as the pictures can be
+    picture = min(round(aspect * columns / rows * height), width)  # the largest width that the panels can have
     beside = _legend_columns(len(entries), height - 2 * pad, font_size) * (widest + pad) + pad
     if picture + beside <= width or (aspect * columns / rows <= 1.2 and beside <= 0.3 * width < 0.5 * height):
         left = max(0, width - picture - beside) // 2
@@ -164,12 +176,12 @@ def _place_legend(
 
 
 def _legend_columns(entries: int, height: int, font_size: int) -> int:
-    """How many columns hold all entries, at least one row high."""
+    """Return how many columns hold all entries; a column has at least one row."""
     return -(-entries // max(1, height // _line(font_size)))
 
 
 def _place_in_columns(room: Box, font_size: int, entries: int, widest: int) -> list[tuple[int, int]]:
-    """Put all entries into columns in the middle of a room that is large enough."""
+    """Return positions of all entries, in columns in the middle of a rectangle that is large enough."""
     pad, line = font_size, _line(font_size)
     columns = _legend_columns(entries, room.height - 2 * pad, font_size)
     rows = -(-entries // columns)
@@ -181,7 +193,7 @@ def _place_in_columns(room: Box, font_size: int, entries: int, widest: int) -> l
 def _place_below(
     size: tuple[int, int], font_size: int, entries: list[Entry]
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
-    """Put entries into centred rows at the bottom, in at most 40 % of the page; what finds no room is counted."""
+    """Place entries in centred rows at the bottom, in at most 40 % of the page; the last entry counts those left out."""
     width, height = size
     font, pad, line = _font(font_size), font_size, _line(font_size)
     rows_allowed = max(1, int(0.4 * height) // line)
@@ -193,13 +205,13 @@ def _place_below(
         if len(lines) <= rows_allowed:
             break
     top = height - len(lines) * line - pad // 2
-    places = []
+    positions = []
     for number, row in enumerate(lines):
         x = (width - sum(widths[i] for i in row) - pad * (len(row) - 1)) // 2
         for i in row:
-            places.append((max(0, x), top + number * line))
+            positions.append((max(0, x), top + number * line))
             x += widths[i] + pad
-    return shown, places, Box(0, 0, width, max(1, top - pad // 2))
+    return shown, positions, Box(0, 0, width, max(1, top - pad // 2))
 
 
 def _cut(entries: list[Entry], room: int) -> list[Entry]:
@@ -209,7 +221,7 @@ def _cut(entries: list[Entry], room: int) -> list[Entry]:
 
 
 def _wrap(widths: list[int], room: int, gap: int) -> list[list[int]]:
-    """Break entries into as few rows as they need, and these about equally long."""
+    """Break entries into as few rows as possible, of about equal length."""
     fewest = len(_fill(widths, room, gap))
     limits = range(max(widths), room, 4)
     return next(
@@ -230,7 +242,7 @@ def _fill(widths: list[int], limit: int, gap: int) -> list[list[int]]:
 
 
 def _tiling(width: int, height: int, panels: int, aspect: float) -> tuple[int, int]:
-    """Return the columns and rows in which pictures of an aspect come out largest; rather beside than above each other."""
+    """Return the columns and rows in which panels of an aspect are largest; of equal ones, those with more columns."""
 
     def scale(columns: int) -> float:
         rows = -(-panels // columns)

@@ -1,4 +1,4 @@
-"""One picture: scenes, each from a viewpoint, on a page."""
+"""Pictures of grids and scans as arrays: drawings, each seen from a viewpoint, side by side."""
 
 from __future__ import annotations
 
@@ -15,10 +15,17 @@ from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
+from carlasc.viewing.colors import ClassColors, Entry, PaletteName, merge_legends
 from carlasc.viewing.rendering.cameras import Viewpoint, birdseye_camera, perspective_camera
-from carlasc.viewing.rendering.colors import ClassColors, Entry, PaletteName, merge_legends
+from carlasc.viewing.rendering.drawings import (
+    Drawing,
+    Extent,
+    error_drawing,
+    flow_drawing,
+    grid_drawing,
+    scan_drawing,
+)
 from carlasc.viewing.rendering.pages import Page, draw_page, plan_page
-from carlasc.viewing.rendering.scenes import Extent, Scene, error_scene, flow_scene, grid_scene, scan_scene
 
 View = Literal["perspective", "bev"]
 VIEWS: tuple[str, ...] = get_args(View)
@@ -27,19 +34,20 @@ DEFAULT_SIZE = (1280, 720)
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture of a page.
+    """A drawing seen from a view: one part of a picture.
 
     Attributes:
-        scene: what is drawn.
-        view: "perspective" or "bev".
-        title: what stands above it.
-        standpoint: for a camera that does not move with the scene: what it shows, and scene_T_standpoint from there.
+        drawing: what is drawn.
+        view: "perspective" or "bev" (bird's-eye view).
+        title: line above the panel; "" for none.
+        fixed_view: for a camera that is not fitted to the drawing: extent of what it shows, and `drawing_T_view`, the frame of
+            that extent.
     """
 
-    scene: Scene
+    drawing: Drawing
     view: View = "perspective"
     title: str = ""
-    standpoint: tuple[Extent, Transform] | None = None
+    fixed_view: tuple[Extent, Transform] | None = None
 
 
 def draw_panels(
@@ -50,28 +58,29 @@ def draw_panels(
     legend: Sequence[Entry] | bool = True,
     left_handed: bool = True,
 ) -> NDArray[np.uint8]:
-    """Draw scenes side by side.
+    """Draw panels side by side.
 
     Args:
         panels: what is drawn.
-        viewpoint: where the perspective views are taken from; behind and above the ego vehicle if None.
+        viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
         size: (width, height) of the whole picture, pixels.
-        legend: whether there is one; or its entries, where a film wants the same in all its frames.
-        left_handed: the frame of the data has y on the right.
+        legend: whether there is a legend; or its entries, so that all pictures of a film have the same legend.
+        left_handed: whether y points to the right in the frame of the data.
 
     Returns:
         (height, width, 3) uint8 RGB.
 
     Raises:
-        ArgumentError: a size, view or viewpoint that makes no picture.
+        ArgumentError: no panel, or an impossible size, view or viewpoint.
+        DependencyError: Pillow or Embree is not installed.
     """
     if not panels:
         raise ArgumentError("panels", expected="at least one", found="none")
     for panel in panels:
         if panel.view not in VIEWS:
-            raise ArgumentError(f"view {panel.view!r}: expected one of {', '.join(VIEWS)}")
+            raise ArgumentError("view", expected=f"one of {', '.join(VIEWS)}", found=repr(panel.view))
     entries = (
-        (merge_legends([p.scene.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
+        (merge_legends([p.drawing.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
     )
     page = plan_page(
         size,
@@ -83,7 +92,7 @@ def draw_panels(
     pictures = [
         _draw(panel, page, number, viewpoint or Viewpoint(), left_handed) for number, panel in enumerate(panels)
     ]
-    return draw_page(page, pictures, [panel.title for panel in panels], [panel.scene.note for panel in panels])
+    return draw_page(page, pictures, [panel.title for panel in panels], [panel.drawing.note for panel in panels])
 
 
 def render_grid(
@@ -99,30 +108,31 @@ def render_grid(
     title: str = "",
     ego: bool = True,
 ) -> NDArray[np.uint8]:
-    """Picture a voxel grid; free and unknown voxels are not drawn.
+    """Draw a voxel grid, without free and unknown voxels.
 
     Args:
         grid: Cartesian or cylindrical.
-        table: of its labels.
-        view: "perspective" or "bev" (bird's-eye).
-        viewpoint: where a perspective view is taken from.
+        table: class table of its labels.
+        view: "perspective" or "bev" (bird's-eye view).
+        viewpoint: where a perspective view is taken from; None takes a point behind and above the ego vehicle.
         size: (width, height), pixels.
         palette: "class", "colorblind" or "height".
-        legend: whether classes are named; those present, by id.
-        left_handed: the frame has y on the right (CarlaSC); False: on the left (KITTI).
-        title: a line above the picture.
-        ego: draw a plain car at the sensor's place.
+        legend: whether there is a legend, of the classes in the grid.
+        left_handed: whether y points to the right (CarlaSC) or to the left (KITTI) in the frame of the grid.
+        title: a line above the picture; "" for none.
+        ego: whether a plain car is drawn at the sensor.
 
     Returns:
         (height, width, 3) uint8 RGB.
 
     Raises:
-        FormatError: a label is not of the table.
-        ArgumentError: an argument makes no picture.
+        FormatError: a label is not in the class table.
+        ArgumentError: an impossible size, view or palette.
+        DependencyError: Pillow or Embree is not installed.
     """
-    scene = grid_scene(grid, ClassColors(table, palette), ego=ego)
+    drawing = grid_drawing(grid, ClassColors(table, palette), ego=ego)
     return draw_panels(
-        [Panel(scene, view, title)], viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed
+        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed
     )
 
 
@@ -141,33 +151,34 @@ def render_scan(
     flow: bool = False,
     extent: Extent | None = None,
 ) -> NDArray[np.uint8]:
-    """Picture a scan's points, by class, by height where they have none, or how they move.
+    """Draw the points of a scan, coloured by class (by height if they have no labels), or their scene flow.
 
     Args:
-        scan: in the sensor's frame.
-        table: of its labels.
-        view: "perspective" or "bev".
-        viewpoint: where a perspective view is taken from.
+        scan: in the frame of the sensor.
+        table: class table of its labels.
+        view: "perspective" or "bev" (bird's-eye view).
+        viewpoint: where a perspective view is taken from; None takes a point behind and above the ego vehicle.
         size: (width, height), pixels.
         palette: "class", "colorblind" or "height".
-        legend: whether colours are explained.
-        left_handed: the frame has y on the right (CarlaSC); False: on the left (KITTI).
-        title: a line above the picture.
-        ego: draw a plain car at the sensor's place.
-        flow: draw what stands grey, what moves in colour, with an arrow as long as the way of one second.
-        extent: (M, 3) points, metres, that a fitted camera shows; most of the scan if None.
+        legend: whether there is a legend.
+        left_handed: whether y points to the right (CarlaSC) or to the left (KITTI) in the frame of the scan.
+        title: a line above the picture; "" for none.
+        ego: whether a plain car is drawn at the sensor.
+        flow: draw static points in grey, moving ones in colour, with an arrow as long as the distance moved in one second.
+        extent: (M, 3) points, metres, that the camera shows; None shows most of the scan.
 
     Returns:
         (height, width, 3) uint8 RGB.
 
     Raises:
-        FormatError: a label is not of the table, or flow is wanted of a scan without.
-        ArgumentError: an argument makes no picture.
+        FormatError: a label is not in the class table, or `flow` is given and the scan has no flow.
+        ArgumentError: an impossible size, view or palette.
+        DependencyError: Pillow or Embree is not installed.
     """
-    draw = flow_scene if flow else scan_scene
-    scene = draw(scan, ClassColors(table, palette), extent=extent, ego=ego)
+    draw = flow_drawing if flow else scan_drawing
+    drawing = draw(scan, ClassColors(table, palette), extent=extent, ego=ego)
     return draw_panels(
-        [Panel(scene, view, title)], viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed
+        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed
     )
 
 
@@ -185,46 +196,47 @@ def render_comparison(
     left_handed: bool = True,
     ego: bool = True,
 ) -> NDArray[np.uint8]:
-    """Picture a prediction beside its truth and, with `errors`, where it is right, wrong, misses and invents.
+    """Draw a prediction beside the ground truth and, with `errors`, where it is right, wrong, missed or invented.
 
     Args:
-        prediction: of the truth's cells.
-        truth: with counts: errors are shown where it is known.
-        table: of both grids' labels.
-        errors: add the picture of errors.
-        view: "perspective" or "bev".
-        viewpoint: where perspective views are taken from.
-        size: (width, height) of the whole, pixels.
+        prediction: a grid with the geometry of the truth.
+        truth: the ground truth; with counts, errors are shown only where it is known.
+        table: class table of the labels of both grids.
+        errors: whether a panel shows the errors.
+        view: "perspective" or "bev" (bird's-eye view).
+        viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
+        size: (width, height) of the whole picture, pixels.
         palette: "class", "colorblind" or "height".
-        legend: whether colours are explained.
-        left_handed: the frame has y on the right (CarlaSC); False: on the left (KITTI).
-        ego: draw a plain car at the sensor's place.
+        legend: whether there is a legend.
+        left_handed: whether y points to the right (CarlaSC) or to the left (KITTI) in the frame of the grids.
+        ego: whether a plain car is drawn at the sensor.
 
     Returns:
         (height, width, 3) uint8 RGB.
 
     Raises:
-        FormatError: a label is not of the table.
-        ArgumentError: the grids differ in their cells, or an argument makes no picture.
+        FormatError: a label is not in the class table.
+        ArgumentError: the grids differ in their geometry; or an impossible size, view or palette.
+        DependencyError: Pillow or Embree is not installed.
     """
     colors = ClassColors(table, palette)
     panels = [
-        Panel(grid_scene(prediction, colors, ego=ego), view, "prediction"),
-        Panel(grid_scene(truth, colors, ego=ego), view, "truth"),
+        Panel(grid_drawing(prediction, colors, ego=ego), view, "prediction"),
+        Panel(grid_drawing(truth, colors, ego=ego), view, "truth"),
     ]
     if errors:
-        panels.append(Panel(error_scene(prediction, truth, ego=ego), view, "errors"))
+        panels.append(Panel(error_drawing(prediction, truth, ego=ego), view, "errors"))
     return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed)
 
 
 def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, left_handed: bool) -> NDArray[np.uint8]:
     box = page.panels[number]
     aspect = box.width / box.height
-    extent = panel.scene.extent if panel.standpoint is None else panel.standpoint[0]
+    extent = panel.drawing.extent if panel.fixed_view is None else panel.fixed_view[0]
     if panel.view == "bev":
         camera = birdseye_camera(extent, aspect, left_handed=left_handed)
     else:
         camera = perspective_camera(extent, viewpoint, aspect, left_handed=left_handed)
-    if panel.standpoint is not None:
-        camera = camera.moved(panel.standpoint[1])
-    return panel.scene.draw(camera, box.width, box.height, left_handed=left_handed)
+    if panel.fixed_view is not None:
+        camera = camera.moved(panel.fixed_view[1])
+    return panel.drawing.render(camera, box.width, box.height, left_handed=left_handed)

@@ -1,7 +1,7 @@
-"""Meshes to pictures: rays against Embree, then light. No screen, no GPU.
+"""Ray casting of meshes with Embree on the CPU: no screen and no GPU are needed.
 
-A sun with soft shadows, and a sky: a face takes as much of it as a handful of rays from the face find free. Voxels get thin
-edges, which fade where a voxel is only a few pixels wide.
+Light comes from a sun with soft shadows and from the sky: each face receives the share of the sky that a few rays from the face find
+free. Voxels have thin edges, which fade where a voxel is only a few pixels wide.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
 BACKGROUND = 255
-SAMPLES = 2  # samples a pixel, each way
+SAMPLES = 2  # per pixel and direction
 
 _SKY_RAYS = 12
-_SKY_RANGE_M = 6.0  # what stands farther away darkens no sky
-_TO_SUN = np.array([-0.42, -0.62, 1.0])  # from behind on the left
+_SKY_RANGE_M = 6.0  # farther faces do not hide the sky
+_TO_SUN = np.array([-0.42, -0.62, 1.0])  # the sun is behind the vehicle, on its left
 _AMBIENT = 0.6
-_SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that an open, level, sunlit face has just its own colour
+_SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that a level face in the sun has exactly its own colour
 _EDGE_DARKNESS = 0.34
-_BAND = 1 << 19  # rays at a time: keeps memory bounded
+_BAND = 1 << 19  # rays cast at a time, which bounds memory
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture with its depth, `SAMPLES` times as wide and high as what comes out of it.
+    """The samples of a picture and their depth; `SAMPLES` times as wide and high as the picture.
 
     Attributes:
         colors: (h, w, 3) uint8 RGB.
-        depth: (h, w) float32 metres along the camera's axis; infinite where nothing is.
+        depth: (h, w) float32 metres along the camera's axis; infinite where nothing was hit.
     """
 
     colors: NDArray[np.uint8]
     depth: NDArray[np.float32]
 
     def resolve(self) -> NDArray[np.uint8]:
-        """Return (H, W, 3) uint8: the mean of each pixel's samples."""
+        """Return the picture, (H, W, 3) uint8: the mean of the samples of each pixel."""
         total = np.full((self.depth.shape[0] // SAMPLES, self.depth.shape[1] // SAMPLES, 3), SAMPLES, np.uint16)
         for row in range(SAMPLES):
             for column in range(SAMPLES):
@@ -51,19 +51,22 @@ class Frame:
 
 
 def empty_frame(width: int, height: int) -> Frame:
-    """Return a frame for a picture of width x height pixels with nothing in it."""
+    """Return an empty frame for a picture of width x height pixels."""
     shape = (height * SAMPLES, width * SAMPLES)
     return Frame(np.full((*shape, 3), BACKGROUND, np.uint8), np.full(shape, np.inf, np.float32))
 
 
 def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = True) -> None:
-    """Draw a mesh into a frame, lit.
+    """Draw a mesh into a frame, with light and shadows.
 
     Args:
-        mesh: what to draw.
-        camera: where from.
-        frame: drawn into; what it holds already is drawn over where the mesh is nearer.
-        left_handed: the data's frame has y on the right: the sun stays behind on the left.
+        mesh: what is drawn.
+        camera: from where it is seen.
+        frame: is drawn into, where the mesh is nearer than what the frame already shows.
+        left_handed: whether y points to the right in the frame of the data; the sun is behind the vehicle on its left in both cases.
+
+    Raises:
+        DependencyError: Embree is not installed.
     """
     if not len(mesh):
         return
@@ -78,7 +81,7 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = Tr
         origins, directions = camera.rays(width, height, rows)
         hits = scene.run(origins, directions, output=True)
         quad, depth = hits["primID"], hits["tfar"]
-        # Each sample of a pixel sees another point of the sun's disc: shadows are soft without a further ray.
+        # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows without further rays.
         columns = np.arange(width) % SAMPLES
         which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
         starts, towards, facing = _shadow_rays(mesh.normals, quad, origins, directions, depth, suns, which)
@@ -115,7 +118,7 @@ def _embree_scene(mesh: QuadMesh) -> tuple[Any, Any]:
 
 
 def _suns(left_handed: bool) -> NDArray[np.float32]:
-    """(SAMPLES^2, 3) unit vectors to points of the sun's disc, behind on the left of the vehicle."""
+    """Return (SAMPLES^2, 3) unit vectors to points of the sun's disc, behind the vehicle on its left."""
     sun = _TO_SUN * (1.0, 1.0 if left_handed else -1.0, 1.0)
     spread = 0.02 * np.array([(a, b) for a in np.linspace(-1, 1, SAMPLES) for b in np.linspace(-1, 1, SAMPLES)])
     suns = sun + np.column_stack([spread, np.zeros(len(spread))])
@@ -123,7 +126,7 @@ def _suns(left_handed: bool) -> NDArray[np.float32]:
 
 
 def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
-    """(Q,) part of the sky that a face sees: rays from its middle, spread about its normal by the cosine law."""
+    """Return (Q,) the share of the sky that each face sees, by rays from its middle, distributed about its normal by the cosine law."""
     number = np.arange(_SKY_RAYS) + 0.5
     radius, angle = np.sqrt(number / _SKY_RAYS), number * (np.pi * (3 - np.sqrt(5)))
     local = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - number / _SKY_RAYS)])
@@ -142,7 +145,7 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
 
 @numba.njit(cache=True)
 def _shadow_rays(normals, quad, origins, directions, depth, suns, which):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Starts and directions of the rays from the points that face the sun to it, and which samples these are."""
+    """Return starts and directions of the rays towards the sun from the points that face it, and the samples that they belong to."""
     count = 0
     facing = np.empty(len(quad), np.int64)
     for i in range(len(quad)):
@@ -183,12 +186,12 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     out,
     out_depth,
 ):
-    """Light every sample that a ray found, and write it where it is nearer than what is there."""
+    """Compute the light of every sample that a ray hit, and write it where it is nearer than what the frame shows."""
     for i in range(len(quad)):
         if quad[i] < 0 or depth[i] >= out_depth[i]:
             continue
         q = quad[i] >> 1
-        # where on the face: s from corner 0 to 1, t from corner 0 to 3
+        # position on the face: s from corner 0 to 1, t from corner 0 to 3
         if quad[i] & 1 == 0:
             s, t = u[i] + v[i], v[i]
         else:
@@ -213,7 +216,7 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
             else:
                 other = extents[q, 0]
                 distance = (s if e == 3 else 1 - s) * other
-            wide = other / pixel  # of the voxel, in pixels
+            wide = other / pixel  # width of the voxel in pixels
             strength = min(np.float32(1.0), max(np.float32(0.0), (wide - 2.5) / 7.5))
             reach = max(0.55 * pixel, 0.022 * other)
             line = max(line, strength * min(np.float32(1.0), max(np.float32(0.0), 1.5 - distance / reach)))

@@ -1,4 +1,4 @@
-"""Points to pictures: every point a small ball, nearer ones over farther ones, darker where something stands before them."""
+"""Drawing points as small balls: nearer ones hide farther ones, and points behind others are darker."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def splat(
     Args:
         points: (N, 3) metres.
         colors: (N, 3) uint8 RGB.
-        camera: where from.
-        frame: drawn into; a point is hidden by what is nearer there.
-        radius_m: of a ball.
+        camera: from where they are seen.
+        frame: is drawn into; what it shows hides points that are farther.
+        radius_m: radius of a ball.
     """
     height, width = frame.depth.shape
     columns, rows, depths = camera.project(points, width, height)
@@ -63,7 +63,7 @@ def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  #
 
 @numba.njit(cache=True)
 def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Eye-dome lighting: a point is darker the farther it lies behind its neighbours in the picture."""
+    """Eye-dome lighting: the farther a point is behind its neighbours in the picture, the darker it is."""
     height, width = depth.shape
     reach = 3
     for y in range(reach, height - reach):

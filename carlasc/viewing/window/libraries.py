@@ -1,4 +1,4 @@
-"""Open3D, or exactly what is missing for it."""
+"""Importing Open3D, with an error that names the missing package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from types import ModuleType
 
 from carlasc.errors import DependencyError, import_extra
 
-_DEBIAN = {  # library that the loader names -> Debian's (and Ubuntu's) package
+PAGE_ADVICE = 'or write a page instead with `out="page.html"`'
+
+_DEBIAN = {  # shared library -> its package in Debian and Ubuntu
     "libEGL.so.1": "libegl1",
     "libGL.so.1": "libgl1",
     "libGLX.so.0": "libglx0",
@@ -27,31 +29,32 @@ def import_open3d() -> ModuleType:
     """Import Open3D.
 
     Raises:
-        DependencyError: it is not installed, or a library of the system is missing; says what to install.
+        DependencyError: Open3D is not installed, or a system library is missing; the advice says what to install.
     """
     try:
         return importlib.import_module("open3d")
     except ImportError as error:
         missing = missing_library(str(error))
         if missing is None:
-            return import_extra("open3d", "view")  # says that it is not installed, or the loader's own words
-        raise DependencyError(f"open3d does not load: {missing} is missing: {advice(missing)}") from error
+            return import_extra("open3d", "view")  # says that it is not installed, or what the loader said
+        problem = f"cannot be loaded: {missing} is missing"
+        raise DependencyError("open3d", problem=problem, advice=advice(missing)) from error
     except OSError as error:
         missing = missing_library(str(error))
-        what = str(error) if missing is None else f"{missing} is missing"
-        raise DependencyError(f"open3d does not load: {what}: {advice(missing)}") from error
+        problem = str(error) if missing is None else f"{missing} is missing"
+        raise DependencyError("open3d", problem=f"cannot be loaded: {problem}", advice=advice(missing)) from error
 
 
 def missing_library(message: str) -> str | None:
-    """Return the shared library that a loader's message says is not there, None where it says something else."""
+    """Return the shared library that is missing according to a loader's message, or None."""
     match = re.search(r"(\S+\.so[.0-9]*): cannot open shared object file", message)
     return match[1] if match else None
 
 
 def advice(library: str | None) -> str:
-    """Return what to install for a library."""
+    """Return what to install for a library, or what to do if its package is not known."""
     package = _DEBIAN.get(library or "")
     if package is None:
-        return "install what it names, or open a page instead with --html"
+        return f"install the library that the message names, {PAGE_ADVICE}"
     root = "sudo " if shutil.which("sudo") else ""
-    return f"{root}apt-get install {package} (Debian, Ubuntu), or open a page instead with --html"
+    return f"{root}apt-get install {package} (Debian, Ubuntu), {PAGE_ADVICE}"

@@ -1,4 +1,4 @@
-"""A window on the desktop: frames of a sequence, drawn by Open3D, steered by keys."""
+"""A window on the desktop that shows a scene with Open3D and is controlled by keys."""
 
 from __future__ import annotations
 
@@ -13,46 +13,44 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.classes import Color
 from carlasc.core.scans import Scan
 from carlasc.errors import DependencyError
-from carlasc.storage import Sequence, Source
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.viewing.clip import Clip, FrameContent, open_clip
-from carlasc.viewing.rendering import colors as palette
-from carlasc.viewing.rendering.colors import PaletteName
+from carlasc.viewing import colors as palette
+from carlasc.viewing.colors import Entry
+from carlasc.viewing.rendering.drawings import ego_vehicle, grid_extent, motion_arrows, scan_extent
 from carlasc.viewing.rendering.meshes import QuadMesh, arrows, grid_mesh
-from carlasc.viewing.rendering.scenes import ego_vehicle, grid_extent, motion_arrows, scan_extent
-from carlasc.viewing.window.libraries import import_open3d
+from carlasc.viewing.scene import FrameContent, Scene, SceneReader
+from carlasc.viewing.window.libraries import PAGE_ADVICE, import_open3d
 
 LAYERS = {"g": "grid", "p": "points", "f": "flow", "v": "vehicle"}
 KEYS = {
-    "right, left": "step",
-    "space": "play, stop",
-    "g p f v": "grid, points, flow, vehicle",
-    "t": "next of prediction, truth, errors",
-    "1 .. 9 0": "show or hide a class; with Shift the eleventh and on, with Ctrl the twenty-first and on",
-    "a": "all classes",
-    "r": "camera as at first",
-    "q, Esc": "leave",
+    "right, left": "next or previous frame",
+    "space": "play or stop",
+    "g p f v": "show or hide the grid, points, flow, vehicle",
+    "t": "switch between prediction, truth and errors",
+    "1 .. 9 0": "show or hide one of classes 1 to 10; with Shift 11 to 20, with Ctrl 21 to 30",
+    "a": "show all classes",
+    "r": "reset the camera",
+    "q, Esc": "close the window",
 }
-_RIGHT, _LEFT, _SPACE = 262, 263, 32  # GLFW's numbers
+_RIGHT, _LEFT, _SPACE = 262, 263, 32  # key codes of GLFW
 _PRESSED, _SHIFT, _CONTROL = 1, 1, 2
 _SUN = np.array([-0.38, -0.5, 0.78]) / np.linalg.norm([0.38, 0.5, 0.78])
 _BACKGROUND = (0.96, 0.965, 0.972)
-_EDGE = 0.8  # how dark a voxel's edges are
+_EDGE = 0.8  # brightness of a voxel's edges, relative to its faces
 
 
 @dataclass
-class Look:
-    """What is shown of a clip.
+class WindowState:
+    """What a window shows of its scene.
 
     Attributes:
-        position: which of the clip's frames.
-        panel: which of the clip's panels.
-        layers: of `LAYERS`, those that are shown.
-        hidden: ids of classes that are not.
-        playing: whether frames follow each other.
+        position: index of the frame in the scene's frames.
+        panel: index of the panel in the scene's panels.
+        layers: names from `LAYERS` that are visible.
+        hidden: ids of classes that are hidden.
+        playing: whether the frames are played.
     """
 
     position: int = 0
@@ -63,21 +61,32 @@ class Look:
 
 
 class Window:
-    """An open window on a clip. Keys change its `look`; `tick` draws."""
+    """A window that shows a scene. Keys change its `state`; `tick` draws it.
+
+    Attributes:
+        reader: reads the scene.
+        state: what is shown.
+        report: called with a line of text for what a key did.
+    """
 
     def __init__(
-        self, clip: Clip, *, size: tuple[int, int] = (1280, 800), report: Callable[[str], None] | None = None
+        self, reader: SceneReader, *, size: tuple[int, int] = (1280, 800), report: Callable[[str], None] | None = None
     ) -> None:
         """Open the window.
+
+        Args:
+            reader: reads the scene.
+            size: (width, height) of the window, pixels.
+            report: called with a line of text for what a key did.
 
         Raises:
             DependencyError: Open3D or a library that it needs is missing, or there is no screen.
         """
-        self.clip, self.look, self.report = clip, Look(), report or (lambda _: None)
-        if clip.panels:
-            self.look.layers.discard("points")
+        self.reader, self.state, self.report = reader, WindowState(), report or (lambda _: None)
+        if reader.panels:
+            self.state.layers.discard("points")
         self.o3d = import_open3d()
-        self._mirror = np.array([1.0, -1.0, 1.0]) if clip.left_handed else np.ones(3)  # Open3D is right-handed
+        self._mirror = np.array([1.0, -1.0, 1.0]) if reader.left_handed else np.ones(3)  # Open3D is right-handed
         self._content = self._read()
         self._shown: dict[str, Any] = {}
         self._due = time.monotonic()
@@ -88,8 +97,8 @@ class Window:
         self._draw()
 
     def tick(self) -> bool:
-        """Draw, and take the next frame where it is due; returns False once the window is closed."""
-        if self.look.playing and time.monotonic() >= self._due:
+        """Draw, and go to the next frame if one is due while playing; return False once the window is closed."""
+        if self.state.playing and time.monotonic() >= self._due:
             self._due = time.monotonic() + FRAME_PERIOD_S
             self.step(1)
         alive = bool(self._visualizer.poll_events())
@@ -97,52 +106,53 @@ class Window:
         return alive
 
     def step(self, by: int) -> None:
-        """Go to another frame, round and round."""
-        self.look.position = (self.look.position + by) % len(self.clip.frames)
+        """Go forward by a number of frames; after the last frame follows the first."""
+        self.state.position = (self.state.position + by) % len(self.reader.frames)
         self._content = self._read()
         self._draw()
-        if not self.look.playing:
-            self.report(f"frame {self.clip.frames[self.look.position]}")
+        if not self.state.playing:
+            self.report(f"frame {self.reader.frames[self.state.position]}")
 
     def toggle_play(self) -> None:
-        """Play, or stop."""
-        self.look.playing = not self.look.playing and len(self.clip.frames) > 1
+        """Play the frames, or stop."""
+        self.state.playing = not self.state.playing and len(self.reader.frames) > 1
 
     def toggle_layer(self, layer: str) -> None:
         """Show or hide a layer."""
-        self.look.layers ^= {layer}
+        self.state.layers ^= {layer}
         self._draw()
 
     def toggle_class(self, number: int) -> None:
-        """Show or hide the `number`-th class (from 0) of those that `classes` lists."""
+        """Show or hide the class at an index of `classes`."""
         listed = self.classes
         if number < len(listed):
-            label, name, _ = listed[number]
-            self.look.hidden ^= {label}
-            self.report(f"{name}: {'hidden' if label in self.look.hidden else 'shown'}")
+            entry = listed[number]
+            self.state.hidden ^= {entry.order}
+            self.report(f"{entry.name}: {'hidden' if entry.order in self.state.hidden else 'shown'}")
             self._draw()
 
     def show_all(self) -> None:
         """Show all classes."""
-        self.look.hidden.clear()
+        self.state.hidden.clear()
         self._draw()
 
     def next_panel(self) -> None:
-        """Show the next of prediction, truth and errors."""
-        if len(self.clip.panels) > 1:
-            self.look.panel = (self.look.panel + 1) % len(self.clip.panels)
-            self.look.hidden.clear()
-            self.report(self.clip.panels[self.look.panel].title)
+        """Switch to the next of prediction, truth and errors."""
+        if len(self.reader.panels) > 1:
+            self.state.panel = (self.state.panel + 1) % len(self.reader.panels)
+            self.state.hidden.clear()
+            self.report(self.reader.panels[self.state.panel].title)
             self._draw()
 
     @property
-    def classes(self) -> list[tuple[int, str, Color]]:
-        """Id, name and colour of the classes in the table that is shown, free left out."""
-        colors = self.clip.panels[self.look.panel].colors if self.clip.panels else self.clip.colors
-        return [(entry.order, entry.name, entry.color) for entry in colors.entries(colors.table.names)]
+    def classes(self) -> list[Entry]:
+        """The classes that can be hidden: all classes of the panel's table except free. `order` is the class id."""
+        reader = self.reader
+        colors = reader.panels[self.state.panel].colors if reader.panels else reader.colors
+        return colors.entries(colors.table.names)
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return what is seen, (H, W, 3) uint8."""
+        """Return a screenshot, (H, W, 3) uint8."""
         self.tick()
         image = np.asarray(self._visualizer.capture_screen_float_buffer(do_render=True))
         return np.round(image * 255).astype(np.uint8)
@@ -152,27 +162,26 @@ class Window:
         self._visualizer.destroy_window()
 
     def _read(self) -> FrameContent:
-        return self.clip.read(self.clip.frames[self.look.position])
+        return self.reader.read(self.reader.frames[self.state.position])
 
     def _open(self, size: tuple[int, int]) -> None:
         no_screen = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-        if no_screen or not self._visualizer.create_window(f"carlasc: {self.clip.name}", *size):
-            found = "no DISPLAY" if no_screen else "one that Open3D cannot draw on"
+        if no_screen or not self._visualizer.create_window(f"carlasc: {self.reader.name}", *size):
             raise DependencyError(
                 "window",
                 expected="a screen",
-                found=f"{found}",
-                advice="work on a desktop, use `xvfb-run`, or open a page instead with --html",
+                found="no DISPLAY" if no_screen else "a screen that Open3D cannot draw on",
+                advice=f"use a desktop or `xvfb-run`, {PAGE_ADVICE}",
             )
 
     def _frame_camera(self) -> None:
-        """Look from behind and above; the extent, which is never drawn over, fixes the scale for all frames."""
+        """Draw the rim of the extent, so that all frames have one scale, and look from behind and above."""
         options = self._visualizer.get_render_option()
         options.background_color = np.array(_BACKGROUND)
-        options.light_on = False  # the light is in the colours
+        options.light_on = False  # the colours include the light
         options.point_size = 2.5
         options.mesh_show_back_face = True
-        panels, scan = self.clip.panels, self._content.scan
+        panels, scan = self.reader.panels, self._content.scan
         corners = grid_extent(panels[0].spec) if panels else scan_extent(scan or Scan(np.empty((0, 3), np.float32)))
         lower, upper = corners.min(0), corners.max(0)
         rim = np.array([(x, y, lower[2]) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], np.float64)
@@ -214,8 +223,8 @@ class Window:
         return True
 
     def _draw(self) -> None:
-        """Bring what is in the window to the look."""
-        layers, content = self.look.layers, self._content
+        """Draw the current state."""
+        layers, content = self.state.layers, self._content
         self._replace("edges", None)
         self._replace("grid", self._grid() if content.grids and "grid" in layers else None)
         self._replace("points", self._points() if content.scan is not None and "points" in layers else None)
@@ -230,8 +239,8 @@ class Window:
             self._shown[name] = geometry
 
     def _grid(self) -> Any:
-        grid, colors = self._content.grids[self.look.panel], self.clip.panels[self.look.panel].colors.by_id
-        drawn = (grid.labels > 0) & ~np.isin(grid.labels, list(self.look.hidden))
+        grid, colors = self._content.grids[self.state.panel], self.reader.panels[self.state.panel].colors.by_id
+        drawn = (grid.labels > 0) & ~np.isin(grid.labels, list(self.state.hidden))
         if not drawn.any():
             return None
         mesh = grid_mesh(grid.spec, colors[grid.labels], drawn)
@@ -239,7 +248,7 @@ class Window:
         return self._mesh(mesh)
 
     def _edges(self, mesh: QuadMesh) -> Any:
-        """Return the edges between voxels as lines, darker than their faces and a hair above them."""
+        """Return the edges of voxels as lines, darker than their faces and slightly in front of them."""
         face, side = np.nonzero(mesh.edges)
         corners = mesh.corners + 4e-3 * mesh.normals[:, None]
         ends = np.stack([corners[face, side], corners[face, (side + 1) % 4]], axis=1)
@@ -253,13 +262,13 @@ class Window:
         return lines
 
     def _points(self) -> Any:
-        scan, colors = self._content.scan, self.clip.colors.by_id.copy()
+        scan, colors = self._content.scan, self.reader.colors.by_id.copy()
         colors[0] = palette.UNLABELLED
         if scan is None:
             return None
         labels = np.zeros(len(scan), np.uint8) if scan.labels is None else scan.labels
-        # ids of the errors' panel are no classes of points
-        hidden = self.look.hidden if not self.clip.panels or self.look.panel < 2 else set[int]()
+        # hidden ids in the panel of errors are outcomes, not classes of points
+        hidden = self.state.hidden if not self.reader.panels or self.state.panel < 2 else set[int]()
         shown = ~np.isin(labels, list(hidden))
         cloud = self.o3d.geometry.PointCloud(self._vectors(scan.points[shown]))
         cloud.colors = self.o3d.utility.Vector3dVector(colors[labels[shown]] / 255.0)
@@ -270,14 +279,14 @@ class Window:
         if scan is None or scan.flow is None:
             return None
         tails, vectors = motion_arrows(scan.select(np.linalg.norm(scan.flow, axis=1) > 0))
-        if self.clip.panels and "points" not in self.look.layers:  # elsewhere they would stand above nothing
-            spec = self.clip.panels[0].spec
+        if self.reader.panels and "points" not in self.state.layers:  # no arrows where nothing else is drawn
+            spec = self.reader.panels[0].spec
             _, inside = spec.index(spec.to_axes(tails * [1, 1, 0] + [0, 0, (spec.lower[2] + spec.upper[2]) / 2]))
             tails, vectors = tails[inside], vectors[inside]
         return self._mesh(arrows(tails, vectors, palette.ARROW, 0.24)) if len(tails) else None
 
     def _mesh(self, mesh: QuadMesh) -> Any:
-        """Return Open3D's mesh of quads, with sun and sky in the colours of the corners."""
+        """Return a mesh for Open3D, with the light of sun and sky in the colours of its corners."""
         corners, triangles = mesh.triangles()
         light = self._light(mesh)[:, None] * mesh.openness
         colors = np.clip(mesh.colors[:, None, :] / 255.0 * light[..., None], 0, 1)
@@ -288,7 +297,7 @@ class Window:
         return shown
 
     def _light(self, mesh: QuadMesh) -> NDArray[np.floating]:
-        """Return how much of the sun each face sees; an open, level one has exactly its colour."""
+        """Return the brightness of each face in the sun; a level face without shade has exactly its own colour."""
         lit = np.clip(mesh.normals @ _SUN, 0, None) / _SUN[2]
         return 0.58 + 0.42 * np.minimum(lit, 1.25)
 
@@ -296,49 +305,9 @@ class Window:
         return self.o3d.utility.Vector3dVector(np.asarray(points, np.float64) * self._mirror)
 
 
-def show(
-    path: str | os.PathLike[str] | Source | Sequence,
-    *,
-    sequence: str | None = None,
-    frames: tuple[int | None, int | None] | None = None,
-    every: int = 1,
-    grid: str | None = None,
-    truth: str | os.PathLike[str] | Source | Sequence | None = None,
-    truth_grid: str | None = None,
-    classes: str | None = None,
-    path_classes: str | None = None,
-    palette: PaletteName = "class",
-    report: Callable[[str], None] | None = None,
-) -> Clip:
-    """Open a window on a sequence, until it is closed.
-
-    Args:
-        path: anything `carlasc.open` takes, a grid's folder, a frame's file in it, a Source or a Sequence.
-        sequence: path or name of the sequence where there are several; None takes the first.
-        frames: half-open range of frames; None takes all.
-        every: take each `every`-th of them.
-        grid: name of the grid; None takes `evaluation`, or the first.
-        truth: what a prediction is compared with: anything that `path` may be.
-        truth_grid: name of the truth's grid; None as for `grid`.
-        classes: name of the class table to show; None shows the data's own.
-        path_classes: class table of the labels at `path` where nothing beside them says.
-        palette: "class" or "colorblind".
-        report: called with a line for what a key did, keys and classes first.
-
-    Returns:
-        What was shown.
-
-    Raises:
-        DependencyError: Open3D or a library that it needs is missing, or there is no screen.
-        ArgumentError: arguments that make no sense.
-        MissingDataError: a sequence, grid or frame that is not there.
-        FormatError: what is there is not what the format says.
-    """
-    clip = open_clip(
-        path, sequence=sequence, frames=frames, every=every, grid=grid, truth=truth, truth_grid=truth_grid,
-        classes=classes, path_classes=path_classes, palette=palette,
-    )  # fmt: skip
-    window = Window(clip, report=report)
+def show_window(scene: Scene, *, report: Callable[[str], None] | None = None) -> None:
+    """Show a scene in a window until it is closed; see `carlasc.viewing.view` for the arguments and errors."""
+    window = Window(scene.open(), report=report)
     for line in help_lines(window):
         window.report(line)
     try:
@@ -346,16 +315,15 @@ def show(
             time.sleep(0.005)
     finally:
         window.close()
-    return clip
 
 
 def help_lines(window: Window) -> list[str]:
-    """Return what the keys do, and which class each digit stands for."""
+    """Return what the keys do, and the class of each digit key."""
     marks = ("", "Shift+", "Ctrl+")
     digits = [
-        f"{marks[number // 10]}{(number + 1) % 10} {name}" for number, (_, name, _) in enumerate(window.classes[:30])
+        f"{marks[number // 10]}{(number + 1) % 10} {entry.name}" for number, entry in enumerate(window.classes[:30])
     ]
-    return [*window.clip.notes, *(f"{keys:<12} {what}" for keys, what in KEYS.items()), ", ".join(digits)]
+    return [*window.reader.notes, *(f"{keys:<12} {what}" for keys, what in KEYS.items()), ", ".join(digits)]
 
 
 def _call(action: Callable[[], None], _: Any) -> bool:

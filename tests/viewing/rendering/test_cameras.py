@@ -87,7 +87,7 @@ def test_a_viewpoint_is_read_from_words():
     + ["azimuth=nan", "distance=inf", "position=1,2,nan"],
 )
 def test_a_senseless_viewpoint_is_refused(text):
-    with pytest.raises(ArgumentError, match="camera"):
+    with pytest.raises(ArgumentError, match="viewpoint"):
         Viewpoint.parse(text)
 
 

@@ -4,12 +4,14 @@ import pytest
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI, TABLES
 from carlasc.errors import ArgumentError
-from carlasc.viewing.rendering.colors import (
+from carlasc.viewing.colors import (
     AFTER_CLASSES,
+    ERRORS,
     ClassColors,
     Entry,
     colorblind_palette,
     height_colors,
+    height_entries,
     merge_legends,
 )
 
@@ -89,5 +91,21 @@ def test_higher_is_lighter():
 
 
 def test_an_unknown_palette_is_refused():
-    with pytest.raises(ArgumentError, match="palette 'rainbow'"):
+    with pytest.raises(ArgumentError, match="palette: .* found 'rainbow'"):
         ClassColors(CARLA, "rainbow")
+
+
+def test_errors_have_their_names_and_colours():
+    assert [(entry.name, entry.color) for entry in ClassColors(ERRORS).entries([1, 2, 3, 4])] == [
+        ("right class", (205, 209, 214)),
+        ("wrong class", (213, 70, 0)),
+        ("missed: predicted free", (16, 90, 190)),
+        ("invented: free in truth", (240, 200, 40)),
+    ]
+
+
+def test_the_legend_of_heights_goes_from_the_lowest_to_the_highest_before_all_classes():
+    entries = height_entries(-2.0, 2.0)
+    assert [entry.name for entry in entries] == ["-2.0 m", "-1.0 m", "+0.0 m", "+1.0 m", "+2.0 m"]
+    assert [entry.color for entry in entries] == [tuple(c) for c in height_colors(np.arange(-2, 3), -2.0, 2.0).tolist()]
+    assert merge_legends([ClassColors(CARLA).entries([1]), entries])[:5] == entries

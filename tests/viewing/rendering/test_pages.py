@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.errors import ArgumentError
-from carlasc.viewing.rendering.colors import ClassColors, Entry
-from carlasc.viewing.rendering.pages import _entry_width, _font, _line, draw_page, plan_page
+from carlasc.viewing.colors import ClassColors, Entry
+from carlasc.viewing.rendering.pages import draw_page, plan_page
 
 ALL = ClassColors(CARLA).entries(range(23))
 MANY = ClassColors(SEMANTICKITTI).entries(SEMANTICKITTI.names)
@@ -14,11 +14,8 @@ MANY = ClassColors(SEMANTICKITTI).entries(SEMANTICKITTI.names)
 
 def boxes_of(page):
     """Every rectangle of a page: panels, titles, entries of the legend, as (x0, y0, x1, y1)."""
-    font = _font(page.font_size)
-    rectangles = [(b.x, b.y, b.x + b.width, b.y + b.height) for b in page.panels + page.titles]
-    for entry, (x, y) in zip(page.entries, page.places, strict=True):
-        rectangles.append((x, y, x + _entry_width(entry, font, page.font_size), y + _line(page.font_size)))
-    return rectangles
+    boxes = page.panels + page.titles + page.entry_boxes
+    return [(box.x, box.y, box.x + box.width, box.y + box.height) for box in boxes]
 
 
 @settings(deadline=None, max_examples=150)
@@ -60,9 +57,9 @@ def test_square_pictures_have_their_legend_beside_them_wide_ones_below():
     square = plan_page((1280, 720), 1, titled=False, legend=ALL[:8], aspect=1.0)
     wide = plan_page((1280, 720), 1, titled=False, legend=ALL[:8])
     assert square.panels[0].height == 720
-    assert min(x for x, _ in square.places) >= square.panels[0].x + square.panels[0].width
+    assert min(box.x for box in square.entry_boxes) >= square.panels[0].x + square.panels[0].width
     assert wide.panels[0].width == 1280
-    assert min(y for _, y in wide.places) >= wide.panels[0].y + wide.panels[0].height
+    assert min(box.y for box in wide.entry_boxes) >= wide.panels[0].y + wide.panels[0].height
 
 
 def test_swatches_and_titles_are_drawn_where_they_were_planned():
@@ -72,8 +69,8 @@ def test_swatches_and_titles_are_drawn_where_they_were_planned():
     drawn = draw_page(
         page, pictures, ["left", "a title that is much too long for the place that it has got"], [None, "empty"]
     )
-    for entry, (x, y) in zip(page.entries, page.places, strict=True):
-        middle = drawn[y + _line(page.font_size) // 2, x + page.font_size // 2]
+    for entry, box in zip(page.entries, page.entry_boxes, strict=True):
+        middle = drawn[box.y + box.height // 2, box.x + page.font_size // 2]
         assert tuple(middle) == entry.color
     for box in page.titles:
         assert (drawn[box.y : box.y + box.height, box.x : box.x + box.width] < 128).any()

@@ -6,18 +6,21 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA, CARLASC11
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.viewing.rendering import (
+from carlasc.viewing import (
     Panel,
     Viewpoint,
     draw_panels,
-    grid_scene,
+    error_drawing,
+    flow_drawing,
+    grid_drawing,
     render_comparison,
     render_grid,
     render_scan,
+    scan_drawing,
 )
-from carlasc.viewing.rendering import colors as palette
-from carlasc.viewing.rendering.colors import ClassColors
-from carlasc.viewing.rendering.scenes import motion_arrows
+from carlasc.viewing import colors as palette
+from carlasc.viewing.colors import AFTER_CLASSES, ClassColors
+from carlasc.viewing.rendering.drawings import ego_vehicle, motion_arrows, scan_extent
 
 SIZE = (320, 180)
 PUBLISHED = [GridSpec.published(name) for name in ("cartesian", "cartesian_fine", "cylindrical")]
@@ -82,11 +85,11 @@ def test_free_and_unknown_voxels_are_not_drawn():
 def test_an_empty_grid_says_so_above_its_ground():
     spec = PUBLISHED[0]
     empty = Grid(spec, np.zeros(spec.size, np.uint8))
-    scene = grid_scene(empty, ClassColors())
+    scene = grid_drawing(empty, ClassColors())
     assert scene.note == "no voxel is occupied"
     picture = render_grid(empty, size=SIZE, ego=False)
     silent = draw_panels(
-        [Panel(type(scene)(scene.extent, grid_scene(empty, ClassColors(), ego=False).mesh))], size=SIZE
+        [Panel(type(scene)(scene.extent, grid_drawing(empty, ClassColors(), ego=False).mesh))], size=SIZE
     )
     assert (silent < 250).any()  # the ground
     assert (silent != picture).any() and picture.min() < 130 < silent.min()  # the words
@@ -221,10 +224,9 @@ def test_errors_are_right_wrong_missed_and_invented_where_the_truth_is_known():
     truth = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 10, (-10, 10, -0.5): 10}, size_m=4.0)
     prediction = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 4, (-10, -10, -0.5): 10, (0, 0, -0.5): 4}, size_m=4.0)
     truth.counts[54:74, 54:74] = 0  # the last one of the prediction's is where nobody knows
-    quarters = {(1, 1): palette.RIGHT, (1, -1): palette.WRONG, (-1, 1): palette.MISSED, (-1, -1): palette.INVENTED}
-    from carlasc.viewing.rendering import error_scene
-
-    scene = error_scene(prediction, truth, ego=False)
+    right, wrong, missed, invented = (palette.ERRORS.colors[outcome] for outcome in (1, 2, 3, 4))
+    quarters = {(1, 1): right, (1, -1): wrong, (-1, 1): missed, (-1, -1): invented}
+    scene = error_drawing(prediction, truth, ego=False)
     picture = draw_panels([Panel(scene, "bev")], size=(400, 400), legend=False)
     for (ahead, right), color in quarters.items():
         y, x = 200 - round(ahead * 10 * 392 / 51.2), 200 + round(right * 10 * 392 / 51.2)
@@ -269,3 +271,94 @@ def test_an_unknown_view_is_refused(view):
         render_grid(grid_with({}), view=view, size=SIZE)
     with pytest.raises(ArgumentError, match="panels"):
         draw_panels([])
+
+
+def test_points_have_the_colours_of_their_classes_and_a_legend():
+    scan = scan_of(((5, 0, 0), RED, (0, 0, 0), 0), ((0, 5, 0), 0, (0, 0, 0), 0))
+    drawing = scan_drawing(scan, ClassColors())
+    np.testing.assert_array_equal(drawing.point_colors[:200], np.broadcast_to(CARLA.colors[RED], (200, 3)))
+    np.testing.assert_array_equal(drawing.point_colors[200:], np.broadcast_to(palette.UNLABELLED, (200, 3)))
+    assert [(entry.name, entry.color) for entry in drawing.legend] == [
+        ("unlabelled", palette.UNLABELLED),
+        ("Pedestrian", CARLA.colors[RED]),
+    ]
+    labelled = scan_drawing(scan_of(((5, 0, 0), RED, (0, 0, 0), 0)), ClassColors())
+    assert [entry.name for entry in labelled.legend] == ["Pedestrian"]
+
+
+def test_flow_shows_what_moves_faster_than_20_centimetres_a_second():
+    scan = scan_of(((5, 0, 0), RED, (0.3, 0, 0), 1), ((0, 5, 0), BLUE, (0, 0.15, 0), 2))
+    drawing = flow_drawing(scan, ClassColors())
+    np.testing.assert_array_equal(drawing.point_colors[:200], np.broadcast_to(CARLA.colors[RED], (200, 3)))
+    np.testing.assert_array_equal(drawing.point_colors[200:], np.broadcast_to(palette.STATIC, (200, 3)))
+    assert [(entry.color, entry.order) for entry in drawing.legend] == [
+        (palette.STATIC, -1),
+        (CARLA.colors[RED], RED),
+        (palette.ARROW, AFTER_CLASSES),
+    ]
+    still = flow_drawing(scan_of(((0, 5, 0), BLUE, (0, 0, 0), 2)), ClassColors())
+    assert still.note == "nothing moves" and drawing.note is None
+
+
+def test_points_without_instances_share_an_arrow_within_three_metres():
+    points = np.array([[0.5, 0.5, 0], [2.5, 2.5, 1], [3.5, 0.5, 0], [-0.5, 0.5, 0]], np.float32)
+    flow = np.tile(np.array([1, 0, 0], np.float32), (4, 1))
+    tails, _ = motion_arrows(Scan(points, flow=flow))
+    np.testing.assert_allclose(sorted(tails.tolist()), [[-0.5, 0.5, 0.4], [1.5, 1.5, 1.4], [3.5, 0.5, 0.4]], atol=1e-6)
+
+
+def test_the_ego_vehicle_is_under_the_sensor_which_is_half_a_metre_behind_its_middle():
+    corners = ego_vehicle().corners.reshape(-1, 3)
+    np.testing.assert_allclose(corners.min(0), (-1.75, -0.95, -1.62))
+    np.testing.assert_allclose(corners.max(0), (2.75, 0.95, -0.42))
+
+
+def test_a_scan_is_shown_to_at_most_40_metres_and_with_the_surroundings_of_the_sensor():
+    far = Scan(np.array([[100, 70, 3], [-100, -70, 3]] * 50, np.float32))
+    np.testing.assert_allclose(scan_extent(far)[[0, -1]], [(-40, -40, 0), (40, 40, 3)])
+    ahead = Scan(np.tile(np.array([20, 10, 1], np.float32), (100, 1)))
+    np.testing.assert_allclose(scan_extent(ahead)[[0, -1]], [(-5, -5, 0), (20, 10, 1)])
+
+
+def test_the_errors_have_a_legend_after_the_classes_and_say_when_there_is_nothing_to_compare():
+    truth, nothing = grid_with({(0, 0, -0.5): BLUE}), grid_with({})
+    drawing = error_drawing(truth, truth)
+    assert [entry.name for entry in drawing.legend][:2] == ["right class", "wrong class"] and len(drawing.legend) == 4
+    assert min(entry.order for entry in drawing.legend) > 1000 and drawing.note is None
+    assert error_drawing(nothing, nothing).note == "no known voxel is occupied in either"
+
+
+def test_the_legend_names_the_classes_of_all_panels():
+    panels = [Panel(grid_drawing(grid_with({(0, 0, -0.5): label}), ClassColors()), "bev") for label in (RED, BLUE)]
+    legend = draw_panels(panels, size=(640, 360))[-40:]
+    assert color_is_there(legend, CARLA.colors[RED], 0) and color_is_there(legend, CARLA.colors[BLUE], 0)
+
+
+@pytest.mark.parametrize("left_handed", [True, False])
+def test_shadows_fall_ahead_to_the_right(left_handed):
+    tower = grid_with({(0, 0, z): BLUE for z in (-1.5, -0.5, 0.5)})
+    picture = render_grid(tower, view="bev", size=(400, 400), legend=False, ego=False, left_handed=left_handed)
+    right, ahead = (int(400 * 0.98 / 51.2 * metres) for metres in (1.3, 1.0))
+    assert picture[200 - ahead, 200 + right].max() < 200  # in the shadow
+    for row, column in ((200 + ahead, 200 - right), (200 + ahead, 200 + right), (200 - ahead, 200 - right)):
+        assert picture[row, column].min() > 225, (row, column)
+
+
+def test_walls_hide_a_part_of_the_sky():
+    """The wall is ahead on the right, away from the sun: it casts no shadow on what is behind it."""
+    ground = {(0, 0, -1.8): CARLA.id_of("Terrain")}
+    wall = {(2.4, y, z): BLUE for y in (-2, -1, 0, 1, 2) for z in (-1.5, -0.5, 0.5)}
+    lone, beside = (
+        render_grid(grid_with(blocks, size_m=1.6), view="bev", size=(400, 400), legend=False, ego=False)
+        for blocks in (ground, ground | wall)
+    )
+    assert color_is_there(lone[197:204, 197:204], CARLA.colors[CARLA.id_of("Terrain")])
+    assert beside[200, 200].sum() < lone[200, 200].sum() - 10
+
+
+def test_points_behind_others_are_darker():
+    x, y = (axis.reshape(-1) for axis in np.meshgrid(np.arange(-10, 10, 0.05), np.arange(-10, 10, 0.05)))
+    scan = Scan(np.column_stack([x, y, np.where(y > 0, 1.0, -1.0)]).astype(np.float32), np.full(x.size, RED, np.uint8))
+    picture = render_scan(scan, view="bev", size=(400, 400), legend=False, ego=False, extent=EXTENT).astype(float)
+    below = picture[150:250, 150:200].mean((0, 2))  # columns from the left towards the edge
+    assert below[-2] < 0.9 * below[:40].mean()

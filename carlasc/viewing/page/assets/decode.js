@@ -1,4 +1,4 @@
-// From the page's text to typed arrays: the inverse of carlasc/viewing/coding.py.
+// Decoding the text of the page to typed arrays: the inverse of carlasc/viewing/page/coding.py.
 
 async function inflate(base64) {
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
@@ -8,7 +8,7 @@ async function inflate(base64) {
 
 const ARRAY_TYPES = { uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array, float32: Float32Array };
 
-/** Returns the arrays of a block by name; each was stored as byte planes. */
+/** Returns the arrays of a block by name. Each is stored as byte planes. */
 function unpackArrays(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -28,7 +28,7 @@ function unpackArrays(buffer) {
   return arrays;
 }
 
-/** Sums gaps up to the rising values they came from. */
+/** Returns the rising values of which the differences are given. */
 function sumUp(gaps) {
   const values = new Uint32Array(gaps.length);
   let value = 0;
@@ -36,7 +36,7 @@ function sumUp(gaps) {
   return values;
 }
 
-/** Makes a panel's voxels of its arrays: C-order index, label and votes of each occupied cell, all labels, all unknown cells. */
+/** Returns the voxels of a panel: C-order index, label and votes of each occupied cell, the labels of all cells, the unknown cells. */
 function decodeGrid(arrays, prefix, panel) {
   const index = sumUp(arrays[`${prefix}/index`]);
   const label = arrays[`${prefix}/label`];
@@ -52,7 +52,7 @@ function decodeGrid(arrays, prefix, panel) {
   return { index, label, votes: arrays[`${prefix}/votes`] ?? null, volume, unknown };
 }
 
-/** Makes points (x, y, z of each, metres) of a scan's cells and offsets. */
+/** Returns the points of a scan (x, y, z of each, metres), their labels, and the arrows. */
 function decodeScan(arrays, scene) {
   if (!arrays['scan/index']) return null;
   const index = sumUp(arrays['scan/index']);
@@ -70,7 +70,7 @@ function decodeScan(arrays, scene) {
   return { points, label: arrays['scan/label'] ?? new Uint8Array(count), arrows: arrays['scan/arrows'] ?? new Float32Array(0) };
 }
 
-/** Decodes frames on demand and keeps the last few. */
+/** Decodes frames when they are needed, and keeps the last eight. */
 class FrameStore {
   constructor(scene) {
     this.scene = scene;

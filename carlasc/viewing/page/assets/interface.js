@@ -1,9 +1,9 @@
-// What stands around the canvas: buttons, the legend with its counts, the card of a picked voxel.
+// The elements around the canvas: buttons, the legend with its counts, the card of a picked voxel.
 
 const byId = (id) => document.getElementById(id);
 const grouped = (number) => number.toLocaleString('en-US');
 
-/** Makes an element with attributes and children. */
+/** Returns a new element with attributes and children. */
 function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
@@ -11,7 +11,7 @@ function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** A button that is on or off. */
+/** Returns a button that is on or off. */
 function toggleButton(label, on, change, attributes = {}) {
   const button = make('button', { 'aria-pressed': String(on), ...attributes }, label);
   button.addEventListener('click', () => {
@@ -28,7 +28,7 @@ function swatch(color) {
   return element;
 }
 
-/** A class table's legend: a line for each class that any frame has shown, with its voxels (or points) in this frame. */
+/** The legend of a class table: a row for each class that any frame so far contained, with its voxels and points in this frame. */
 class Legend {
   constructor(title, table, classes, columns, change) {
     this.table = table;
@@ -46,7 +46,7 @@ class Legend {
     this.element = make('section', { 'data-table': table }, make('div', { class: 'legend-head' }, make('h2', {}, title), all, none), rows);
   }
 
-  /** Shows a frame's counts: for each column, an array by class id. */
+  /** Shows the counts of a frame: for each column, an array indexed by class id. */
   update(columns) {
     this.classes.forEach(([name, color], id) => {
       const counts = columns.map((column) => column[id] ?? 0);
@@ -84,14 +84,14 @@ class Legend {
   }
 }
 
-/** The scale of a ramp of colours. */
+/** Returns the scale of a colour ramp. */
 function rampScale(title, from, to) {
   const bar = make('div', { class: 'ramp' });
   bar.style.background = `linear-gradient(to right, ${RAMP.join(', ')})`;
   return make('section', { id: 'ramp' }, make('h2', {}, title), bar, make('div', { class: 'ramp-ends' }, make('span', {}, from), make('span', {}, to)));
 }
 
-/** Fills the card of a voxel; returns what it says, for those who cannot see it. */
+/** Fills the card of a voxel and returns its contents. */
 function fillCard(card, scene, contents, picked) {
   const { panel, index } = picked;
   const spec = panel.panel;
@@ -104,7 +104,7 @@ function fillCard(card, scene, contents, picked) {
     const grid = contents.grids[number];
     const label = grid.volume[index];
     if (label) return scene.tables[scene.panels[number].table][label][0];
-    return grid.unknown?.[index] ? 'unknown' : scene.panels[number].table === 'errors' ? 'agree: free' : 'free';
+    return grid.unknown?.[index] ? 'unknown' : scene.panels[number].table === 'errors' ? 'free in both' : 'free';
   };
   const number = scene.panels.indexOf(spec);
   const own = contents.grids[number];

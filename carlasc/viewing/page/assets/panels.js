@@ -1,4 +1,4 @@
-// Panels side by side on one canvas, seen by one camera: so they are linked.
+// Panels side by side on one canvas, all seen by the same camera.
 
 class Panels {
   constructor(canvas, scene, visibility) {
@@ -81,8 +81,8 @@ class Panels {
     this.invalidate();
   }
 
-  /** Looks from behind and above, or from straight above, so that the grid just fits in a panel. */
-  look(view) {
+  /** Sets the view from behind and above, or from straight above, so that the grid just fits into a panel. */
+  setView(view) {
     const box = this.boxes()[0];
     this.camera.aspect = box.width / box.height;
     this.camera.updateProjectionMatrix();
@@ -90,7 +90,7 @@ class Panels {
     const back = new THREE.Vector3(0, Math.sin(elevation), Math.cos(elevation));
     const target = this.target.clone();
     let distance = 2 * this.radius;
-    for (let i = 0; i < 30; i++) { // nearer or farther, forth or back, until the corners touch the margins
+    for (let i = 0; i < 30; i++) { // changes the distance and the target until the corners touch the margins
       this.camera.position.copy(target).addScaledVector(back, distance);
       this.camera.lookAt(target);
       this.camera.updateMatrixWorld();
@@ -105,7 +105,7 @@ class Panels {
     this.invalidate();
   }
 
-  /** Corners of what should be in the picture: of the grid's floor and ceiling. */
+  /** Returns the corners of the floor and of the ceiling of the grid. */
   corners() {
     const { x, z } = this.target;
     const around = this.round ? Array.from({ length: 24 }, (_, i) => (i * Math.PI) / 12) : [1, 3, 5, 7].map((i) => (i * Math.PI) / 4);
@@ -119,11 +119,11 @@ class Panels {
     this.invalidate();
   }
 
-  /** The rectangles of the panels that are shown, CSS pixels from the top left. */
+  /** Returns the rectangles of the panels that are shown, in CSS pixels from the top left. */
   boxes() {
     const { clientWidth, clientHeight } = this.canvas.parentElement;
     const shown = this.shown;
-    const upright = clientHeight > clientWidth * 1.15; // a telephone: one above the other
+    const upright = clientHeight > clientWidth * 1.15; // narrow screens: one panel above the other
     return shown.map((panel, i) => {
       const [from, to] = [i / shown.length, (i + 1) / shown.length];
       return upright
@@ -152,7 +152,7 @@ class Panels {
     }
   }
 
-  /** Whether pictures are computed without a GPU: then shadows would make every move take seconds. */
+  /** Returns whether pictures are computed without a GPU: shadows would then take seconds. */
   isSoftware() {
     const gl = this.renderer.getContext();
     const names = gl.getExtension('WEBGL_debug_renderer_info');
@@ -164,7 +164,7 @@ class Panels {
     this.invalidate();
   }
 
-  /** Finds the voxel at a place on the canvas: draws that one pixel with the voxels' numbers for colours. */
+  /** Returns the voxel at a position on the canvas: draws that pixel with the numbers of the voxels as colours. */
   pick(x, y) {
     const box = this.boxes().find((b) => x >= b.x && x < b.x + b.width && y >= b.y && y < b.y + b.height);
     const layer = box?.panel.layer;
@@ -191,7 +191,7 @@ class Panels {
     return instance < 0 || instance >= layer.drawn.length ? null : { panel: box.panel, instance, index: layer.grid.index[layer.drawn[instance]] };
   }
 
-  /** Marks a picked cell in every panel that draws it; null marks none. */
+  /** Marks a cell in every panel that draws it; null marks no cell. */
   mark(index) {
     for (const { layer } of this.panels) {
       if (!layer?.grid) continue;

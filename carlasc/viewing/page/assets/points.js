@@ -1,4 +1,4 @@
-// What is drawn beside voxels: points, arrows of what moves, the ego vehicle, the rim of the grid.
+// What is drawn besides voxels: points, arrows of moving actors, the ego vehicle, the outline of the grid.
 
 const POINT_VERTEX = /* glsl */ `
   attribute float label;
@@ -7,7 +7,7 @@ const POINT_VERTEX = /* glsl */ `
   uniform bool byHeight;
   uniform vec2 heights;
   uniform float scale;
-  uniform float forward; // metres that points come towards the eye: out of the voxels that hold them
+  uniform float forward; // metres by which points are moved towards the camera, out of the voxels that contain them
   varying vec3 vColor;
   void main() {
     vec4 entry = texelFetch(palette, ivec2(int(label + 0.5), 0), 0);
@@ -28,7 +28,7 @@ const POINT_FRAGMENT = /* glsl */ `
     gl_FragColor = vec4(vColor * (1.0 - 0.35 * smoothstep(0.45, 1.0, radius)), 1.0);
   }`;
 
-/** A scan's points and its arrows; one is shared by all panels. */
+/** The points and the arrows of a scan; all panels share one layer. */
 class ScanLayer {
   constructor(side, palette, heights, panel) {
     this.side = side;
@@ -51,7 +51,7 @@ class ScanLayer {
     this.arrows = [];
   }
 
-  /** Returns the objects to put into a panel's scene. */
+  /** Returns the objects for the scene of a panel. */
   objects() {
     const points = new THREE.Points(this.geometry, this.material);
     points.frustumCulled = false;
@@ -81,7 +81,7 @@ class ScanLayer {
     this.thinArrows();
   }
 
-  /** Hides arrows above nothing: those outside the grid, while no points are shown. */
+  /** Hides the arrows outside the grid while no points are shown. */
   thinArrows() {
     const shown = this.points.some((points) => points.visible);
     for (const group of this.arrows) for (const arrow of group.children) arrow.visible = shown || arrow.userData.inside;
@@ -112,10 +112,10 @@ class ScanLayer {
   }
 }
 
-/** A plain car under the sensor, which stands 0.5 m behind its middle, 1.8 m above the ground. */
+/** Returns a plain car under the sensor, which is mounted 0.5 m behind the middle of the car, 1.8 m above the ground. */
 function egoVehicle() {
   const car = new THREE.Group();
-  const parts = [ // colour, scene x y z from and to
+  const parts = [ // colour, lower and upper corner in the axes of the scene
     ['#eef0f3', [-0.95, -1.62, -2.75], [0.95, -0.98, 1.75]],
     ['#78849a', [-0.8, -0.98, -1.3], [0.8, -0.5, 1.35]],
     ['#eef0f3', [-0.78, -0.5, -1.2], [0.78, -0.4, 1.25]],
@@ -131,7 +131,7 @@ function egoVehicle() {
   return car;
 }
 
-/** The rim of a grid's floor, and a mark ahead. */
+/** Returns the outline of a grid's floor, with a mark ahead of the vehicle. */
 function outline(panel, side) {
   const [x0, y0, z0] = panel.lower;
   const [x1, y1] = panel.upper;

@@ -1,4 +1,4 @@
-// What the page needs of three.js; build.sh bundles it as the global THREE.
+// The part of three.js that the page uses; build.sh bundles it as the global THREE.
 export {
   BackSide,
   BoxGeometry,

@@ -1,4 +1,4 @@
-// Puts everything together. `window.carlasc` is there for scripts and tests.
+// The viewer: connects the interface with the panels. `window.carlasc` is the viewer, for scripts and tests.
 
 class Viewer {
   constructor(scene) {
@@ -21,7 +21,7 @@ class Viewer {
     this.setTheme(window.matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light');
     new ResizeObserver(() => this.resize()).observe(byId('stage'));
     this.panels.resize();
-    this.panels.look('behind');
+    this.panels.setView('behind');
     await this.show(0);
     byId('message').textContent = '';
     const tick = () => { this.panels.draw(); requestAnimationFrame(tick); };
@@ -30,7 +30,7 @@ class Viewer {
 
   resize() {
     this.panels.resize();
-    if (!this.moved) this.panels.look(this.view ?? 'behind');
+    if (!this.moved) this.panels.setView(this.view ?? 'behind');
     this.placeTitles();
   }
 
@@ -47,8 +47,8 @@ class Viewer {
         byId('panel-buttons').append(button);
       });
     }
-    byId('view-behind').addEventListener('click', () => this.look('behind'));
-    byId('view-top').addEventListener('click', () => this.look('top'));
+    byId('view-behind').addEventListener('click', () => this.setView('behind'));
+    byId('view-top').addEventListener('click', () => this.setView('top'));
     byId('theme').addEventListener('click', () => this.setTheme(this.theme === 'dark' ? 'light' : 'dark'));
   }
 
@@ -56,8 +56,8 @@ class Viewer {
     const names = { grid: 'Grid', points: 'Points', flow: 'Flow', vehicle: 'Vehicle' };
     this.layerButtons = {};
     for (const [layer, label] of Object.entries(names)) {
-      const there = { grid: this.scene.panels.length > 0, points: this.scene.hasPoints, flow: this.scene.hasFlow, vehicle: true };
-      if (!there[layer]) continue;
+      const available = { grid: this.scene.panels.length > 0, points: this.scene.hasPoints, flow: this.scene.hasFlow, vehicle: true };
+      if (!available[layer]) continue;
       const button = toggleButton(label, this.layers[layer], (on) => this.setLayer(layer, on), { 'data-layer': layer });
       this.layerButtons[layer] = button;
       byId('layer-buttons').append(button);
@@ -72,7 +72,7 @@ class Viewer {
     this.legends = Object.entries(this.scene.tables).map(([name, classes]) => {
       const panels = this.scene.panels.map((panel, number) => ({ panel, number })).filter(({ panel }) => panel.table === name);
       const columns = panels.map(({ panel }) => (panels.length > 1 ? panel.title : 'voxels'));
-      const counted = this.scene.hasPoints && name === this.scene.pointTable && panels.length < 2; // beside two grids there is no room for a third column
+      const counted = this.scene.hasPoints && name === this.scene.pointTable && panels.length < 2; // a third column does not fit
       if (counted) columns.push('points');
       const change = (table, id, on) => { this.panels.setClass(table, id, on); this.unpick(); };
       const legend = new Legend(name === 'errors' ? 'Errors' : 'Classes', name, classes, columns, change);
@@ -99,8 +99,8 @@ class Viewer {
       g: () => this.layerButtons.grid?.click(),
       p: () => this.layerButtons.points?.click(),
       f: () => this.layerButtons.flow?.click(),
-      1: () => this.look('behind'),
-      2: () => this.look('top'),
+      1: () => this.setView('behind'),
+      2: () => this.setView('top'),
       d: () => byId('theme').click(),
       Escape: () => this.unpick(),
     };
@@ -123,11 +123,11 @@ class Viewer {
     canvas.addEventListener('wheel', () => { this.moved = true; }, { passive: true });
   }
 
-  /** Shows a frame by its place in the range. */
+  /** Shows the frame at a position of the range. */
   async show(position) {
     this.wanted = position;
     const contents = await this.store.get(position);
-    if (this.wanted !== position) return; // another was asked for meanwhile
+    if (this.wanted !== position) return; // another frame was requested in the meantime
     this.position = position;
     this.contents = contents;
     this.panels.setFrame(contents);
@@ -141,7 +141,7 @@ class Viewer {
     byId('frame-label').textContent = `frame ${this.scene.frames[position]}${time === null ? '' : ` · ${time.toFixed(1)} s`}`;
     if (this.picked) this.unpick();
     this.showRamp();
-    if (this.scene.frames.length > 1) this.store.get((position + 1) % this.scene.frames.length); // ready for playing
+    if (this.scene.frames.length > 1) this.store.get((position + 1) % this.scene.frames.length); // decoded in advance, for playing
   }
 
   step(by) {
@@ -154,7 +154,7 @@ class Viewer {
     byId('play').textContent = this.playing ? 'Stop' : 'Play';
     if (this.runs) return;
     this.runs = true;
-    while (this.playing) { // frames are 0.1 s apart, or as far as they take to draw
+    while (this.playing) { // a frame takes 0.1 s, or longer if drawing it does
       const due = performance.now() + 100;
       await this.step(1);
       await new Promise((done) => requestAnimationFrame(done));
@@ -171,7 +171,7 @@ class Viewer {
 
   showPanel(panel, on, button) {
     if (!on && this.panels.shown.length === 1) {
-      button.setAttribute('aria-pressed', 'true'); // one stays
+      button.setAttribute('aria-pressed', 'true'); // at least one panel is shown
       return;
     }
     panel.shown = on;
@@ -193,10 +193,10 @@ class Viewer {
     if (this.mode === 'votes' && layer?.grid?.votes) byId('layers').after(rampScale('Votes (logarithmic)', '0', grouped(Math.round(layer.mostVotes()))));
   }
 
-  look(view) {
+  setView(view) {
     this.view = view;
     this.moved = false;
-    this.panels.look(view);
+    this.panels.setView(view);
   }
 
   setTheme(theme) {
@@ -242,7 +242,7 @@ function countBy(labels, classes) {
 
 (async () => {
   try {
-    if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old: it has no DecompressionStream (Chrome 80, Firefox 113, Safari 16.4 do)');
+    if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old: Chrome 80, Firefox 113, Safari 16.4 or later is needed');
     window.carlasc = new Viewer(JSON.parse(byId('scene').textContent));
     await window.carlasc.start();
     document.documentElement.dataset.ready = 'true';

@@ -1,15 +1,15 @@
-// A grid's voxels as instances of one cell. The vertex shader bends it into a wedge in cylindrical grids.
+// The voxels of a grid as instances of one cell, which the vertex shader bends into a wedge in cylindrical grids.
 //
-// The scene's axes are right-handed: x to the right, y up, z backwards. CarlaSC's are left-handed (x forward, y right, z up), so this is a
-// plain change of names (`side` is +1); in right-handed data (y left) it also mirrors y (`side` is -1).
+// The axes of the scene are right-handed: x to the right, y up, z backwards. CarlaSC's axes are left-handed (x forward, y right, z up), so
+// axes only change their names (`side` is +1); in right-handed data (y left) y changes its sign too (`side` is -1).
 
-const RAMP = ['#440154', '#3b528b', '#21918c', '#5ec962', '#fde725']; // viridis: lightness rises throughout
-const WIDEST_ARC = (4 * Math.PI) / 180; // wider cells are drawn as several flat pieces
+const RAMP = ['#440154', '#3b528b', '#21918c', '#5ec962', '#fde725']; // viridis: lightness increases from the first to the last
+const WIDEST_ARC = (4 * Math.PI) / 180; // wider cells are drawn in several flat pieces
 
 const GRID_GLSL = /* glsl */ `
   uniform vec3 lower;    // lower bounds on the grid's axes
   uniform vec3 voxel;    // size of a cell
-  uniform vec3 dims;     // cells an axis
+  uniform vec3 dims;     // number of cells along each axis
   uniform bool cylindrical;
   uniform float side;
   vec3 toScene(vec3 axes) {
@@ -26,8 +26,8 @@ const GRID_GLSL = /* glsl */ `
 const VOXEL_VERTEX = /* glsl */ `
   precision highp sampler2D;
   precision highp sampler3D;
-  uniform sampler3D occupancy; // of the shown voxels; its axes are z, y, x
-  uniform bool closed;         // azimuth goes all the way round
+  uniform sampler3D occupancy; // of the voxels that are shown; its axes are z, y, x
+  uniform bool closed;         // the azimuth covers a full turn
   attribute vec3 cell;
   attribute float label;
   attribute float value;   // 0..1 on the ramp
@@ -43,7 +43,7 @@ const VOXEL_VERTEX = /* glsl */ `
   flat varying float vPicked;
   flat varying int vInstance;
   ${GRID_GLSL}
-  bool covered() { // by a neighbour that is shown: such faces would shine through at the edges
+  bool covered() { // whether a neighbour that is shown covers the face, which would otherwise be visible at its edges
     vec3 beside = cell + normal;
     if (closed) beside.y = mod(beside.y, dims.y);
     if (any(lessThan(beside, vec3(0.0))) || any(greaterThanEqual(beside, dims))) return false;
@@ -100,13 +100,13 @@ const VOXEL_FRAGMENT = /* glsl */ `
       for (int i = 1; i <= 14; i++) shadow = max(shadow, solid(toCells(foot + sun * (reach * 0.75 * float(i)))));
     }
     lit *= 1.0 - smoothstep(0.35, 0.8, shadow);
-    float level = sun.y; // an open, level face in the sun has exactly the legend's colour
+    float level = sun.y; // a level face in the sun has exactly the colour of the legend
     vec3 color = vColor * open * (0.58 + 0.42 * min(lit / level, 1.25));
 
     vec3 step = max(fwidth(vWithin), 1e-5);
-    vec3 away = min(vWithin, 1.0 - vWithin) / step + abs(vFace) * 1e6; // pixels to the edges, of which a face has four
+    vec3 away = min(vWithin, 1.0 - vWithin) / step + abs(vFace) * 1e6; // distance in pixels to the four edges of the face
     float edge = min(away.x, min(away.y, away.z));
-    vec3 fine = clamp((1.0 / step - 3.0) / 6.0, 0.0, 1.0); // lines a few pixels apart would shimmer
+    vec3 fine = clamp((1.0 / step - 3.0) / 6.0, 0.0, 1.0); // no lines where they would be only a few pixels apart, which flickers
     vec3 lines = fine * (1.0 - smoothstep(0.3, 1.3, away));
     color *= 1.0 - 0.22 * max(lines.x, max(lines.y, lines.z));
     if (vPicked > 0.5) color = mix(color, vec3(1.0, 0.62, 0.1), 0.35 + 0.65 * (1.0 - smoothstep(1.0, 2.5, edge)));
@@ -120,7 +120,7 @@ const PICK_FRAGMENT = /* glsl */ `
     gl_FragColor = vec4(float(id & 255), float((id >> 8) & 255), float((id >> 16) & 255), 255.0) / 255.0;
   }`;
 
-/** A texture of colours ("#rrggbb" or [.., "#rrggbb"]), one texel each, visible all. */
+/** Returns a texture of colours ("#rrggbb"), one texel each, all visible. */
 function colorTexture(colors, filter) {
   const texels = new Uint8Array(4 * colors.length);
   colors.forEach((color, i) => texels.set([1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16)).concat(255), 4 * i));
@@ -130,7 +130,7 @@ function colorTexture(colors, filter) {
   return texture;
 }
 
-/** Draws the voxels of one panel, whose classes may be hidden and picked. */
+/** Draws the voxels of one panel. Classes can be hidden, and a voxel can be marked. */
 class VoxelLayer {
   constructor(panel, side, palette) {
     this.panel = panel;
@@ -160,7 +160,7 @@ class VoxelLayer {
       shadows: { value: true },
       picked: { value: -1 },
     };
-    // the change of axes mirrors where the data is left-handed: there the box's faces turn inside out
+    // with left-handed data the change of axes mirrors the box, so that its faces are seen from the inside
     const face = side > 0 ? THREE.BackSide : THREE.FrontSide;
     this.material = new THREE.ShaderMaterial({ uniforms, vertexShader: VOXEL_VERTEX, fragmentShader: VOXEL_FRAGMENT, side: face });
     this.pickMaterial = new THREE.ShaderMaterial({ uniforms, vertexShader: VOXEL_VERTEX, fragmentShader: PICK_FRAGMENT, side: face });
@@ -170,7 +170,7 @@ class VoxelLayer {
     this.drawn = new Uint32Array(0);
   }
 
-  /** Takes a frame's voxels. */
+  /** Sets the voxels of a frame. */
   set(grid) {
     if (this.grid !== grid) {
       this.grid = grid;
@@ -179,10 +179,10 @@ class VoxelLayer {
     this.build();
   }
 
-  /** The voxels that can be seen: one whose six neighbours are of its own class is hidden whichever classes are shown. */
+  /** Returns the voxels that can be visible: one whose six neighbours have its own class never is, whichever classes are shown. */
   visible({ index, label, volume }) {
     const [nx, ny, nz] = this.panel.size;
-    const rim = 0xffff; // outside the grid: seen from there
+    const rim = 0xffff; // outside the grid: no class
     const kept = [];
     for (let i = 0; i < index.length; i++) {
       const at = index[i];
@@ -227,7 +227,7 @@ class VoxelLayer {
     this.shade();
   }
 
-  /** Where each drawn voxel stands on the ramp, 0..255: its height, or the logarithm of its votes. */
+  /** Returns the position of each drawn voxel on the ramp, 0 to 255: its height, or the logarithm of its votes. */
   rampValues(cells) {
     const values = new Uint8Array(this.drawn.length);
     const { votes } = this.grid;
@@ -251,7 +251,7 @@ class VoxelLayer {
     if (this.grid) this.build();
   }
 
-  /** Tells the shader what casts shadows: the voxels of the classes that are shown. */
+  /** Gives the shader the voxels of the classes that are shown: these cast shadows. */
   shade() {
     const shown = this.material.uniforms.palette.value.image.data;
     const { index, label } = this.grid;

@@ -1,8 +1,8 @@
-"""Which colour stands for what: the tables' own colours, a palette for the colour-blind, and ramps.
+"""Colours of classes, of a prediction's errors, and of heights.
 
-The palette for the colour-blind keeps the eleven groups of the paper apart under deuteranopia and protanopia (Machado et al.
-2009, severity 1): at least 29 units of CIE 1976 L*a*b* between any two, where the paper's colours come down to 7. It set out from
-Okabe and Ito's colours. Classes within a group are shades of it.
+The palette for colour-blind readers starts from the colours of Okabe and Ito. Any two of the paper's eleven classes differ by at least
+29 units of CIE 1976 L*a*b* under deuteranopia and protanopia (Machado et al. 2009, severity 1); with the paper's own colours the least
+difference is 7. Classes that belong to the same one of the eleven have shades of its colour.
 """
 
 from __future__ import annotations
@@ -17,17 +17,36 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Color
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError
+from carlasc.metrics.comparison import Outcome
 
 PaletteName = Literal["class", "colorblind", "height"]
 PALETTES: tuple[str, ...] = get_args(PaletteName)
 
-RIGHT, WRONG, MISSED, INVENTED = (205, 209, 214), (213, 70, 0), (16, 90, 190), (240, 200, 40)
+ERRORS = ClassTable(
+    "errors",
+    {
+        Outcome.NOT_COMPARED: "nothing to compare",
+        Outcome.RIGHT: "right class",
+        Outcome.WRONG: "wrong class",
+        Outcome.MISSED: "missed: predicted free",
+        Outcome.INVENTED: "invented: free in truth",
+    },
+    {
+        Outcome.NOT_COMPARED: (255, 255, 255),
+        Outcome.RIGHT: (205, 209, 214),
+        Outcome.WRONG: (213, 70, 0),
+        Outcome.MISSED: (16, 90, 190),
+        Outcome.INVENTED: (240, 200, 40),
+    },
+)
+"""Names and colours of the outcomes of comparing a prediction with the ground truth."""
+
 STATIC = (188, 191, 196)
 ARROW = (20, 20, 24)
 EGO, GLASS = (250, 250, 250), (120, 132, 148)
 UNLABELLED = (150, 150, 150)
 
-_GROUPS: dict[int, Color] = {  # by id of the eleven classes
+_GROUPS: dict[int, Color] = {  # by id in the paper's eleven classes
     0: (255, 255, 255),
     1: (10, 176, 245),
     2: (145, 81, 154),
@@ -40,18 +59,19 @@ _GROUPS: dict[int, Color] = {  # by id of the eleven classes
     9: (10, 165, 88),
     10: (16, 69, 190),
 }
-_RAMP = np.array(  # viridis at five places: lightness rises throughout
+_RAMP = np.array(  # viridis at five positions: lightness increases from the first to the last
     [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], np.float64
 )
 
 
 class Entry(NamedTuple):
-    """A line of the legend.
+    """An entry of a legend.
 
     Attributes:
-        name: what the colour stands for.
-        color: RGB.
-        order: where it stands: a class's id; what is no class comes before (below 0) or after (`AFTER_CLASSES` and more).
+        name: meaning of the colour.
+        color: RGB, 0 to 255.
+        order: position in the legend: the id of a class; below 0 for entries before the classes, `AFTER_CLASSES` and more for
+            entries after them.
     """
 
     name: str
@@ -64,11 +84,14 @@ AFTER_CLASSES = 1 << 20
 
 @dataclass(frozen=True)
 class ClassColors:
-    """How the classes of a table are drawn.
+    """The colours in which the classes of a table are drawn.
 
     Attributes:
-        table: whose ids.
-        palette: "class" (the table's own colours), "colorblind", or "height" (by height, whatever the class).
+        table: the class table.
+        palette: "class" (the colours of the table), "colorblind", or "height" (by height, for any class).
+
+    Raises:
+        ArgumentError: an unknown palette.
     """
 
     table: ClassTable = CARLA
@@ -76,15 +99,15 @@ class ClassColors:
 
     def __post_init__(self) -> None:
         if self.palette not in PALETTES:
-            raise ArgumentError(f"palette {self.palette!r}: expected one of {', '.join(PALETTES)}")
+            raise ArgumentError("palette", expected=f"one of {', '.join(PALETTES)}", found=repr(self.palette))
 
     @property
     def by_id(self) -> NDArray[np.uint8]:
-        """(num_channels, 3) uint8 RGB."""
+        """(num_channels, 3) uint8 RGB by class id."""
         return colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
 
     def entries(self, ids: Iterable[int]) -> list[Entry]:
-        """Return the legend of some classes, sorted by id; free (0) has none."""
+        """Return the legend of the given class ids, sorted by id, without free (0)."""
         colors = self.by_id
         return [
             Entry(self.table.names.get(i, f"class {i}"), as_color(colors[i]), i)
@@ -94,7 +117,7 @@ class ClassColors:
 
 
 def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
-    """Return (num_channels, 3) uint8 RGB that people with red-green blindness tell apart."""
+    """Return (num_channels, 3) uint8 RGB by class id, in colours that readers with red-green blindness can distinguish."""
     groups = _groups(table)
     palette = np.full((table.num_channels, 3), 128, np.uint8)
     for group, base in _GROUPS.items():
@@ -104,7 +127,8 @@ def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
             key=lambda i: (table.names[i].lower() not in (family, family.removesuffix("s")), i),
         )
         for number, member in enumerate(members):
-            # the one of the group's name, or the first, has its colour; the others come ever nearer to white (to black where that is light)
+            # the class named as the group, or the first one, has the group's colour; the others are blended with white, or with
+            # black if the group's colour is light
             target, most = (255, 0.7) if sum(base) < 480 else (0, 0.35)
             share = most * number / max(len(members) - 1, 1) if number else 0.0
             palette[member] = np.round((1 - share) * np.array(base) + share * target)
@@ -112,7 +136,7 @@ def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
 
 
 def height_colors(heights: NDArray[np.floating], lower: float, upper: float) -> NDArray[np.uint8]:
-    """Return (..., 3) uint8 RGB by height, dark below and light above."""
+    """Return (..., 3) uint8 RGB of heights: dark at `lower`, light at `upper`, both in metres."""
     position = np.clip((heights - lower) / max(upper - lower, 1e-9), 0, 1) * (len(_RAMP) - 1)
     places = np.arange(len(_RAMP))
     return np.stack([np.interp(position, places, _RAMP[:, c]) for c in range(3)], axis=-1).astype(np.uint8)
@@ -134,7 +158,7 @@ def as_color(rgb: NDArray[np.uint8]) -> Color:
 
 
 def _groups(table: ClassTable) -> dict[int, int]:
-    """Which of the eleven classes an id belongs to; ids that belong to none are Other."""
+    """Return which of the eleven classes each id belongs to; ids that belong to none count as Other."""
     eleven = REMAPS["carlasc11"].mapping
     if table == CARLASC11:
         return {i: i for i in table.names}
@@ -151,5 +175,5 @@ def _groups(table: ClassTable) -> dict[int, int]:
 
 
 def merge_legends(legends: Iterable[Iterable[Entry]]) -> list[Entry]:
-    """Return the entries of several legends, each once, in their order."""
+    """Return the different entries of several legends, sorted by `order`."""
     return sorted(dict.fromkeys(entry for legend in legends for entry in legend), key=lambda entry: entry.order)

@@ -1,4 +1,4 @@
-"""What is in a picture: a grid, a scan, how things move, or where a prediction errs, as meshes, points and a legend."""
+"""What a picture is made of: a grid, a scan, scene flow or the errors of a prediction, as a mesh, points and a legend."""
 
 from __future__ import annotations
 
@@ -9,33 +9,35 @@ from numpy.typing import NDArray
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.errors import ArgumentError, FormatError
-from carlasc.viewing.rendering import colors as palette
+from carlasc.errors import FormatError
+from carlasc.metrics.comparison import Outcome, compare_grids
+from carlasc.viewing import colors as palette
+from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry
+from carlasc.viewing.remapping import without_invalid_points
 from carlasc.viewing.rendering.cameras import Camera
-from carlasc.viewing.rendering.colors import AFTER_CLASSES, ClassColors, Entry
 from carlasc.viewing.rendering.meshes import QuadMesh, arrows, box, footprint, grid_mesh, join, quads
 from carlasc.viewing.rendering.raycasting import cast, empty_frame
 from carlasc.viewing.rendering.splats import splat
 
 Extent = NDArray[np.float64]
-"""(N, 3) points, metres, that should be in the picture."""
+"""(N, 3) float64 points, metres, that a camera fitted to the drawing shows."""
 
 _FLOOR = (240, 240, 243)
-_MOVING_M_S = 0.2  # slower is standing
+_MOVING_M_S = 0.2  # slower points count as static
 _ARROW_CELL_M = 3.0
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What is drawn.
+class Drawing:
+    """A mesh and points with colours, and a legend for them.
 
     Attributes:
-        extent: what a fitted camera shows.
+        extent: (N, 3) points, metres, that a camera fitted to the drawing shows.
         mesh: faces, or None.
-        points: (N, 3) metres and
-        point_colors: (N, 3) uint8 RGB, or None.
-        legend: what the colours mean, in order.
-        note: one line that is written into the picture: it is empty, say.
+        points: (N, 3) metres, or None.
+        point_colors: (N, 3) uint8 RGB of the points, or None.
+        legend: the meaning of the colours.
+        note: a line to write into the picture, such as that the grid is empty; or None.
     """
 
     extent: Extent
@@ -45,7 +47,7 @@ class Scene:
     legend: list[Entry] = field(default_factory=list)
     note: str | None = None
 
-    def draw(self, camera: Camera, width: int, height: int, *, left_handed: bool = True) -> NDArray[np.uint8]:
+    def render(self, camera: Camera, width: int, height: int, *, left_handed: bool = True) -> NDArray[np.uint8]:
         """Return the picture, (height, width, 3) uint8, without legend or title."""
         frame = empty_frame(width, height)
         if self.mesh is not None:
@@ -56,25 +58,29 @@ class Scene:
 
 
 def grid_extent(spec: GridSpec) -> Extent:
-    """Return the corners of a grid's volume: of its floor and its ceiling."""
+    """Return the corners of the floor and of the ceiling of a grid."""
     return np.concatenate([footprint(spec, height).reshape(-1, 3) for height in (spec.lower[2], spec.upper[2])]).astype(
         np.float64
     )
 
 
 def scan_extent(scan: Scan) -> Extent:
-    """Return the corners of a box that holds the sensor and most points, at most 40 m from it."""
+    """Return the corners of a box that contains the sensor and most points, at most 40 m from the sensor."""
     lower, upper = np.array([-5.0, -5.0, -2.0]), np.array([5.0, 5.0, 0.0])
     if len(scan):
         lower, upper = (np.quantile(scan.points, share, axis=0) for share in (0.03, 0.97))
-    side = np.array([5.0, 5.0, 0.0])  # the sensor, and something around it, is always in the picture
+    side = np.array([5.0, 5.0, 0.0])  # the sensor and its surroundings are always in the picture
     lower, upper = np.clip(np.minimum(lower, -side), -40, 40), np.clip(np.maximum(upper, side), -40, 40)
     corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     return lower + corners * (upper - lower)
 
 
-def grid_scene(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Scene:
-    """Return a grid's occupied voxels; free and unknown ones are not drawn."""
+def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawing:
+    """Return the occupied voxels of a grid, without free and unknown ones.
+
+    Raises:
+        FormatError: a label is not in the class table.
+    """
     colors.table.check(grid.labels, "grid labels")
     occupied = grid.labels > 0
     ids = np.flatnonzero(np.bincount(grid.labels.reshape(-1), minlength=1))
@@ -84,35 +90,30 @@ def grid_scene(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Scene:
         voxel_colors, legend = np.broadcast_to(layers, (*grid.spec.size, 3)), palette.height_entries(low, high)
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
-    return _voxel_scene(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
+    return _voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
 
 
-def error_scene(prediction: Grid, truth: Grid, *, ego: bool = True) -> Scene:
-    """Return where a prediction is right, wrong, misses and invents, where the truth is known.
+def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
+    """Return the voxels where a prediction is right, wrong, missed or invented, where the truth is known.
 
     Raises:
         ArgumentError: the grids differ in their geometry.
     """
-    check_same_spec(prediction, truth)
-    predicted, occupied = prediction.labels > 0, truth.labels > 0
-    kinds = (
-        ("right class", palette.RIGHT, occupied & (prediction.labels == truth.labels)),
-        ("wrong class", palette.WRONG, occupied & predicted & (prediction.labels != truth.labels)),
-        ("missed: predicted free", palette.MISSED, occupied & ~predicted),
-        ("invented: free in truth", palette.INVENTED, ~occupied & predicted),
-    )
-    voxel_colors = np.zeros((*truth.spec.size, 3), np.uint8)
-    drawn = np.zeros(truth.spec.size, np.bool_)
-    for _, color, where in kinds:
-        voxel_colors[where & truth.known] = color
-        drawn |= where & truth.known
-    legend = [Entry(name, color, AFTER_CLASSES + number) for number, (name, color, _) in enumerate(kinds)]
-    return _voxel_scene(truth.spec, voxel_colors, drawn, legend, "no known voxel is occupied in either", ego)
+    outcomes = compare_grids(prediction, truth)
+    colors = ClassColors(ERRORS)
+    legend = [entry._replace(order=AFTER_CLASSES + entry.order) for entry in colors.entries(ERRORS.names)]
+    empty = "no known voxel is occupied in either"
+    return _voxel_drawing(truth.spec, colors.by_id[outcomes], outcomes != Outcome.NOT_COMPARED, legend, empty, ego)
 
 
-def scan_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Scene:
-    """Return a scan's points, by class; by height where there are no labels or the palette says so."""
-    points, extent = _finite(scan), scan_extent(scan) if extent is None else extent
+def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
+    """Return the points of a scan, coloured by class; by height if there are no labels or the palette is "height".
+
+    Raises:
+        FormatError: a label is not in the class table.
+    """
+    points = without_invalid_points(scan)
+    extent = scan_extent(points) if extent is None else extent
     if colors.palette == "height" or points.labels is None:
         low, high = float(extent[:, 2].min()), float(extent[:, 2].max())
         point_colors = palette.height_colors(points.points[:, 2], low, high)
@@ -125,18 +126,21 @@ def scan_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
         unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
         point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids)
     note = None if len(points) else "the scan has no point"
-    return Scene(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
+    return Drawing(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
 
 
-def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Scene:
-    """Return a scan with what moves in its class's colour, and an arrow for each thing that does: the way of one second.
+def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
+    """Return a scan with moving points in the colour of their class, static ones in grey, and an arrow for each moving actor.
+
+    An arrow is as long as the distance that its actor moves in one second.
 
     Raises:
-        FormatError: the scan has no flow.
+        FormatError: the scan has no flow, or a label is not in the class table.
     """
     if scan.flow is None:
-        raise FormatError("scan", expected="the field flow", found="none", advice="choose another picture")
-    points, extent = _finite(scan), scan_extent(scan) if extent is None else extent
+        raise FormatError("scan", expected="the field flow", found="none", advice="choose other contents with `what`")
+    points = without_invalid_points(scan)
+    extent = scan_extent(points) if extent is None else extent
     flow = np.asarray(points.flow)
     moving = np.linalg.norm(flow, axis=1) > _MOVING_M_S
     point_colors = np.full((len(points), 3), palette.STATIC, np.uint8)
@@ -151,13 +155,17 @@ def flow_scene(scan: Scan, colors: ClassColors, *, extent: Extent | None = None,
         meshes.append(arrows(tails, vectors, palette.ARROW, 0.24))
         legend.append(Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES))
     note = None if len(tails) else "nothing moves"
-    return Scene(extent, join(meshes) if meshes else None, points.points, point_colors, legend, note)
+    return Drawing(extent, join(meshes) if meshes else None, points.points, point_colors, legend, note)
 
 
 def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (M, 3) tails and (M, 3) vectors of an arrow for each actor; for each 3 m of them where instances are unknown.
+    """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in metres.
 
-    An arrow begins above the middle of its points, and is as long as the way of one second.
+    There is one arrow per instance, and one per cell of 3 m for points without an instance. An arrow starts above the middle of its
+    points and is as long as the distance moved in one second.
+
+    Args:
+        moving: the points that move, with flow.
     """
     if not len(moving):
         return np.empty((0, 3)), np.empty((0, 3))
@@ -180,38 +188,25 @@ def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64
     return middle[real], vectors[real]
 
 
-def check_same_spec(prediction: Grid, truth: Grid) -> None:
-    """Raise ArgumentError where two grids have not the same cells."""
-    if prediction.spec != truth.spec:
-        raise ArgumentError(
-            "truth",
-            expected=f"the prediction's grid ({prediction.spec}, {prediction.spec.lower} to {prediction.spec.upper})",
-            found=f"{truth.spec}, {truth.spec.lower} to {truth.spec.upper}",
-            advice="choose another with --grid",
-        )
-
-
-def _voxel_scene(
+def _voxel_drawing(
     spec: GridSpec,
     voxel_colors: NDArray[np.uint8],
     occupied: NDArray[np.bool_],
     legend: list[Entry],
     empty: str,
     ego: bool,
-) -> Scene:
+) -> Drawing:
     floor = quads(footprint(spec, spec.lower[2] - 2e-3), _FLOOR, open_sky=True)
     meshes = [grid_mesh(spec, voxel_colors, occupied), floor, *([ego_vehicle()] if ego else [])]
-    return Scene(grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty)
+    return Drawing(grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty)
 
 
 def ego_vehicle() -> QuadMesh:
-    """Return a plain car under the sensor: this stands 0.5 m behind its middle, 1.8 m above the ground (FORMAT section 1)."""
+    """Return a plain car under the sensor, which is mounted 0.5 m behind the middle of the car, 1.8 m above the ground.
+
+    See the format page, `docs/format.md#coordinate-frame`.
+    """
     body = box((-1.75, -0.95, -1.62), (2.75, 0.95, -0.98), palette.EGO)
     windows = box((-1.55, -0.88, -0.98), (1.55, 0.88, -0.5), palette.GLASS, taper=0.28)
     roof = box((-1.27, -0.6, -0.5), (1.27, 0.6, -0.42), palette.EGO)
     return join([body, windows, roof])
-
-
-def _finite(scan: Scan) -> Scan:
-    keep = np.asarray(np.isfinite(scan.points).all(axis=1))
-    return scan if keep.all() else scan.select(keep)

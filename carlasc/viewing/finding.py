@@ -1,0 +1,129 @@
+"""Finding the sequence to look at: in any source, by a grid's folder, or by the file of one frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage import Sequence, Source, as_source, layout
+from carlasc.storage.folders.folder import FolderSequence
+
+SceneSource = str | os.PathLike[str] | Source | Sequence
+"""What a scene is read from: anything that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSequence:
+    """A sequence, and what its path says beyond that.
+
+    Attributes:
+        sequence: the sequence.
+        grid: name of the grid, if the path is a grid's folder or a file in it.
+        frame: frame number, if the path is the file of one frame.
+        is_scan: whether the path is a file of a scan (points, labels, ...).
+        note: which of several sequences was taken, or None.
+    """
+
+    sequence: Sequence
+    grid: str | None = None
+    frame: int | None = None
+    is_scan: bool = False
+    note: str | None = None
+
+
+def find_sequence(source: SceneSource, name: str | None = None) -> FoundSequence:
+    """Find the sequence that a source and a name stand for.
+
+    Args:
+        source: see `SceneSource`.
+        name: path or name of the sequence in the source; None takes the first.
+
+    Raises:
+        MissingDataError: there is no sequence, or none of that name.
+        FormatError: the source is nothing that can be read.
+    """
+    if isinstance(source, Sequence):
+        return FoundSequence(source)
+    if (found := _open_part(source)) is not None:
+        return found
+    return _choose_sequence(as_source(source), name)
+
+
+def find_truth(truth: SceneSource, prediction: Sequence) -> FoundSequence:
+    """Find the ground truth of a prediction: the sequence with its path, with its name, or the only one.
+
+    Raises:
+        MissingDataError: no sequence matches.
+        FormatError: the source is nothing that can be read.
+    """
+    if isinstance(truth, Sequence):
+        return FoundSequence(truth)
+    if (found := _open_part(truth)) is not None:
+        return found
+    source = as_source(truth)
+    sequences = source.sequences()
+    if len(sequences) == 1:
+        return FoundSequence(next(iter(sequences.values())))
+    identity = (prediction.name, prediction.coordinates)
+    same_name = (sequence for sequence in sequences.values() if (sequence.name, sequence.coordinates) == identity)
+    match = sequences.get(prediction.path) or next(same_name, None)
+    if match is None:
+        raise MissingDataError(
+            source.location,
+            expected=f"the sequence {prediction.name} ({prediction.coordinates})",
+            found=_shorten(sequences),
+            advice="give the folder of the sequence",
+        )
+    return FoundSequence(match)
+
+
+def _open_part(source: str | os.PathLike[str] | Source) -> FoundSequence | None:
+    """Open a grid's folder or the file of one frame; None if the source is neither."""
+    if isinstance(source, Source):
+        return None
+    path = Path(source)
+    if path.is_file() and path.suffix in (".label", ".bin"):
+        return _open_file(path.absolute())
+    if (path / layout.PARAMS).is_file():
+        path = path.absolute()
+        return FoundSequence(FolderSequence(path.parent), grid=path.name)
+    return None
+
+
+def _open_file(path: Path) -> FoundSequence:
+    """Open the sequence that a frame's file belongs to; its folder is that of a grid or of one of a scan's fields."""
+    folder = path.parent
+    frame = layout.frame_of(path.name, path.suffix)
+    is_scan = folder.name in layout.scan_folders()
+    if frame is None or not (is_scan or (folder / layout.PARAMS).is_file()):
+        raise FormatError(
+            path,
+            expected=f"a file named by its frame number (six digits), in a folder of scans or beside {layout.PARAMS}",
+            found="another file",
+            advice=f"the geometry of a grid is in its {layout.PARAMS}",
+        )
+    found = FoundSequence(FolderSequence(folder.parent), frame=frame, is_scan=is_scan)
+    return found if is_scan else replace(found, grid=folder.name)
+
+
+def _choose_sequence(source: Source, name: str | None) -> FoundSequence:
+    sequences = source.sequences()
+    if not sequences:
+        raise MissingDataError(source.location, expected="a sequence", found="none")
+    if name is None:
+        path, first = next(iter(sequences.items()))
+        note = f"{source.location}: {len(sequences)} sequences found, showing the first, {path}"
+        return FoundSequence(first, note=note if len(sequences) > 1 else None)
+    same_name = (sequence for sequence in sequences.values() if sequence.name == name)
+    match = sequences.get(name) or next(same_name, None)
+    if match is None:
+        raise MissingDataError(source.location, expected=f"the sequence {name}", found=_shorten(sequences))
+    return FoundSequence(match)
+
+
+def _shorten(names: Iterable[str]) -> str:
+    names = list(names)
+    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")

@@ -1,0 +1,84 @@
+"""Reading a sequence whose labels are wanted in another class table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
+from carlasc.core.tables import to_table
+from carlasc.storage import Sequence
+
+
+@dataclass(frozen=True, eq=False)
+class RemappedSequence:
+    """A sequence whose labels are read as classes of another table.
+
+    Attributes:
+        sequence: where frames are read from.
+        grid: name of the grid that is read; "" for none.
+        stored: class table of the labels in the sequence; None takes what the metadata of the grid and of the scans say.
+        shown: class table that labels are read in; None leaves them as they are stored.
+    """
+
+    sequence: Sequence
+    grid: str
+    stored: ClassTable | None = None
+    shown: ClassTable | None = None
+
+    @property
+    def spec(self) -> GridSpec:
+        """Geometry of the grid."""
+        return self.sequence.grids[self.grid]
+
+    @property
+    def stored_table(self) -> ClassTable:
+        """Class table of the grid's labels as they are stored, or of the scans' if no grid is read."""
+        if self.stored is not None or not self.grid:
+            return self.scan_table
+        return self.sequence.classes_of(self.grid)
+
+    @property
+    def scan_table(self) -> ClassTable:
+        """Class table of the scans' labels as they are stored: a prediction beside them may have another."""
+        return self.sequence.metadata.classes if self.stored is None else self.stored
+
+    def read_grid(self, frame: int) -> Grid:
+        """Read the grid of a frame, in the table that is shown.
+
+        Raises:
+            FormatError: the grid does not have the format, or a label is not in its class table.
+        """
+        grid = self.sequence.grid(self.grid, frame)
+        labels = self._remap(grid.labels, self.stored_table, f"{self.sequence.location}: {self.grid}, frame {frame}")
+        return replace(grid, labels=labels)
+
+    def read_scan(self, frame: int) -> Scan:
+        """Read the scan of a frame, in the table that is shown, without points that are not finite.
+
+        Raises:
+            FormatError: the scan does not have the format, or a label is not in its class table.
+        """
+        scan = without_invalid_points(self.sequence.scan(frame))
+        if scan.labels is None:
+            return scan
+        where = f"{self.sequence.location}: labels, frame {frame}"
+        return replace(scan, labels=self._remap(scan.labels, self.scan_table, where))
+
+    def _remap(
+        self, labels: NDArray[np.unsignedinteger], stored: ClassTable, where: str
+    ) -> NDArray[np.unsignedinteger]:
+        target = self.shown or stored
+        labels = to_table(labels, stored, target, where)
+        target.check(labels, where)
+        return labels
+
+
+def without_invalid_points(scan: Scan) -> Scan:
+    """Return a scan without the points that have a coordinate that is NaN or infinite."""
+    finite = np.asarray(np.isfinite(scan.points).all(axis=1))
+    return scan if finite.all() else scan.select(finite)

@@ -1,0 +1,326 @@
+"""What to look at: frames of a sequence with a grid, its ground truth and its points, all in one class table.
+
+Pictures, pages and windows, and whatever else shows data, take a `Scene` and read it through a `SceneReader`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
+from carlasc.core.tables import TABLES, remaps_between
+from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.metrics.comparison import check_same_geometry, compare_grids
+from carlasc.storage import Sequence, layout
+from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
+from carlasc.viewing.finding import FoundSequence, SceneSource, find_sequence, find_truth
+from carlasc.viewing.remapping import RemappedSequence
+
+CONTENTS = ("grid", "scan", "flow", "truth", "errors")
+"""What a picture can show of a frame."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Which frames of which sequence are shown, and in which classes and colours. Nothing is read before `open`.
+
+    Attributes:
+        source: a path or URL that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence.
+        sequence: path or name of the sequence in the source; None takes the first.
+        frames: range of frame numbers; None takes all.
+        every: take every N-th frame of the range.
+        grid: name of the grid; None takes `evaluation`, or the first grid.
+        truth: ground truth to compare the grid with; anything that `source` may be.
+        truth_grid: name of the ground truth's grid; None as for `grid`.
+        classes: class table to show, such as "carlasc11"; None shows the grid's own classes, or those of the ground truth if
+            only these are common to both.
+        source_classes: class table of the labels in `source`; None takes what its metadata say.
+        palette: "class" (the colours of the class table), "colorblind", or "height" (by height; for pictures only).
+
+    Raises:
+        ArgumentError: an unknown class table or palette, an invalid range of frames, or `every` below 1.
+    """
+
+    source: SceneSource
+    _: KW_ONLY
+    sequence: str | None = None
+    frames: Frames = None
+    every: int = 1
+    grid: str | None = None
+    truth: SceneSource | None = None
+    truth_grid: str | None = None
+    classes: ClassTable | str | None = None
+    source_classes: ClassTable | str | None = None
+    palette: PaletteName = "class"
+
+    def __post_init__(self) -> None:
+        FrameRange.of(self.frames)
+        if self.every < 1:
+            raise ArgumentError("every", expected="1 or more", found=str(self.every))
+        if self.palette not in PALETTES:
+            raise ArgumentError("palette", expected=f"one of {', '.join(PALETTES)}", found=repr(self.palette))
+        for name, table in (("classes", self.classes), ("source_classes", self.source_classes)):
+            if isinstance(table, str) and table not in TABLES:
+                raise ArgumentError(name, expected=f"one of {', '.join(TABLES)}", found=repr(table))
+
+    def open(self, what: str | Iterable[str] | None = None) -> SceneReader:
+        """Find the sequence, the grids, the frames and a common class table.
+
+        Args:
+            what: names from `CONTENTS`, or one string of them separated by commas; only frames that have all of them are
+                taken. None takes the grid, with a ground truth also the truth and the errors; or the scan if there is no grid.
+
+        Raises:
+            ArgumentError: an unknown content, one that needs a ground truth, or classes that cannot be shown in one table.
+            MissingDataError: a sequence, grid or frame does not exist.
+            FormatError: the data do not have the format.
+        """
+        found = find_sequence(self.source, self.sequence)
+        truth = None if self.truth is None else find_truth(self.truth, found.sequence)
+        contents = self._default_contents(found) if what is None else self._check_contents(what)
+        grid = _choose_grid(found, self.grid) if {"grid", "errors"} & set(contents) else ""
+        data = RemappedSequence(found.sequence, grid, stored=_table_of(self.source_classes))
+        reference = None
+        if truth is not None:
+            reference = RemappedSequence(truth.sequence, _choose_grid(truth, self.truth_grid))
+            if "errors" in contents:
+                check_same_geometry(data.spec, reference.spec)
+        table = _common_table(data, reference, _table_of(self.classes))
+        data = replace(data, shown=table)
+        reference = None if reference is None else replace(reference, shown=table)
+        frames = self._choose_frames(found, _frames_with(data, reference, contents))
+        notes = () if found.note is None else (found.note,)
+        return SceneReader(data, reference, contents, frames, self.palette, notes)
+
+    def _default_contents(self, found: FoundSequence) -> tuple[str, ...]:
+        has_grid = self.grid is not None or found.grid is not None or self.truth is not None
+        has_grid = has_grid or (bool(found.sequence.grids) and not found.is_scan)
+        if has_grid:
+            return ("grid",) if self.truth is None else ("grid", "truth", "errors")
+        if "points" in found.sequence.fields():
+            return ("scan",)
+        raise MissingDataError(found.sequence.location, expected="a grid or points", found=_list_fields(found.sequence))
+
+    def _check_contents(self, what: str | Iterable[str]) -> tuple[str, ...]:
+        contents = tuple(what.split(",") if isinstance(what, str) else what)
+        for name in contents:
+            if name not in CONTENTS:
+                raise ArgumentError("what", expected=f"one or more of {', '.join(CONTENTS)}", found=repr(name))
+            if name in ("truth", "errors") and self.truth is None:
+                raise ArgumentError("what", problem=f"{name} needs a ground truth", advice="give it with `truth`")
+        if not contents:
+            raise ArgumentError("what", expected=f"one or more of {', '.join(CONTENTS)}", found="nothing")
+        return contents
+
+    def _choose_frames(self, found: FoundSequence, available: NDArray[np.int64]) -> tuple[int, ...]:
+        frames = FrameRange.of(self.frames)
+        if self.frames is None and found.frame is not None:
+            frames = FrameRange(found.frame, found.frame + 1)
+        chosen = frames.select(available)[:: self.every]
+        if not len(chosen):
+            raise MissingDataError(
+                found.sequence.location,
+                expected=f"frames {frames}",
+                found=_describe_frames(available),
+                advice="choose others with `frames`",
+            )
+        return tuple(int(frame) for frame in chosen)
+
+
+def as_scene(source: Scene | SceneSource) -> Scene:
+    """Return a Scene as it is, and the scene of all frames of anything else."""
+    return source if isinstance(source, Scene) else Scene(source)
+
+
+@dataclass(frozen=True)
+class GridPanel:
+    """One of the grids that are shown side by side.
+
+    Attributes:
+        title: "prediction", "truth", "errors"; or the size of the grid if there is only one.
+        spec: geometry.
+        colors: colours of its labels.
+    """
+
+    title: str
+    spec: GridSpec
+    colors: ClassColors
+
+
+@dataclass(frozen=True)
+class FrameContent:
+    """What a viewer shows of one frame.
+
+    Attributes:
+        grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.Outcome`).
+        scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
+        time_s: seconds since the first frame, or None if the sequence has no times.
+    """
+
+    grids: tuple[Grid, ...]
+    scan: Scan | None
+    time_s: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneReader:
+    """Reads the frames of a scene. It holds no open files and can be sent to other processes.
+
+    Attributes:
+        data: the sequence that is shown.
+        truth: the ground truth that its grid is compared with, or None.
+        contents: what is shown, names from `CONTENTS`.
+        frames: the frame numbers.
+        palette: "class", "colorblind" or "height".
+        notes: what was chosen where the scene left a choice, one sentence each.
+    """
+
+    data: RemappedSequence
+    truth: RemappedSequence | None
+    contents: tuple[str, ...]
+    frames: tuple[int, ...]
+    palette: PaletteName = "class"
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence, such as "Town01_Light", after its split if it has one."""
+        sequence = self.data.sequence
+        name = sequence.name or sequence.path or sequence.location
+        return f"{sequence.split} / {name}" if sequence.split else name
+
+    @property
+    def path(self) -> str:
+        """Path of the sequence in its source, or where it is."""
+        return self.data.sequence.path or self.data.sequence.location
+
+    @property
+    def left_handed(self) -> bool:
+        """Whether y points to the right of the vehicle."""
+        return self.data.sequence.metadata.axes == "left"
+
+    @property
+    def table(self) -> ClassTable:
+        """The class table of all grids and points."""
+        return self.data.shown or self.data.stored_table
+
+    @cached_property
+    def colors(self) -> ClassColors:
+        """The colours of the classes."""
+        return ClassColors(self.table, self.palette)
+
+    @cached_property
+    def panels(self) -> tuple[GridPanel, ...]:
+        """The grids that are shown side by side; empty if only points are shown."""
+        if not self.data.grid:
+            return ()
+        spec = self.data.spec
+        if self.truth is None:
+            return (GridPanel(str(spec), spec, self.colors),)
+        return (
+            GridPanel("prediction", spec, self.colors),
+            GridPanel("truth", spec, self.colors),
+            GridPanel("errors", spec, ClassColors(ERRORS)),
+        )
+
+    def read(self, frame: int) -> FrameContent:
+        """Read a frame.
+
+        Raises:
+            FormatError: the data do not have the format.
+        """
+        scan = self.data.read_scan(frame) if frame in self.data.sequence.frames("points") else None
+        return FrameContent(self._read_grids(frame), scan, self.read_time(frame))
+
+    def read_time(self, frame: int) -> float | None:
+        """Return the seconds since the first frame, or None if the sequence has no times."""
+        try:
+            return self.data.sequence.read_time(frame)
+        except MissingDataError:
+            return None
+
+    def _read_grids(self, frame: int) -> tuple[Grid, ...]:
+        if not self.data.grid:
+            return ()
+        grid = self.data.read_grid(frame)
+        if self.truth is None:
+            return (grid,)
+        truth = self.truth.read_grid(frame)
+        return grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
+
+
+def _table_of(classes: ClassTable | str | None) -> ClassTable | None:
+    return TABLES[classes] if isinstance(classes, str) else classes
+
+
+def _choose_grid(found: FoundSequence, name: str | None) -> str:
+    """Return the grid that is asked for, the one that the path names, `evaluation`, or the first."""
+    names = list(found.sequence.grids)
+    wanted = name or found.grid
+    if wanted is None:
+        wanted = layout.EVALUATION if layout.EVALUATION in names else next(iter(names), layout.EVALUATION)
+    if wanted not in names:
+        raise MissingDataError(
+            found.sequence.location, expected=f"the grid {wanted}", found=", ".join(names) or "no grid"
+        )
+    return wanted
+
+
+def _common_table(data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None) -> ClassTable:
+    """Return the class table that all labels are shown in: the wanted one, the data's, or the truth's."""
+    stored = [data.stored_table] + ([] if truth is None else [truth.stored_table])
+    candidates = stored if wanted is None else [wanted]
+    for table in candidates[:-1]:
+        try:
+            _check_remaps(stored, table)
+        except ArgumentError:
+            continue
+        return table
+    _check_remaps(stored, candidates[-1])
+    return candidates[-1]
+
+
+def _check_remaps(stored: Iterable[ClassTable], target: ClassTable) -> None:
+    """Raise ArgumentError if labels of one of the tables cannot be shown in the target."""
+    for table in stored:
+        remaps_between(table, target)
+
+
+def _frames_with(
+    data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]
+) -> NDArray[np.int64]:
+    """Return the frames that have everything that is shown."""
+    own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
+    needed = [(data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))]
+    if truth is not None and {"truth", "errors"} & set(contents):
+        needed.append((truth.sequence, f"{truth.grid}/labels"))
+    frames: NDArray[np.int64] | None = None
+    for sequence, name in needed:
+        available = sequence.frames(name)
+        if not len(available):
+            raise MissingDataError(sequence.location, expected=f"the field {name}", found=_list_fields(sequence))
+        common = available if frames is None else np.intersect1d(frames, available)
+        if frames is not None and not len(common):
+            raise MissingDataError(
+                sequence.location,
+                expected=f"{name} of frames {_describe_frames(frames)}",
+                found=f"frames {_describe_frames(available)}",
+            )
+        frames = common
+    return np.empty(0, np.int64) if frames is None else frames
+
+
+def _list_fields(sequence: Sequence) -> str:
+    return ", ".join(sorted(sequence.fields())) or "nothing"
+
+
+def _describe_frames(frames: NDArray[np.int64]) -> str:
+    return f"{frames[0]} to {frames[-1]} ({len(frames)} frames)"
