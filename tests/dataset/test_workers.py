@@ -7,8 +7,10 @@ from helpers.drives import write_drive
 from carlasc.core.grids import GridSpec
 from carlasc.dataset import FIELDS, Dataset, Flip, collate
 
-torch = pytest.importorskip("torch")
-from torch.utils.data import DataLoader, DistributedSampler  # noqa: E402
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
+import torch
+from torch.utils.data import DataLoader, DistributedSampler
 
 RAGGED = ("points", "point_labels", "flow")
 

@@ -4,15 +4,18 @@ import shutil
 
 import numpy as np
 import pytest
+from helpers.completion import SPEC, write_split
+
+from carlasc.errors import ArgumentError, DependencyError
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
 import torch
 from completion.config import Config
 from completion.inference import check_compiler, prepare
 from completion.latency import measure_network
 from completion.networks import build_network
 from completion.throughput import measure_throughput
-from helpers.completion import SPEC, write_split
-
-from carlasc.errors import ArgumentError, DependencyError
 
 CPU = torch.device("cpu")
 

@@ -8,16 +8,19 @@ import sys
 
 import numpy as np
 import pytest
-import torch
-from completion.networks import build_network
-from completion.predicting import Model, predict_dataset, predict_scans
-from completion.weights import read_weights, write_weights
 from helpers.completion import SPEC, write_split
 
 from carlasc import Dataset, GridSpec
 from carlasc import open as open_source
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.metrics import evaluate
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
+import torch
+from completion.networks import build_network
+from completion.predicting import Model, predict_dataset, predict_scans
+from completion.weights import read_weights, write_weights
 
 CPU = torch.device("cpu")
 

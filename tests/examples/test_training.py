@@ -10,14 +10,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.completion import write_split
+
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
 import torch
 from completion.config import Config
 from completion.processes import Processes
 from completion.training import BEST, LAST, train
 from completion.weights import read_checkpoint, read_weights
-from helpers.completion import write_split
-
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
 
 ALONE = Processes(0, 1, torch.device("cpu"))
 QUICK = Config("lmscnet_ss", epochs=2, batch_size=2, workers=0, learning_rate=0.01, class_weights="train")
