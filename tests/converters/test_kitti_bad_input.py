@@ -163,7 +163,13 @@ def test_a_second_run_of_other_settings_stops(tmp_path, folder):
 
 
 def test_arguments_that_make_no_sense_are_named(tmp_path, folder):
-    for name, value in (("classes", "semanticposs"), ("axes", "up"), ("grids", "all"), ("poses", "gps"), ("flow", "icp")):
+    for name, value in (
+        ("classes", "semanticposs"),
+        ("axes", "up"),
+        ("grids", "all"),
+        ("poses", "gps"),
+        ("flow", "icp"),
+    ):
         with pytest.raises(ArgumentError, match=f"{name}: expected one of"):
             run(tmp_path, **{name: value})
     with pytest.raises(ArgumentError, match=r"name: expected one of .*kitti.*, found 'kiti'"):

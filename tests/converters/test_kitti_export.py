@@ -29,7 +29,9 @@ def frame_files(folder, name, suffix):
 @pytest.fixture(scope="module")
 def there_and_back(simulated, tmp_path_factory):
     middle, back = tmp_path_factory.mktemp("middle"), tmp_path_factory.mktemp("back")
-    convert("kitti", simulated[0], middle, classes="semantickitti", axes="right", grids="voxels", flow="none", workers=1)
+    convert(
+        "kitti", simulated[0], middle, classes="semantickitti", axes="right", grids="voxels", flow="none", workers=1
+    )
     result = export("kitti", middle, back, workers=1)
     assert (result.made, result.failures, result.sequences) == (24, (), {SEQUENCE: "sequences/00"})
     return simulated[1].folder, back / "sequences" / "00"
