@@ -117,7 +117,7 @@ def test_weights_that_do_not_fit_name_the_layer_and_both_shapes(tmp_path):
 
     with pytest.raises(
         FormatError,
-        match=r"conv_classes.weight: expected 11 x 128 x 1 x 1 x 1, found 7 x .*: weights of another number of classes",
+        match=r"conv_classes.weight: expected 11 x 128 x 1 x 1 x 1, found 7 x .*: the weights are for another number of classes",
     ):
         load_weights(
             build_network("sscnet", 11, SPEC), read_weights(save(tmp_path / "k.pt", "sscnet", classes=7)), "k.pt"
