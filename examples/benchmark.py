@@ -1,8 +1,8 @@
-"""A mini benchmark that can be run again: `python examples/benchmark.py OUT` (`--size full` on a GPU).
+"""A small benchmark that anyone can reproduce: `python examples/benchmark.py OUT` (`--size full` on a GPU).
 
 Simulates towns for training, validation and test, makes their ground truth, trains LMSCNet SS, SSCNet-full, MotionSC T=1 and T=5, and prints the
-paper's two tables. Beside them, MotionSC without history, with it, with it shuffled and with pose alignment off, three seeds each. Seeds and settings
-are fixed here; the towns are never changed to suit a network. A run that was stopped goes on where it was.
+paper's two tables. With `--history` also MotionSC without history, with history, with shuffled history and without pose alignment, three seeds each.
+Seeds and settings are fixed in this file. A run that was stopped continues where it was.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from carlasc.core.tables import CARLASC11
 from carlasc.metrics import Evaluation, Table, geometric_table, semantic_table
 
 TRAFFIC = ("light", "medium", "heavy")
-SPLITS = (("Train", 100), ("Val", 200), ("Test", 300))  # and the seed of its first town
+SPLITS = (("Train", 100), ("Val", 200), ("Test", 300))  # split, and seed of its first town
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is simulated and trained.
+    """The amount of simulation and training.
 
     Attributes:
-        towns: drives in Train, Val and Test.
-        frames: of each drive.
-        sensors: LiDARs a frame.
-        points: rays a scan.
-        half_width_m: the grid reaches so far from the sensor; height is the published -2..1 m.
-        cells: of the grid.
-        epochs: of every network.
-        batch_size: samples a step.
-        seeds: runs of each setting of the study of history.
-        workers: processes that load data.
+        towns: number of drives in Train, Val and Test.
+        frames: number of frames of each drive.
+        sensors: number of LiDARs per frame.
+        points: number of rays per scan.
+        half_width_m: distance from the sensor to the sides of the grid; its height is the published -2..1 m.
+        cells: number of cells of the grid along x, y and z.
+        epochs: number of epochs of every network.
+        batch_size: samples per step.
+        seeds: number of runs of each setting in the study of history.
+        workers: number of processes that load data.
     """
 
     towns: tuple[int, int, int]
@@ -92,7 +92,7 @@ def list_entries(size: Size) -> list[Entry]:
 
 
 def list_history_entries(size: Size) -> dict[str, list[Entry]]:
-    """Return MotionSC without history, with it, with it shuffled, and with alignment off, a run a seed."""
+    """Return MotionSC without history, with history, with shuffled history, and without alignment: one run per seed."""
     single, plain = (entry.config for entry in list_entries(size)[2:])
     variants = {
         "T=1": single,
@@ -127,7 +127,7 @@ def build_data(out: Path, size: Size, workers: int | None) -> None:
 
 
 def run_entry(entry: Entry, data: Path, out: Path, processes: Processes) -> Evaluation:
-    """Train a network, unless it is trained already, and score its best weights on the test split."""
+    """Train a network if it is not trained yet, and score its best weights on the test split."""
     print(entry.name, file=sys.stderr)
     train(data, entry.config, out, processes, resume=(out / LAST).exists())
     test = open_split(data, entry.config.test, entry.config)
@@ -140,7 +140,7 @@ def run_entry(entry: Entry, data: Path, out: Path, processes: Processes) -> Eval
 
 
 def average_seeds(groups: Mapping[str, Sequence[Evaluation]]) -> list[Table]:
-    """Return the paper's two tables with a row a group: the mean of its runs, and their standard deviation."""
+    """Return the paper's two tables with one row per group: the mean and the standard deviation of its runs."""
     tables = []
     for make in (semantic_table, geometric_table):
         rows: list[tuple[str, ...]] = []
@@ -164,10 +164,11 @@ def main(
         Literal["tiny", "small", "full"], typer.Option(help="tiny and small: on a CPU; full: on a GPU.")
     ] = "tiny",
     history: Annotated[
-        bool, typer.Option("--history", help="Also the study of history: none, in order, shuffled, and not aligned.")
+        bool,
+        typer.Option("--history", help="Also run the study of history: none, in order, shuffled, and not aligned."),
     ] = False,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
-    workers: Annotated[int | None, typer.Option(help="Processes that simulate; all cores if not given.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Number of processes that simulate. Default: all cores.")] = None,
 ) -> None:
     """Simulate, train, score, and print the tables."""
     chosen = SIZES[size]
@@ -193,7 +194,7 @@ def main(
 
 
 def _mean(values: Sequence[float]) -> str:
-    if np.isnan(values).any():  # as the tables write it: nothing to divide by
+    if np.isnan(values).any():  # as in the tables: a class that never occurs
         return "-"
     spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
     return f"{np.mean(values):.2f}{spread}"

@@ -1,4 +1,4 @@
-"""Measure what networks take for a frame: `python examples/latency.py motionsc:1 motionsc:16 lmscnet_ss sscnet_full`."""
+"""Measure time and memory of networks for one frame: `python examples/latency.py motionsc:1 motionsc:16 lmscnet_ss sscnet_full`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ from carlasc import GridSpec
 
 
 def main(
-    networks: Annotated[list[str], typer.Argument(help="Names, with :T for a history.")],
+    networks: Annotated[list[str], typer.Argument(help="Names of networks, with :T for a history of T scans.")],
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
-    repetitions: Annotated[int, typer.Option(help="Timed calls, after a first one.", min=1)] = 100,
-    grid: Annotated[str, typer.Option(help="A published grid.")] = "cartesian",
-    threads: Annotated[int | None, typer.Option(help="Of the CPU; all cores if not given.", min=1)] = None,
+    repetitions: Annotated[int, typer.Option(help="Number of timed calls, after a first one.", min=1)] = 100,
+    grid: Annotated[
+        str, typer.Option(help="A published grid: cartesian, cartesian_fine or cylindrical.")
+    ] = "cartesian",
+    threads: Annotated[
+        int | None, typer.Option(help="Number of threads on the CPU. Default: all cores.", min=1)
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Print latency and peak memory at batch 1, eagerly in float32 and compiled."""
@@ -34,7 +38,7 @@ def main(
         for r in measured if not as_json else ():
             print(
                 f"{r.network} T={r.history} {r.mode:8s} median {r.median_ms:8.2f} ms  fastest {r.fastest_ms:8.2f} ms"
-                f"  {r.memory_mb:6.0f} MB  x{r.speedup:.2f}  {r.differing:.1f} voxels in a million differ",
+                f"  {r.memory_mb:6.0f} MB  x{r.speedup:.2f}  {r.differing:.1f} voxels per million differ",
                 flush=True,
             )
     if as_json:

@@ -1,6 +1,6 @@
 """Complete scans: `python examples/predict.py WEIGHTS DATA [OUT]`, then `carlasc render OUT`.
 
-DATA is anything in the layout, or a folder of raw `.bin` scans. Without OUT the grids go beside the data, as one more grid.
+DATA is anything in the CarlaSC layout, or a folder of raw `.bin` scans. Without OUT the grids are written to DATA, as another grid.
 """
 
 from __future__ import annotations
@@ -10,28 +10,34 @@ from typing import Annotated
 
 import torch
 import typer
-from completion.command import parse_frames, progress_bar, run
+from completion.command import progress_bar, run
 from completion.inference import Mode
 from completion.predicting import Model, predict_dataset, predict_scans
 
 from carlasc import GridSpec
+from carlasc.core import FrameRange
 
 
 def main(
     weights: Annotated[Path, typer.Argument(help="Weights: .safetensors, or a state dict as .pt.")],
     data: Annotated[str, typer.Argument(help="A data set, a sequence, or a folder of raw .bin scans.")],
-    out: Annotated[Path | None, typer.Argument(help="Where grids go; beside the data if not given.")] = None,
-    split: Annotated[str | None, typer.Option(help="Split; all if not given.")] = None,
+    out: Annotated[Path | None, typer.Argument(help="Where grids are written. Default: in DATA.")] = None,
+    split: Annotated[str | None, typer.Option(help="Split. Default: all.")] = None,
     grid: Annotated[
-        str, typer.Option(help="Grid of the data whose geometry is predicted, or a published one: cartesian, ...")
+        str,
+        typer.Option(
+            help="Grid of the data whose geometry is predicted, or a published geometry: cartesian, cartesian_fine, cylindrical."
+        ),
     ] = "evaluation",
-    frames: Annotated[str | None, typer.Option(help="Frames A:B (B not included).")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames A:B (B not included), A:, :B, or one frame A.")] = None,
     history: Annotated[
-        int | None, typer.Option(help="Scans in a stack; what the run's config.yaml says, else 1.")
+        int | None, typer.Option(help="Number of scans in a stack. Default: that of the run's config.yaml, else 1.")
     ] = None,
-    name: Annotated[str, typer.Option(help="Name of the grid beside the data.")] = "completion",
+    name: Annotated[str, typer.Option(help="Name of the grid in DATA.")] = "completion",
     right_handed: Annotated[bool, typer.Option("--right-handed", help="Raw scans with y to the left (KITTI).")] = False,
-    eager: Annotated[bool, typer.Option("--eager", help="Do not compile: better for a few frames.")] = False,
+    eager: Annotated[
+        bool, typer.Option("--eager", help="Do not compile the network: faster for a few frames.")
+    ] = False,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
     """Complete every scan of a data set, or of a folder of raw scans."""
@@ -56,12 +62,12 @@ def main(
                 mode,
                 split=split,
                 grid=geometry,
-                frames=parse_frames(frames),
+                frames=None if frames is None else FrameRange.parse(frames),
                 name=name,
                 progress=progress,
             )
-    where = target if raw else out or f"{data}, grid {name}"
-    print(f"{model.network}: {made} frames completed: {where}")
+    place = target if raw else out or f"{data}, grid {name}"
+    print(f"{model.network}: {made} frames completed: {place}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Loader against network, samples a second: `python examples/throughput.py examples/motionsc/carlasc.yaml CarlaSC --set history=16`."""
+"""Measure samples per second of the loader and of the network: `python examples/throughput.py examples/motionsc/carlasc.yaml CarlaSC --set history=16`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from completion.throughput import measure_throughput
 def main(
     config: Annotated[Path, typer.Argument(help="Settings: a YAML file.")],
     data: Annotated[str, typer.Argument(help="The data set.")],
-    settings: Annotated[list[str] | None, typer.Option("--set", help="key=value, over the file's.")] = None,
-    batches: Annotated[int, typer.Option(help="How many are timed.", min=1)] = 20,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="key=value, replaces a setting of the file.")
+    ] = None,
+    batches: Annotated[int, typer.Option(help="Number of timed batches.", min=1)] = 20,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
-    """Print how many samples a second the loader gives and the network takes."""
+    """Print the samples per second of the loader and of the network."""
     own = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     rates = measure_throughput(data, Config.read(config, settings or ()), own, batches)
     print(f"loader {rates.loader:.1f} samples/s, network {rates.network:.1f} samples/s on {own.type}")

@@ -17,13 +17,15 @@ from completion.training import BEST, train
 
 def main(
     config: Annotated[Path, typer.Argument(help="Settings: a YAML file.")],
-    data: Annotated[str, typer.Argument(help="The data set: anything carlasc opens.")],
+    data: Annotated[str, typer.Argument(help="The data set: anything that carlasc opens.")],
     out: Annotated[Path, typer.Option(help="Folder of the run.")],
-    settings: Annotated[list[str] | None, typer.Option("--set", help="key=value, over the file's.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's last checkpoint.")] = False,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="key=value, replaces a setting of the file.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint of the run.")] = False,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
-    """Train a network on a data set; the best weights by validation mIoU are kept."""
+    """Train a network on a data set. The weights with the best mIoU on the validation split are kept."""
     with join_processes(device) as processes:
         progress = train(data, Config.read(config, settings or ()), out, processes, resume=resume)
         if processes.first:

@@ -38,18 +38,18 @@ class Split(StrEnum):
 
 
 class Grids(StrEnum):
-    """Where grids come from."""
+    """What grids are made from."""
 
     scans = "scans"
     voxels = "voxels"
     none = "none"
 
 
-class Frame(StrEnum):
-    """Handedness of what is written."""
+class Axes(StrEnum):
+    """Handedness of the axes that are written."""
 
-    carlasc = "carlasc"
-    kitti = "kitti"
+    left = "left"
+    right = "right"
 
 
 class PoseSource(StrEnum):
@@ -78,36 +78,48 @@ def _print_list(wanted: bool) -> None:
 
 def convert(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The data set: kitti, poss, ... (see --list).")],
-    src: Annotated[Path, typer.Argument(metavar="SRC", help="Its root, or one of its sequences.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Folder of the data set, or of one of its sequences.")
+    ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
     sequences: Annotated[
-        str | None, typer.Option(help="Numbers of sequences, with commas between: 00,08; all if not given.")
+        str | None, typer.Option(help="Numbers of sequences, separated by commas: 00,08. Default: all.")
     ] = None,
-    split: Annotated[Split, typer.Option(help="Only sequences of this part.")] = Split.all,
-    labels: Annotated[
-        str, typer.Option(help="carla: CarlaSC's classes; the converter's name: the data set's own.")
+    split: Annotated[Split, typer.Option(help="Only sequences of this split.")] = Split.all,
+    classes: Annotated[
+        str,
+        typer.Option(
+            help="carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: keep its ids."
+        ),
     ] = "carla",
-    frame: Annotated[
-        Frame, typer.Option(help="carlasc: y mirrored into CarlaSC's left-handed frame; kitti: right-handed, as it is.")
-    ] = Frame.carlasc,
+    axes: Annotated[
+        Axes,
+        typer.Option(
+            help="left: y is mirrored into CarlaSC's left-handed axes. right: right-handed, as in the data set."
+        ),
+    ] = Axes.left,
     grids: Annotated[
         Grids,
         typer.Option(
-            help="scans: made of scans merged over time, coarse ones if no grid is given; voxels: the data set's own; none."
+            help="scans: made from scans merged over time (the coarse grid if no other is given). voxels: the data set's own."
+            " none: no grids."
         ),
     ] = Grids.scans,
     poses: Annotated[
         PoseSource,
-        typer.Option(help="file; kiss-icp: estimated from the scans; auto: the file where there is one."),
+        typer.Option(
+            help="file: those of the data set. kiss-icp: estimated from the scans. auto: the file if it exists, else estimated."
+        ),
     ] = PoseSource.auto,
     flow: Annotated[
-        Flow, typer.Option(help="instances: velocity of moving actors, estimated from their points; none.")
+        Flow, typer.Option(help="instances: the velocity of moving actors, estimated from their points. none: no flow.")
     ] = Flow.instances,
     allow_unknown: Annotated[
-        bool, typer.Option("--allow-unknown", help="Take unknown class ids for unlabelled.")
+        bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")
     ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Go on with poses that do not put scans on each other, or lack Tr.")
+        bool,
+        typer.Option("--force", help="Accept poses under which scans do not overlap, or whose calibration is missing."),
     ] = False,
     preset: PresetOption = None,
     res: ResOption = None,
@@ -126,30 +138,28 @@ def convert(
         typer.Option("--list", help="List the converters that are installed.", callback=_print_list, is_eager=True),
     ] = False,
 ) -> None:
-    """Write another data set as sequences of the layout: the same files, frame and classes.
+    """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes.
 
-    Run it again to go on where it stopped: frames that are there are skipped.
+    Run it again to continue where it stopped: frames that exist are skipped.
     """
     from carlasc.converting import convert as convert_recordings
 
     merging = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, merging))
     if asked and grids is not Grids.scans:
-        raise ArgumentError(
-            "grid options are for --grids scans", expected="none of them", found=f"some with {grids.value}"
-        )
+        raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids.value)
     if preset is None and res is None and size is None:
         preset = Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse
     spec = parse_grid(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
     with progress_bar(f"convert {name}") as progress:
         result = convert_recordings(
             name,
-            src,
+            source,
             out,
             sequences=None if sequences is None else sequences.split(","),
             split=split.value,
-            labels=labels,
-            frame=frame.value,
+            classes=classes,
+            axes=axes.value,
             grids=grids.value,
             spec=spec,
             merging=merging,
@@ -168,8 +178,8 @@ def convert(
             typer.echo(f"note: {note}")
         for place in (*result.sequences, *result.grids):
             typer.echo(place)
-        there = f" ({result.skipped} were there)" if result.skipped else ""
-        typer.echo(f"{result.made} frames converted{there} in {result.elapsed_s:.1f} s")
+        skipped = f" ({result.skipped} existed)" if result.skipped else ""
+        typer.echo(f"{result.made} frames converted{skipped} in {result.elapsed_s:.1f} s")
     report_failures(
         [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
     )

@@ -1,6 +1,8 @@
-"""Other data sets into the layout, and back."""
+"""Other data sets into the CarlaSC layout, and back."""
 
+from carlasc.converting.axes import Axes, mirror_grid, mirror_points, mirror_poses, mirror_spec
 from carlasc.converting.exporting import ExportResult, export
+from carlasc.converting.frames import VOXEL_FILES
 from carlasc.converting.protocol import (
     Converter,
     Exporter,
@@ -15,6 +17,8 @@ from carlasc.converting.results import ConvertResult, Failure
 from carlasc.converting.run import convert
 
 __all__ = [
+    "VOXEL_FILES",
+    "Axes",
     "ConvertResult",
     "Converter",
     "ExportResult",
@@ -29,4 +33,8 @@ __all__ = [
     "converter_names",
     "export",
     "load_converter",
+    "mirror_grid",
+    "mirror_points",
+    "mirror_poses",
+    "mirror_spec",
 ]

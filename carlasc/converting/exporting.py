@@ -1,4 +1,4 @@
-"""The way back: sequences of the layout as another data set's files."""
+"""`export`: sequences of the layout as another data set's files."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from pathlib import Path
 from typing import Any
 
 from carlasc import storage
+from carlasc.converting.places import check_outside
 from carlasc.converting.protocol import Exporter
 from carlasc.converting.registry import load_converter
 from carlasc.converting.results import Failure, Progress, Steps
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, StorageError
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError, StorageError
 from carlasc.running.processes import count_workers, run_all
 from carlasc.storage.files import remove_stale, write_atomic
 
 
 @dataclass(frozen=True)
 class ExportResult:
-    """What `export` did.
+    """The result of `export`.
 
     Attributes:
-        out: the data set.
+        out: root of the data set that was written.
         sequences: the folder of each sequence in it, by the sequence's path in the source.
-        made: frames that were written now.
-        skipped: frames that were there already.
+        made: number of frames that were written.
+        skipped: number of frames that existed already.
         failures: frames that could not be written.
-        elapsed_s: how long it took, seconds.
+        elapsed_s: duration in seconds.
     """
 
     out: Path
@@ -51,7 +52,7 @@ class _Job:
 
 def export(
     name: str,
-    src: str | os.PathLike[str],
+    source: str | os.PathLike[str] | storage.Source,
     out: str | os.PathLike[str],
     *,
     sequences: Collection[str] | None = None,
@@ -63,38 +64,36 @@ def export(
 ) -> ExportResult:
     """Write sequences of the layout as another data set's files, so that its tools can read them.
 
-    A second run skips the frames that are there. A frame that cannot be written is reported in the result and the others go on.
+    A second run skips the frames that exist. A frame that cannot be written is reported in the result, and the others are written.
 
     Args:
         name: the other data set: "kitti".
-        src: anything that `carlasc.open` takes.
+        source: anything that `carlasc.open` takes, or a Source.
         out: folder to write to.
-        sequences: names of the sequences to export; all if None.
-        overwrite: write frames again that are there.
-        workers: how many frames are written side by side; all cores if None.
-        executor: does the work instead of processes of our own; it is left open.
-        progress: called with the number of finished frames and of all.
-        **options: of the exporter; "kitti" takes `grid` (which grid goes to voxels/, the finest if None) and `predictions` (whether grids are
-            a network's output, and go to predictions/).
+        sequences: names of the sequences to export; None exports all.
+        overwrite: write frames again that exist.
+        workers: number of frames that are written at the same time; None uses all cores.
+        executor: runs the work instead of processes of our own; it is not shut down.
+        progress: called with the number of finished frames and the number of all frames.
+        **options: of the exporter. "kitti" takes `grid` (the grid that goes to voxels/; None takes the finest) and `predictions`
+            (whether grids are the output of a network, which goes to predictions/).
 
     Returns:
-        What was written, what was there, what failed.
+        What was written, what was skipped, and what failed.
 
     Raises:
-        ArgumentError: nothing is called so, or it has no way back, or not these options.
-        MissingDataError: there is no such sequence.
-        ConflictError: `out` lies inside `src`.
-        StorageError: the output cannot be written to. What was written is whole.
+        ArgumentError: no data set has that name, it can only be read, or it has no such option.
+        MissingDataError: a sequence does not exist.
+        ConflictError: `out` lies inside `source`.
+        StorageError: the output cannot be written. The files written so far are complete.
     """
     start, workers = time.perf_counter(), count_workers(workers)
     exporter = load_converter(name).exporter(**options)
     if exporter is None:
-        raise ArgumentError(
-            f"export {name!r}", expected="a data set that can be written", found="one that is only read"
-        )
-    source, root = storage.open(src), Path(out)
-    _refuse_overlap(root, source)
-    chosen = _choose(source, sequences)
+        raise ArgumentError("name", expected="a data set that can be written", found=f"{name!r}, which is only read")
+    opened, root = storage.as_source(source), Path(out)
+    check_outside(root, opened.location)
+    chosen = _choose(opened, sequences)
     folders = exporter.folders([sequence.name for sequence in chosen.values()])
     jobs, total = [], 0
     for sequence in chosen.values():
@@ -126,7 +125,7 @@ def export(
 
 
 def _choose(source: storage.Source, wanted: Collection[str] | None) -> dict[str, storage.Sequence]:
-    """Return the sequences with scans or grids, one of each name: Cartesian ones where both coordinates are there."""
+    """Return the wanted sequences by path, one per name: the Cartesian one where a sequence has both coordinates."""
     found: dict[str, tuple[str, storage.Sequence]] = {}
     for path, sequence in source.sequences().items():
         if sequence.name not in found or sequence.coordinates == "cartesian":
@@ -138,21 +137,8 @@ def _choose(source: storage.Source, wanted: Collection[str] | None) -> dict[str,
     return {path: sequence for name, (path, sequence) in found.items() if wanted is None or name in wanted}
 
 
-def _refuse_overlap(root: Path, source: storage.Source) -> None:
-    if "://" in source.location:
-        return
-    place, origin = root.resolve(), Path(source.location).resolve()
-    if place == origin or place.is_relative_to(origin):
-        raise ConflictError(
-            root,
-            expected=f"a place outside {source.location}",
-            found="one inside it",
-            advice="choose another, the source is never written to",
-        )
-
-
 def _export_frame(job: _Job) -> str | None:
-    """Write one frame's files, the last one last; return what is wrong where it cannot be done."""
+    """Write one frame's files; return the error message if it cannot be done."""
     try:
         for file, data in job.exporter.make_frame(job.sequence, job.frame).items():
             write_atomic(job.folder / file, data)

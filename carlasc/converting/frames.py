@@ -1,74 +1,85 @@
-"""One frame after another: from a handle of the other data set to the fields of the layout, in workers."""
+"""Frames of another data set as fields of the layout. Runs in workers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.converting.axes import mirror_grid, mirror_points
 from carlasc.converting.protocol import FrameContent, FrameHandle
 from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError, FormatError, StorageError
 from carlasc.storage import layout
 from carlasc.storage.protocol import SequenceWriter
 
-VOXEL_FILES = "voxels_kitti"  # the other data set's own voxel files, as they were: for the way back
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-_IDS = np.iinfo(np.uint16).max + 1
+VOXEL_FILES = "voxels_kitti"
+"""Folder of a sequence that keeps the other data set's own voxel files unchanged, so that an export gives them back."""
 
-Velocities = Mapping[int, tuple[float, float, float]]
-"""m/s over ground by actor, right-handed sensor frame."""
+Velocity = tuple[float, float, float]
+"""(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
+
+_IDS = np.iinfo(np.uint16).max + 1
+_UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
+_MAX_LISTED = 8
 
 
 @dataclass(frozen=True)
 class Target:
-    """How frames are to be written.
+    """How frames are written.
 
     Attributes:
         source: class table of the ids that are read.
-        remap: takes them to others; None keeps them.
-        mirrored: whether y is mirrored: from right-handed to CarlaSC's frame.
-        allow_unknown: whether ids that the table does not know become unlabelled.
-        grid: folder for the data set's own voxel grids; None leaves them.
+        remap: maps them to other ids; None keeps them.
+        mirrored: whether y is mirrored, from right-handed axes to CarlaSC's left-handed ones.
+        allow_unknown: whether ids that the table does not have become unlabelled.
+        voxels: geometry of the data set's own voxel grids, right-handed, if they are written; None if not.
     """
 
     source: ClassTable
     remap: Remap | None
     mirrored: bool
     allow_unknown: bool = False
-    grid: str | None = None
+    voxels: GridSpec | None = None
 
     @property
     def classes(self) -> ClassTable:
         """Table of the ids that are written."""
         return self.source if self.remap is None else self.remap.target
 
-    def labels(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.uint32]:
-        """Take class ids to the target's.
+    def map_labels(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.uint32]:
+        """Return the ids that are written for the ids that were read.
 
         Raises:
-            FormatError: an id is unknown; names it, and how often it stands.
+            FormatError: an id is unknown; names it, and how often it occurs. `where` names the labels.
         """
-        lookup = self._lookup()
+        ids = self.source.names if self.remap is None else self.remap.mapping
+        lookup = _lookup_table(tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values()))
         mapped = lookup[labels if labels.dtype.itemsize <= 2 else np.minimum(labels, _IDS - 1)]
         if mapped.size and int(mapped.max()) == _UNKNOWN:
             unknown = mapped == _UNKNOWN
             if not self.allow_unknown:
-                raise FormatError(f"{where}: expected class ids of {self.source.name}, {_describe(labels[unknown])}")
+                raise FormatError(
+                    where,
+                    expected=f"class ids of {self.source.name}",
+                    found=_list_ids(labels[unknown]),
+                    advice="treat them as unlabelled with `allow_unknown=True`",
+                )
             mapped[unknown] = 0
         return mapped
 
-    def _lookup(self) -> NDArray[np.uint32]:
-        mapping = {i: i for i in self.source.names} if self.remap is None else self.remap.mapping
-        key = tuple(mapping.items())
-        if key not in _LOOKUPS:
-            lookup = np.full(_IDS, _UNKNOWN, np.uint32)
-            lookup[list(mapping)] = list(mapping.values())
-            _LOOKUPS[key] = lookup
-        return _LOOKUPS[key]
+
+@lru_cache(maxsize=8)
+def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Return the target of every 16-bit id, `_UNKNOWN` where it has none."""
+    lookup = np.full(_IDS, _UNKNOWN, np.uint32)
+    lookup[list(ids)] = targets
+    return lookup
 
 
 @dataclass(frozen=True)
@@ -77,18 +88,24 @@ class FrameJob:
 
     Attributes:
         handle: the frame.
-        scan: whether its scan is to be written: it is not there yet.
-        velocities: of its moving actors; None where flow is not written.
+        scan: whether its scan is to be written; False where it exists already.
+        velocities: velocity of each moving actor; None where no flow is written.
     """
 
     handle: FrameHandle
     scan: bool
-    velocities: Velocities | None = None
+    velocities: Mapping[int, Velocity] | None = None
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some frames that a worker converts in one go: a task of its own for each would cost more than the work."""
+    """Several frames that a worker converts in one task, because a task costs more than a frame.
+
+    Attributes:
+        jobs: the frames.
+        target: how they are written.
+        writer: where they are written.
+    """
 
     jobs: tuple[FrameJob, ...]
     target: Target
@@ -97,13 +114,13 @@ class Block:
 
 @dataclass
 class BlockResult:
-    """What became of a block.
+    """The result of a block.
 
     Attributes:
-        block: what was to do.
-        outputs: fields by frame, where the writer cannot write in workers.
-        failures: (frame, what is wrong).
-        without_flow: moving points whose actor has no known motion.
+        block: the block.
+        outputs: fields by frame number, where the writer cannot be used in workers.
+        failures: (frame number, error message) of the frames that failed.
+        without_flow: number of moving points whose actor has no known motion.
     """
 
     block: Block
@@ -113,19 +130,20 @@ class BlockResult:
 
 
 def convert_block(block: Block) -> BlockResult:
-    """Convert some frames, and write them where the writer can be written to from here."""
+    """Convert several frames, and write them if the writer can be used in workers."""
     result = BlockResult(block)
     for job in block.jobs:
         try:
             outputs: dict[str, NDArray[Any]] = {}
             if job.scan:
                 content = job.handle.read()
-                outputs, without = make_fields(content, job, block.target)
-                result.without_flow += without
-            if block.target.grid is not None:
-                outputs |= _voxel_fields(job.handle, block.target, block.writer)
+                outputs, without_flow = make_fields(content, job, block.target)
+                result.without_flow += without_flow
+            if block.target.voxels is not None:
+                grid = layout.grid_folder(block.target.voxels)
+                outputs |= _voxel_fields(job.handle, grid, block.target, block.writer)
         except StorageError:
-            raise  # every other frame would meet the same
+            raise  # every other frame would fail in the same way
         except (CarlascError, OSError) as error:
             result.failures.append((job.handle.number, str(error)))
             continue
@@ -143,30 +161,26 @@ def write_fields(writer: SequenceWriter, frame: int, fields: Mapping[str, NDArra
 
 
 def make_fields(content: FrameContent, job: FrameJob, target: Target) -> tuple[dict[str, NDArray[Any]], int]:
-    """Return the fields of a scan, points last, and how many moving points have no known velocity.
+    """Return the fields of a scan, points last, and the number of moving points whose velocity is unknown.
 
-    Points are never dropped or put in another order.
+    Every point is kept, in its order.
     """
-    where = job.handle.location
     fields: dict[str, NDArray[Any]] = {}
-    without = 0
+    without_flow = 0
     if content.labels is not None:
-        fields["labels"] = target.labels(content.labels, f"labels of {where}")
+        fields["labels"] = target.map_labels(content.labels, f"labels of {job.handle.location}")
     if content.instances is not None:
         fields["instances"] = content.instances
         if job.velocities is not None:
-            flow = _flow(content.instances, job.velocities)
-            fields["flow"] = flow * _MIRROR_VECTOR if target.mirrored else flow
+            flow = _make_flow(content.instances, job.velocities)
+            fields["flow"] = mirror_points(flow) if target.mirrored else flow
             moving = np.isin(np.asarray(content.labels), sorted(target.source.moving))
-            without = int(np.count_nonzero(moving & ~np.isin(content.instances, sorted(job.velocities))))
+            without_flow = int(np.count_nonzero(moving & ~np.isin(content.instances, sorted(job.velocities))))
     for name, array in content.others.items():
         mirrored = target.mirrored and layout.field_named(name).kind == "vector"
-        fields[name] = array * _MIRROR_VECTOR if mirrored else array
-    points = content.points
-    if target.mirrored:
-        points = points * _MIRROR_POINT
-    fields["points"] = points
-    return fields, without
+        fields[name] = mirror_points(array) if mirrored else array
+    fields["points"] = mirror_points(content.points) if target.mirrored else content.points
+    return fields, without_flow
 
 
 def scan_fields(*, labelled: bool, flow: bool) -> tuple[str, ...]:
@@ -174,7 +188,8 @@ def scan_fields(*, labelled: bool, flow: bool) -> tuple[str, ...]:
     return ("labels", "instances", *(("flow",) if flow else ()), "points") if labelled else ("points",)
 
 
-def _flow(instances: NDArray[np.uint32], velocities: Velocities) -> NDArray[np.float32]:
+def _make_flow(instances: NDArray[np.uint32], velocities: Mapping[int, Velocity]) -> NDArray[np.float32]:
+    """Return (N, 3) m/s: the velocity of each point's actor, zero for all other points."""
     flow = np.zeros((len(instances), 3), np.float32)
     if velocities:
         numbered = np.flatnonzero(instances)
@@ -183,30 +198,26 @@ def _flow(instances: NDArray[np.uint32], velocities: Velocities) -> NDArray[np.f
     return flow
 
 
-def _voxel_fields(handle: FrameHandle, target: Target, writer: SequenceWriter) -> dict[str, NDArray[Any]]:
-    """Return the frame's own grid, and keep its files; nothing where it has none, or it is there."""
-    if writer.has(f"{target.grid}/counts", handle.number):
+def _voxel_fields(handle: FrameHandle, grid: str, target: Target, writer: SequenceWriter) -> dict[str, NDArray[Any]]:
+    """Return the fields of the frame's own voxel grid, and keep its files; empty if it has none, or if it is written already."""
+    if writer.has(f"{grid}/counts", handle.number):
         return {}
     voxels = handle.read_voxels()
     if voxels is None:
         return {}
-    labels = target.labels(voxels.labels, f"voxels of {handle.location}")
-    known = voxels.known & ~((labels == 0) & (voxels.labels > 0))  # something is there, and nobody knows what
+    labels = target.map_labels(voxels.labels, f"voxels of {handle.location}")
+    known = voxels.known & ~((labels == 0) & (voxels.labels > 0))  # occupied, but of a class that has no target
     labels[~known] = 0
     for name, data in voxels.files.items():
         writer.write_document(f"{VOXEL_FILES}/{name}", data)
-    axes = (slice(None), slice(None, None, -1)) if target.mirrored else ()
-    return {f"{target.grid}/labels": labels[axes], f"{target.grid}/counts": known[axes].astype(np.float32)}
+    counts = known.astype(np.float32)
+    if target.mirrored:
+        labels, counts = mirror_grid(labels), mirror_grid(counts)
+    return {f"{grid}/labels": labels, f"{grid}/counts": counts}
 
 
-def _describe(labels: NDArray[np.unsignedinteger]) -> str:
+def _list_ids(labels: NDArray[np.unsignedinteger]) -> str:
     ids, counts = np.unique(labels, return_counts=True)
     named = [f"{i} ({n} times)" for i, n in zip(ids.tolist(), counts.tolist(), strict=True)]
-    more = f" and {len(named) - 8} more" if len(named) > 8 else ""
-    return f"found {', '.join(named[:8])}{more}: take them for unlabelled with --allow-unknown"
-
-
-_MIRROR_VECTOR = np.array([1, -1, 1], np.float32)
-_MIRROR_POINT = np.array([1, -1, 1, 1], np.float32)
-_UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
-_LOOKUPS: dict[tuple[tuple[int, int], ...], NDArray[np.uint32]] = {}
+    more = f" and {len(named) - _MAX_LISTED} more" if len(named) > _MAX_LISTED else ""
+    return ", ".join(named[:_MAX_LISTED]) + more

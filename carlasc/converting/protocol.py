@@ -1,12 +1,12 @@
-"""What a converter is: it finds the recordings of another data set and reads their frames. It never touches a store.
+"""The protocol of converters: a converter finds the recordings of another data set and reads their frames. It uses no store.
 
-A third party adds one by a class that inherits `Converter` and an entry point of its own distribution:
+Another distribution adds a converter by a class that inherits `Converter` and an entry point:
 
     [project.entry-points."carlasc.converters"]
     name = "package.module:Class"
 
-Everything a converter gives is as the other data set has it: its axes (right-handed, y left), its class ids. Mirroring, remapping, poses from
-scans, flow and grids are one for all of them: `carlasc.convert`.
+A converter gives everything as the other data set has it: in right-handed axes (y to the left) and with its class ids. Mirroring,
+remapping, poses from scans, flow and grids are the same for all converters, and `carlasc.convert` does them.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ Split = Literal["Train", "Val", "Test"]
 
 @dataclass(frozen=True)
 class FrameContent:
-    """What one frame of another data set holds.
+    """The content of one frame of another data set.
 
     Attributes:
         points: (N, 4) float32: x, y, z in metres, right-handed sensor frame, and remission.
-        labels: (N,) class ids of the data set, 0 unlabelled; None where there are none.
-        instances: (N,) uint32 actor of each point, 0 none, the same number for the same actor all over the recording, whether it
-            moves or not; None where there are none.
+        labels: (N,) class ids of the data set, 0 unlabelled; None if the frame has no labels.
+        instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same number in all frames of the
+            recording, whether it moves or not. None if the frame has no instances.
         others: further fields of the layout with a row per point, by name; vectors right-handed. They are written as they are.
     """
 
@@ -51,8 +51,8 @@ class VoxelContent:
 
     Attributes:
         labels: (X, Y, Z) class ids of the data set.
-        known: (X, Y, Z) bool: voxels that count in an evaluation.
-        files: the original files by name: kept beside the grid, for the way back.
+        known: (X, Y, Z) bool, voxels that take part in an evaluation.
+        files: the original files by name. They are kept beside the grid, so that an export gives them back.
     """
 
     labels: NDArray[np.unsignedinteger]
@@ -61,11 +61,11 @@ class VoxelContent:
 
 
 class FrameHandle(ABC):
-    """One frame: paths and numbers only, so that it pickles into a worker, which reads it there.
+    """One frame. It holds paths and numbers only, so that it can be pickled into a worker and read there.
 
     Attributes:
-        number: the frame's number, from 0; line `number` of poses and times is its own.
-        location: what to call it in errors: the file of its points.
+        number: the frame's number, from 0. Line `number` of poses and times belongs to this frame.
+        location: the name of the frame in error messages: the file of its points.
     """
 
     number: int
@@ -76,17 +76,17 @@ class FrameHandle(ABC):
         """Read points, labels and instances.
 
         Raises:
-            MissingDataError: a file is not there.
+            MissingDataError: a file does not exist.
             FormatError: a file does not hold what it must.
         """
 
     def read_labels(self) -> tuple[NDArray[np.unsignedinteger] | None, NDArray[np.uint32] | None]:
-        """Read labels and instances alone; faster where they have files of their own."""
+        """Read only labels and instances. Override it where they have files of their own, which is faster."""
         content = self.read()
         return content.labels, content.instances
 
     def read_voxels(self) -> VoxelContent | None:
-        """Read the frame's voxel grid; None where it has none."""
+        """Read the frame's voxel grid; None if it has none."""
         return None
 
 
@@ -94,10 +94,10 @@ class Recording(ABC):
     """One sequence of another data set.
 
     Attributes:
-        name: what it is called in the layout: "KITTI_00".
-        split: which split it belongs to.
-        location: what to call it in errors.
-        frames: its frames, by rising number.
+        name: name of the sequence in the layout, such as "KITTI_00".
+        split: the split that it belongs to.
+        location: its name in error messages.
+        frames: its frames, by increasing number.
         has_labels: whether frames have labels and instances.
     """
 
@@ -109,35 +109,35 @@ class Recording(ABC):
 
     @abstractmethod
     def poses(self, *, force: bool = False) -> NDArray[np.float64] | None:
-        """Return (F, 4, 4) world_T_sensor by frame number, right-handed; None where there are none.
+        """Return (F, 4, 4) world_T_sensor by frame number, right-handed; None if the recording has no poses.
 
         Args:
             force: go on without a calibration that the poses need.
 
         Raises:
-            FormatError: the files do not hold what they must.
-            MissingDataError: a file without which poses mean nothing is not there.
+            FormatError: a file does not hold what it must.
+            MissingDataError: a file without which the poses cannot be used does not exist.
         """
 
     def times(self) -> NDArray[np.float64] | None:
-        """Return (F,) seconds by frame number; None where there are none."""
+        """Return (F,) seconds by frame number; None if the recording has no times."""
         return None
 
     def problems(self) -> list[tuple[int, str]]:
-        """Return (frame number, what is wrong in one line) of frames that should be there and are not."""
+        """Return (frame number, message in one line) of frames that should exist and do not."""
         return []
 
 
 class Exporter(ABC):
-    """Writes a sequence of the layout as another data set's files. It makes their bytes; writing them is not its business."""
+    """Makes another data set's files from a sequence of the layout. It returns their bytes, and `carlasc.export` writes them."""
 
     @abstractmethod
     def folders(self, names: Sequence[str]) -> dict[str, str]:
-        """Return the folder of each sequence, by name, relative to the data set's root."""
+        """Return the folder of each sequence, by the sequence's name, relative to the root of the data set."""
 
     @abstractmethod
     def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
-        """Return the files that stand once in a sequence, by their path in its folder."""
+        """Return the files that a sequence has once, by their path in its folder."""
 
     @abstractmethod
     def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
@@ -145,10 +145,10 @@ class Exporter(ABC):
 
     @abstractmethod
     def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, bytes | memoryview]:
-        """Return a frame's files.
+        """Return a frame's files, by their path in the sequence's folder.
 
         Raises:
-            CarlascError: the frame cannot be read, or not be said in the other format.
+            CarlascError: the frame cannot be read, or cannot be expressed in the other format.
         """
 
 
@@ -156,13 +156,14 @@ class Converter(ABC):
     """Finds the recordings of one kind of data set.
 
     Attributes:
+        source: folder of the data set, or of one of its sequences.
         title: what it reads, in a few words.
         classes: the data set's class table.
-        to_carla: takes its ids to CarlaSC's.
-        sensor: what takes the scans.
-        min_range_m: nearer returns are the own car's.
-        max_range_m: farther returns are too few to tell free from occupied.
-        voxels: geometry of the data set's own voxel grids, right-handed; None where it has none.
+        to_carla: maps its ids to CarlaSC's.
+        sensor: the sensor that took the scans.
+        min_range_m: nearer points are left out of grids: they belong to the vehicle that carries the sensor.
+        max_range_m: farther points are left out of grids: they are too sparse to tell free space from occupied space.
+        voxels: geometry of the data set's own voxel grids, right-handed; None if it has none.
     """
 
     title: ClassVar[str]
@@ -173,19 +174,19 @@ class Converter(ABC):
     max_range_m: ClassVar[float | None] = None
     voxels: ClassVar[GridSpec | None] = None
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, source: Path) -> None:
         """Remember where the data set is."""
-        self.root = root
+        self.source = source
 
     @abstractmethod
     def sequences(self) -> list[Recording]:
         """Return the recordings.
 
         Raises:
-            MissingDataError: there is none; says what was looked for.
+            MissingDataError: none exists; says what was looked for.
         """
 
     @classmethod
     def exporter(cls, **options: Any) -> Exporter | None:
-        """Return what writes the data set's own format; None where there is no way back."""
+        """Return the exporter that writes the data set's own format; None if it can only be read."""
         return None

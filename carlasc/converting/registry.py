@@ -1,4 +1,4 @@
-"""Which converters there are: those of installed distributions, by the entry-point group `carlasc.converters`."""
+"""The installed converters: those that distributions declare in the entry-point group `carlasc.converters`."""
 
 from __future__ import annotations
 
@@ -11,33 +11,30 @@ GROUP = "carlasc.converters"
 
 
 def converter_names() -> tuple[str, ...]:
-    """Return the names of the installed converters; none of them is loaded."""
+    """Return the sorted names of the installed converters, without loading any."""
     return tuple(sorted(_entries()))
 
 
 def load_converter(name: str) -> type[Converter]:
-    """Load a converter.
+    """Load a converter by its name.
 
     Raises:
-        ArgumentError: none is called so.
-        DependencyError: it does not load, or is no converter.
+        ArgumentError: no converter has that name.
+        DependencyError: it cannot be loaded, or is not a converter.
     """
     entries = _entries()
     if name not in entries:
         raise ArgumentError(
-            f"converter {name!r}: expected one of {', '.join(sorted(entries)) or 'none: none is installed'} (`carlasc convert --list`)"
+            "name", expected=f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}", found=repr(name)
         )
     entry = entries[name]
+    where = f"converter {name} ({entry.value})"
     try:
         found = entry.load()
     except (ImportError, AttributeError) as error:
-        raise DependencyError(f"converter {name} ({entry.value}) does not load: {error}") from error
+        raise DependencyError(where, problem=f"cannot be loaded: {error}") from error
     if not (isinstance(found, type) and issubclass(found, Converter)):
-        raise DependencyError(
-            f"converter {name} ({entry.value})",
-            expected="a class that inherits carlasc.converting.Converter",
-            found=f"{found!r}",
-        )
+        raise DependencyError(where, expected="a class that inherits carlasc.converting.Converter", found=repr(found))
     return found
 
 

@@ -1,4 +1,4 @@
-"""What a conversion or an export did, and how far it is."""
+"""The results of a conversion or an export, and the counting of their steps."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Failure:
-    """A frame that could not be converted.
+    """A frame that could not be converted or exported.
 
     Attributes:
-        sequence: where its source is.
+        sequence: location of its sequence in the source.
         frame: its number.
-        message: what is wrong, in one line.
+        message: the error, in one line.
     """
 
     sequence: str
@@ -25,16 +25,16 @@ class Failure:
 
 @dataclass(frozen=True)
 class ConvertResult:
-    """What `convert` did.
+    """The result of `convert`.
 
     Attributes:
-        sequences: where the sequences are now.
-        made: frames that were converted now.
-        skipped: frames that were there already.
-        failures: frames that could not be converted, or not be gridded.
-        grids: where grids were made from scans.
-        notes: what the reader should know.
-        elapsed_s: how long it took, seconds.
+        sequences: locations of the sequences that were written.
+        made: number of frames that were converted.
+        skipped: number of frames that existed already.
+        failures: frames that could not be converted, or whose grid could not be made.
+        grids: locations of the grids that were made from scans.
+        notes: remarks about the result, one line each.
+        elapsed_s: duration in seconds.
     """
 
     sequences: tuple[str, ...]
@@ -47,17 +47,17 @@ class ConvertResult:
 
 
 class Steps:
-    """Counts the steps of several stages for one progress callback; a stage's steps are added when they are known."""
+    """Counts the steps of several stages for one progress callback. A stage adds its steps when it knows their number."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress, self._done, self._total = progress, 0, total
 
     def expect(self, more: int) -> None:
-        """Add steps to come."""
+        """Add steps to the total."""
         self._total += more
 
     def __call__(self, steps: int = 1) -> None:
-        """Say that so many steps are done."""
+        """Count finished steps, and report them."""
         self._done += steps
         if self._progress:
             self._progress(self._done, self._total)

@@ -1,4 +1,4 @@
-"""Poses of a recording: from its files or from its scans, and whether scans agree with them."""
+"""Poses and times of a recording: from its files or estimated from its scans, and whether the scans fit the poses."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from carlasc.storage.protocol import Sequence
 
 PoseSource = Literal["file", "kiss-icp", "auto"]
 FILE, KISS_ICP = "file", "kiss-icp"
+_ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
+_ACCEPT = "accept them as they are with `force=True`"
 
 
-def read_poses(recording: Recording, wanted: PoseSource, *, force: bool) -> NDArray[np.float64] | None:
-    """Return (F, 4, 4) first_T_sensor by frame number from the recording's files, None where they are to be estimated.
+def read_poses(recording: Recording, pose_source: PoseSource, *, force: bool) -> NDArray[np.float64] | None:
+    """Return (F, 4, 4) first_T_sensor by frame number from the recording's files; None if they are to be estimated.
 
     Raises:
-        MissingDataError: there are none, and none are to be estimated.
-        FormatError: a frame has no line.
+        MissingDataError: the file of poses does not exist, and they are not to be estimated.
+        FormatError: a frame has no pose.
     """
-    poses = None if wanted == KISS_ICP else recording.poses(force=force)
+    poses = None if pose_source == KISS_ICP else recording.poses(force=force)
     if poses is None:
-        if wanted == FILE:
+        if pose_source == FILE:
             raise MissingDataError(
                 recording.location,
                 expected="poses.txt",
                 found="nothing",
-                advice="copy it, or estimate poses from the scans (`--poses kiss-icp`)",
+                advice=f"copy it, or {_ESTIMATE}",
             )
         return None
     last = recording.frames[-1].number
@@ -43,16 +45,23 @@ def read_poses(recording: Recording, wanted: PoseSource, *, force: bool) -> NDAr
             recording.location,
             expected=f"a pose for each frame up to {last}",
             found=f"{len(poses)} lines in the file of poses",
-            advice="copy it again, or estimate poses from the scans (`--poses kiss-icp`)",
+            advice=f"copy it again, or {_ESTIMATE}",
         )
     relative: NDArray[np.float64] = np.linalg.inv(poses[0]) @ poses[: last + 1]
     return relative
 
 
 def estimate_poses(recording: Recording, converter: type[Converter], step: Callable[[], object]) -> NDArray[np.float64]:
-    """Let KISS-ICP find the pose of each scan; lines of frames without a scan stay where the last one was.
+    """Estimate the pose of each scan with KISS-ICP. A frame without a scan gets the pose of the scan before it.
 
-    Scans that cannot be read are passed over: whoever converts them reports them.
+    Scans that cannot be read are skipped: their conversion reports them.
+
+    Returns:
+        (F, 4, 4) first_T_sensor by frame number, right-handed.
+
+    Raises:
+        MissingDataError: no scan can be read.
+        DependencyError: kiss-icp is not installed.
     """
     from carlasc.motion import odometry
 
@@ -79,10 +88,10 @@ def estimate_poses(recording: Recording, converter: type[Converter], step: Calla
 
 
 def check_poses(recording: Recording, converter: type[Converter], poses: NDArray[np.float64]) -> None:
-    """Align scans under their poses.
+    """Check that the scans overlap under their poses.
 
     Raises:
-        FormatError: they do not lie on each other; says what the poses look like, and what to do.
+        FormatError: they do not; says which mistake the poses look like, and what to do.
     """
     scans = _Scans(recording, converter)
     frames = [handle.number for handle in recording.frames]
@@ -94,22 +103,48 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
             return np.empty((0, 3))
 
     diagnosis = diagnose_poses(structure, poses[frames])
-    expected = f"{recording.location}: expected poses that put scans on each other"
+    expected = "poses under which the scans overlap"
     if diagnosis.correction is not None:
         raise FormatError(
-            f"{expected}, found {diagnosis.share_there:.0%} of a scan's structure on an earlier scan's; they look like {diagnosis.correction.name}"
-            f" (with that undone, {diagnosis.corrected_share:.0%}): {diagnosis.correction.advice}; or go on with --force"
+            recording.location,
+            expected=expected,
+            found=f"{diagnosis.share_there:.0%} of a scan's structure on that of an earlier scan; they look like"
+            f" {diagnosis.correction.name} (with that corrected: {diagnosis.corrected_share:.0%})",
+            advice=f"{diagnosis.correction.advice}, or {_ACCEPT}",
         )
     if diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
         raise FormatError(
-            f"{expected}, found that they put scans about ({x:.1f}, {y:.1f}, {z:.1f}) m beside their place: are poses.txt and calib.txt of this"
-            " sequence? Estimate poses from the scans (`--poses kiss-icp`), or go on with --force"
+            recording.location,
+            expected=expected,
+            found=f"scans that are about ({x:.1f}, {y:.1f}, {z:.1f}) m away from each other",
+            advice=f"check that poses.txt and calib.txt belong to this sequence, {_ESTIMATE}, or {_ACCEPT}",
         )
 
 
+def times_from_first(recording: Recording) -> NDArray[np.float64]:
+    """Return (F,) seconds since the first frame, by frame number; 10 Hz if the recording has no times.
+
+    Raises:
+        FormatError: a frame has no time.
+    """
+    frames = recording.frames[-1].number + 1
+    times = recording.times()
+    if times is None:
+        return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
+    if len(times) < frames:
+        raise FormatError(
+            recording.location,
+            expected=f"a time for each frame up to {frames - 1}",
+            found=f"{len(times)} lines in times.txt",
+            advice="copy it again",
+        )
+    since: NDArray[np.float64] = times[:frames] - times[0]
+    return since
+
+
 class _Scans(Sequence):
-    """A recording's scans, as they are, for those who read sequences."""
+    """A recording's scans as a sequence, in their own axes and classes, for functions that read sequences."""
 
     def __init__(self, recording: Recording, converter: type[Converter]) -> None:
         self.recording, self.path, self.location = recording, "", recording.location
@@ -136,24 +171,3 @@ class _Scans(Sequence):
 
     def read_document(self, name: str) -> bytes:
         raise MissingDataError(f"{self.location}/{name}", expected="a file", found="a recording of another data set")
-
-
-def first_line_times(recording: Recording) -> NDArray[np.float64]:
-    """Return (F,) seconds since the first frame by frame number; 10 Hz where the recording says nothing.
-
-    Raises:
-        FormatError: a frame has no line.
-    """
-    frames = recording.frames[-1].number + 1
-    times = recording.times()
-    if times is None:
-        return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
-    if len(times) < frames:
-        raise FormatError(
-            recording.location,
-            expected=f"a time for each frame up to {frames - 1}",
-            found=f"{len(times)} lines in times.txt",
-            advice="copy it again",
-        )
-    since: NDArray[np.float64] = times[:frames] - times[0]
-    return since

@@ -1,40 +1,47 @@
-"""`Dataset`: what training code imports. Sequences of any Source as samples: dicts of NumPy arrays.
+"""`Dataset`: the frames of any Source as training samples, which are dicts of NumPy arrays.
 
-It is a map-style data set as torch's DataLoader wants one, and loads no torch. A sample is one frame: the grid to predict, and
-the last `history` scans moved into the frame's own sensor frame and binned (FORMAT section 5).
+It is a map-style data set for torch's DataLoader, and does not import torch. A sample is one frame: the grid to predict, and
+the last `history` scans, moved into the frame's own sensor frame and binned. See the format page, `docs/format.md#training-samples`.
 """
 
 from __future__ import annotations
 
 import operator
 import os
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, SupportsIndex
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
-from carlasc.core.tables import remap_named
-from carlasc.dataset.selection import Part, choose, common_frames, find_grids, grid_named
+from carlasc.dataset.labels import LabelMap, RemapLike
+from carlasc.dataset.scans import RecentScans
+from carlasc.dataset.selection import (
+    Part,
+    choose_sequences,
+    common_frames,
+    common_value,
+    find_grid_name,
+    find_grid_sequences,
+)
+from carlasc.dataset.transforms import Sample
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, import_extra
 from carlasc.storage import Sequence, Source, as_source, layout
 
-Sample = dict[str, Any]
+Axes = Literal["left", "right"]
 
 FIELDS = ("occupancy", "density", "labels", "known", "counts", "points", "point_labels", "flow", "poses")
 ALWAYS = ("valid", "sequence", "frame")
-RAGGED = ("points", "point_labels", "flow")  # as many rows as the scan has points
+RAGGED = ("points", "point_labels", "flow")  # one row per point of the scan
 _STACKS = frozenset({"occupancy", "density"})
-_OF_GRID = {"labels": "labels", "known": "counts", "counts": "counts"}  # a sample's field -> the grid's
-_OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow"}  # a sample's field -> the scan's
+_OF_GRID = {"labels": "labels", "known": "counts", "counts": "counts"}  # field of a sample -> field of the grid
+_OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow"}  # field of a sample -> field of the scan
+_AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # `frame` in carlasc.json -> handedness
 
-
-if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; no torch is loaded when it runs
+if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
     from torch.utils.data import Dataset as TorchDataset
 
     _MapStyle = TorchDataset[Sample]
@@ -43,71 +50,71 @@ else:
 
 
 class Dataset(_MapStyle):
-    """Frames of one or many sequences as training samples.
+    """Frames of one or more sequences as training samples.
 
-    A sample is a dict of the `fields` asked for, T being `history` and (X, Y, Z) the grid's size:
+    A sample is a dict with the `fields` that were asked for. T is `history`, and (X, Y, Z) is the size of the grid:
 
-        occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; oldest scan first, the frame's own last
-        density       (T, X, Y, Z) uint16, points a voxel
-        labels        (X, Y, Z) uint8 class of each voxel (uint16 where ids go over 255); 0 is free, also where unknown
-        known         (X, Y, Z) bool, voxels that were evaluated: leave the others out of losses and metrics
-        counts        (X, Y, Z) float32 votes of each voxel
-        points        (N, 3) float32 metres, the frame's sensor frame; all of them
-        point_labels  (N,) uint8 class of each point
-        flow          (N, 3) float32 m/s velocity of each point, sensor frame
+        occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the frame's own scan last
+        density       (T, X, Y, Z) uint16, number of points per voxel
+        labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also stands for unknown
+        known         (X, Y, Z) bool, voxels that have a vote: leave the others out of losses and metrics
+        counts        (X, Y, Z) float32, number of votes per voxel
+        points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
+        point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
+        flow          (N, 3) float32 m/s, velocity of each point, sensor frame
         poses         (T, 4, 4) float64 current_T_past; the identity where not valid
-        valid         (T,) bool, whether there is a scan; always there
-        sequence      str, always there
-        frame         int, always there
+        valid         (T,) bool, whether the scan exists; in every sample
+        sequence      str, name of the sequence; in every sample
+        frame         int, number of the frame; in every sample
 
-    The history stops at the start of a sequence and at a gap in its frame numbers: what would lie before is left empty
-    and is not `valid`. Frames without a field that was asked for are left out. Points nearer than `min_range_m` or farther
-    than `max_range_m` of carlasc.json go into no grid. Arrays come in the sequences' own frame: right-handed data
-    are neither mirrored nor mixed with left-handed ones.
+    The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are empty, and their `valid` is
+    False. Frames that lack a field that was asked for are left out. Points nearer than `min_range_m` or farther than `max_range_m`
+    of carlasc.json are in no grid. Arrays are in the sequences' own axes: right-handed data are not mirrored, and are not mixed
+    with left-handed data.
 
     Attributes:
-        sequences: the sequences in use, in order; a sample's `sequence` is the name of its.
-        axes: "left" (y to the right) or "right" (y to the left).
-        classes: table of the label ids that samples hold, after the remap.
-        transform: called with each sample, returns it changed; may be set later (see `carlasc.Flip`).
+        sequences: the sequences in use, in order. A sample's `sequence` is the name of one of them.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
+        classes: table of the class ids in samples, after the remap.
+        transform: called with each sample; returns the sample to use. It may be set later (see `carlasc.Flip`).
     """
 
     def __init__(
         self,
-        root: str | os.PathLike[str] | Source,
+        source: str | os.PathLike[str] | Source,
         split: str | Iterable[str] | None = None,
         *,
         history: int = 1,
         coordinates: Coordinates = "cartesian",
         grid: str | GridSpec = layout.EVALUATION,
-        grids_root: str | os.PathLike[str] | Source | None = None,
+        grids_source: str | os.PathLike[str] | Source | None = None,
         fields: Iterable[str] = ("occupancy", "labels", "known"),
-        remap: str | Remap | Mapping[int, int] | ArrayLike | None = "carlasc11",
+        remap: RemapLike = "carlasc11",
         align: bool = True,
         transform: Callable[[Sample], Sample] | None = None,
     ) -> None:
-        """Find the frames; no scan and no grid is read.
+        """Find the frames. No scan and no grid is read.
 
         Args:
-            root: anything that `carlasc.open` takes, or a Source.
-            split: "train", "val" or "test" in any case; or names of sequences; None takes all.
-            history: T, number of scans in a stack, the frame's own included.
-            coordinates: which grids: "cartesian" or "cylindrical" (a GridSpec as `grid` knows its own). Scans, poses and
-                times come from the sequence's folder of that name if they are there, else from `cartesian/`.
-            grid: name of the grid (its folder), whose params.json gives the geometry. Or a geometry: `labels`, `known` and
-                `counts` then come from the grid that has it, and where none of them is asked for no grid need be there.
-            grids_root: where grids are read from instead, for eval_fine.zip and eval_cylindrical.zip. Its sequences go to
-                those of `root` by split and name.
-            fields: what a sample holds, any of those above.
-            remap: for `labels` and `point_labels`: a name in `carlasc.core.tables.REMAPS`, a Remap, a mapping or a table of
-                ids; None keeps the ids as they stand.
-            align: move past scans into the frame's sensor frame by their poses; False stacks them as they are.
+            source: anything that `carlasc.open` takes, or a Source.
+            split: "train", "val" or "test" in any case, or names of sequences; None takes all sequences.
+            history: T, number of scans in a stack, the frame's own scan included.
+            coordinates: coordinates of the grids: "cartesian" or "cylindrical"; ignored if `grid` is a GridSpec. Scans, poses and
+                times are read from the sequence's folder of that name if it has scans, else from `cartesian/`.
+            grid: name of the grid (its folder), whose params.json gives the geometry. Or a GridSpec: `labels`, `known` and
+                `counts` are then read from the grid with this geometry; without these fields no such grid need exist.
+            grids_source: where grids are read from, if not from `source`, as for eval_fine.zip and eval_cylindrical.zip. Its
+                sequences are matched to those of `source` by split and name.
+            fields: the fields of a sample, any of those above.
+            remap: how `labels` and `point_labels` are mapped: a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a
+                table of new ids by old id; None keeps the ids of the data.
+            align: move past scans into the frame's sensor frame by their poses; False stacks them without moving them.
             transform: called with each sample.
 
         Raises:
-            ArgumentError: an argument makes no sense, or the remap is one for other classes.
-            MissingDataError: there is no such split or sequence, or a sequence lacks what was asked for.
-            FormatError: the sequences' grids or frames differ, or poses.txt does not fit the scans.
+            ArgumentError: an argument has a wrong value, or the remap is for other classes.
+            MissingDataError: a split or sequence does not exist, or a sequence lacks a field that was asked for.
+            FormatError: sequences differ in grid, axes or class table, or poses.txt does not fit the scans.
         """
         self.fields = _check_fields(fields)
         self.history = _check_history(history)
@@ -115,37 +122,41 @@ class Dataset(_MapStyle):
         self.transform = transform
         coordinates = grid.coordinates if isinstance(grid, GridSpec) else coordinates
         if coordinates not in layout.COORDINATES:
-            raise ArgumentError("coordinates", expected="cartesian or cylindrical", found=f"{coordinates!r}")
+            raise ArgumentError("coordinates", expected="cartesian or cylindrical", found=repr(coordinates))
 
-        source = as_source(root)
-        chosen = choose(source, split, coordinates)
+        opened = as_source(source)
+        chosen = choose_sequences(opened, split, coordinates)
         if self._asks(_OF_GRID) or (self._asks(_STACKS) and isinstance(grid, str)):
-            grids = find_grids(chosen, source if grids_root is None else as_source(grids_root), coordinates)
-            self._parts = [self._part(*pair, grid_named(pair[1], grid)) for pair in zip(chosen, grids, strict=True)]
+            grids_opened = opened if grids_source is None else as_source(grids_source)
+            grids = find_grid_sequences(chosen, grids_opened, coordinates)
+            self._parts = [
+                self._part(scans, sequence, find_grid_name(sequence, grid))
+                for scans, sequence in zip(chosen, grids, strict=True)
+            ]
         else:
             self._parts = [self._part(scans, None, "") for scans in chosen]
         self._starts = np.cumsum([0, *(len(part.frames) for part in self._parts)])
         if not len(self):
             raise MissingDataError(
-                source.location, expected=f"frames with {', '.join(self.fields)}", found="none that has all of them"
+                opened.location, expected=f"frames with {', '.join(self.fields)}", found="none that has all of them"
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
-        self.axes = _the_one({scans.location: scans.metadata.axes for scans in self.sequences}, "axes")
+        self.axes: Axes = common_value({scans.location: scans.metadata.axes for scans in self.sequences}, "axes")
         self._spec = grid if isinstance(grid, GridSpec) else self._spec_of_grids()
-        self._labels = self._labelling(remap)
-        self.classes = self._labels.target
+        self._label_map = self._make_label_map(remap)
+        self.classes: ClassTable = self._label_map.target
 
     @property
     def spec(self) -> GridSpec:
-        """The geometry of the grids.
+        """Geometry of the grids.
 
         Raises:
             ArgumentError: no field that was asked for needs a grid.
         """
         if self._spec is None:
             raise ArgumentError(
-                "fields", expected="one that needs a grid, such as occupancy", found=f"{', '.join(self.fields)}"
+                "fields", expected="one that needs a grid, such as occupancy", found=", ".join(self.fields)
             )
         return self._spec
 
@@ -153,15 +164,15 @@ class Dataset(_MapStyle):
         return int(self._starts[-1])
 
     def __getitem__(self, index: SupportsIndex) -> Sample:
-        """Return the sample at a place in `0..len - 1`; negative places count from the end.
+        """Return one sample; a negative index counts from the end.
 
         Raises:
-            IndexError: it is beyond the end.
-            FormatError: a file does not hold what it should; names the file.
+            IndexError: the index is beyond the end.
+            FormatError: a file does not hold what it must; names the file.
         """
         place = operator.index(index)
         if not -len(self) <= place < len(self):
-            raise IndexError(f"sample {place}: expected one of {len(self)}")
+            raise IndexError(f"sample {place} is out of range: there are {len(self)} samples")
         part, frame = self._frame_at(place % len(self))
         past = part.history(frame, self.history)
 
@@ -180,26 +191,28 @@ class Dataset(_MapStyle):
         return sample if self.transform is None else self.transform(sample)
 
     def index_of(self, sequence: str, frame: int) -> int:
-        """Return the place of a frame of a sequence.
+        """Return the index of the sample of a sequence's frame.
 
         Raises:
-            MissingDataError: it is no sample.
+            MissingDataError: no sample is of this frame.
         """
         for part, start in zip(self._parts, self._starts, strict=False):
             if part.scans.name == sequence and frame in part.frames:
                 return int(start + np.searchsorted(part.frames, frame))
-        raise MissingDataError(f"frame {frame} of {sequence}: expected one of the {len(self)} samples")
+        raise MissingDataError(
+            f"frame {frame} of {sequence}", expected=f"the frame of one of the {len(self)} samples", found="none"
+        )
 
     def __repr__(self) -> str:
         return f"<Dataset of {len(self)} frames in {len(self._parts)} sequences: {', '.join(self.fields)}>"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave decoded scans behind: each process keeps its own."""
+        """Leave out the decoded scans: each process keeps its own."""
         return {name: value for name, value in self.__dict__.items() if name != "_recent"}
 
     @cached_property
-    def _recent(self) -> _RecentScans:
-        return _RecentScans(self.history)
+    def _recent(self) -> RecentScans:
+        return RecentScans(self.history)
 
     def _asks(self, names: Iterable[str]) -> bool:
         return not set(names).isdisjoint(self.fields)
@@ -215,7 +228,7 @@ class Dataset(_MapStyle):
         if grids is not None:
             uncounted = "counts" not in self.fields and not len(grids.frames(f"{grid}/counts"))
             parts = {_OF_GRID[field] for field in self.fields if field in _OF_GRID}
-            # Without counts every voxel is known, in all frames that have labels.
+            # If the grid has no counts, every voxel is known, in all frames that have labels.
             wanted |= {(grids, f"{grid}/{'labels' if uncounted else part}"): None for part in sorted(parts)}
         part = Part(scans, grids, grid, common_frames(wanted), frozenset(scans.frames("points").tolist()))
         if self._needs_poses:
@@ -224,9 +237,9 @@ class Dataset(_MapStyle):
 
     def _spec_of_grids(self) -> GridSpec | None:
         specs = {part.grids.location: part.grids.grids[part.grid] for part in self._parts if part.grids is not None}
-        return _the_one(specs, "grid geometry") if specs else None
+        return common_value(specs, "grid geometry") if specs else None
 
-    def _labelling(self, remap: str | Remap | Mapping[int, int] | ArrayLike | None) -> _Labelling:
+    def _make_label_map(self, remap: RemapLike) -> LabelMap:
         tables: dict[str, ClassTable] = {}
         for part in self._parts:
             if "point_labels" in self.fields:
@@ -234,17 +247,17 @@ class Dataset(_MapStyle):
             if "labels" in self.fields and part.grids is not None:
                 tables[f"{part.grids.location}/{part.grid}"] = part.grids.classes_of(part.grid)
         where, found = next(iter(tables.items()), ("", self.sequences[0].metadata.classes))
-        labelling = _Labelling(remap, found)
+        label_map = LabelMap(remap, found)
         if tables:
-            _the_one({place: table.name for place, table in tables.items()}, "class table")
-        if tables and labelling.source != found:
+            common_value({place: table.name for place, table in tables.items()}, "class table")
+        if tables and label_map.source != found:
             raise ArgumentError(
-                where,
-                expected=f"labels of the class table {labelling.source.name} for the remap {labelling.name}",
-                found=f"{found.name}",
-                advice="give another remap=, or None to keep the ids",
+                "remap",
+                expected=f"a remap of {where}'s class table {found.name}",
+                found=f"{label_map.name}, which maps {label_map.source.name}",
+                advice="give another `remap`, or None to keep the ids",
             )
-        return labelling
+        return label_map
 
     def _frame_at(self, place: int) -> tuple[Part, int]:
         which = int(np.searchsorted(self._starts, place, side="right")) - 1
@@ -270,7 +283,7 @@ class Dataset(_MapStyle):
         sample: Sample = {}
         if "labels" in self.fields:
             field = f"{part.grid}/labels"
-            sample["labels"] = self._labels(
+            sample["labels"] = self._label_map(
                 part.grids.read(field, frame), f"{part.grids.location}: {field} of frame {frame}"
             )
         if "known" in self.fields or "counts" in self.fields:
@@ -287,21 +300,21 @@ class Dataset(_MapStyle):
             sample["points"] = np.array(points[:, :3] if points is not None else (), np.float32, order="C")
         if "point_labels" in self.fields:
             labels = part.scans.read("labels", frame)
-            sample["point_labels"] = self._labels(labels, f"{part.scans.location}: labels of frame {frame}")
+            sample["point_labels"] = self._label_map(labels, f"{part.scans.location}: labels of frame {frame}")
         if "flow" in self.fields:
             sample["flow"] = np.array(part.scans.read("flow", frame), np.float32, order="C")
         lengths = {name: len(array) for name, array in sample.items()}
         if len(set(lengths.values())) > 1:
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
-            raise FormatError(f"{part.scans.location}: frame {frame}", expected="as many of each", found=f"{found}")
+            raise FormatError(f"{part.scans.location}: frame {frame}", expected="the same number of each", found=found)
         return sample
 
 
 def collate(samples: list[Sample]) -> dict[str, Any]:
-    """Make a batch of samples that may hold ragged fields: give it to a DataLoader as `collate_fn`.
+    """Return a batch of samples that may hold fields with one row per point. Give it to a DataLoader as `collate_fn`.
 
-    `points`, `point_labels` and `flow` become lists of B tensors, one a sample; everything else is stacked as torch's
-    default collate does.
+    `points`, `point_labels` and `flow` become lists of B tensors, one per sample. All other fields are stacked as torch's
+    default_collate does.
 
     Raises:
         DependencyError: torch is not installed.
@@ -313,85 +326,11 @@ def collate(samples: list[Sample]) -> dict[str, Any]:
     return {name: ragged[name] if name in ragged else batch[name] for name in samples[0]}
 
 
-class _RecentScans(threading.local):
-    """The scans that a thread read last, decoded: frames taken in order share all but one with the frame before.
-
-    What is dropped is memory for what comes next, so scans are for the reading thread alone.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        super().__init__()
-        self.capacity = capacity
-        self._scans: OrderedDict[tuple[Sequence, int], NDArray[np.float32]] = OrderedDict()
-
-    def read(self, sequence: Sequence, frames: list[int | None]) -> list[NDArray[np.float32] | None]:
-        """Return the points of each frame as `Sequence.read_xyz` does, None for None, good until the next call.
-
-        What is not at hand is read in one go.
-        """
-        wanted = [(sequence, frame) for frame in frames if frame is not None]
-        for key in wanted:
-            if key in self._scans:
-                self._scans.move_to_end(key)
-        missing = [key for key in wanted if key not in self._scans]
-        spare = []
-        while self._scans and len(self._scans) + len(missing) > self.capacity:
-            spare.append(self._scans.popitem(last=False)[1])
-        if missing:
-            read = sequence.read_xyz([frame for _, frame in missing], spare)
-            self._scans.update(zip(missing, read, strict=True))
-        return [None if frame is None else self._scans[sequence, frame] for frame in frames]
-
-
-class _Labelling:
-    """What `remap` makes of labels: one lookup table, and an error that names the file and the id."""
-
-    def __init__(self, remap: str | Remap | Mapping[int, int] | ArrayLike | None, classes: ClassTable) -> None:
-        self._remap = None if remap is None else _as_remap(remap, classes)
-        self.name = self._remap.name if self._remap else "none"
-        self.source = self._remap.source if self._remap else classes
-        self.target = self._remap.target if self._remap else classes
-        self._table = self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
-
-    def __call__(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.unsignedinteger]:
-        """Return the labels in the target's dtype; `where` is what to call them in an error."""
-        from carlasc.dataset.stacking import look_up
-
-        found = look_up(labels, self._table, self.target.dtype)
-        if found is None and self._remap is not None:
-            return self._remap(labels, where)  # raises, naming the id
-        if found is None:
-            self.source.check(labels, where)
-            raise FormatError(f"{where}: expected class ids of {self.source.name}")
-        return found
-
-
-def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: ClassTable) -> Remap:
-    if isinstance(remap, Remap):
-        return remap
-    if isinstance(remap, str):
-        return remap_named(remap)
-    if isinstance(remap, Mapping):
-        mapping = {int(old): int(new) for old, new in remap.items()}
-    else:
-        table = np.asarray(remap)
-        if table.ndim != 1 or table.dtype.kind not in "iu" or not table.size:
-            raise ArgumentError(
-                "remap", expected="a name, a mapping or a table of ids", found=f"{type(remap).__name__}"
-            )
-        mapping = dict(enumerate(table.tolist()))
-    if not mapping or min(mapping.values()) < 0:
-        raise ArgumentError("remap", expected="ids of 0 or more", found="none or a negative one")
-    ids = sorted(set(mapping.values()))
-    target = ClassTable("custom", {i: f"class {i}" for i in ids}, dict.fromkeys(ids, (128, 128, 128)))
-    return Remap("custom", classes, target, mapping)
-
-
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([fields] if isinstance(fields, str) else fields))
     unknown = [name for name in names if name not in (*FIELDS, *ALWAYS)]
     if unknown:
-        raise ArgumentError("fields", expected=f"any of {', '.join(FIELDS)}", found=f"{', '.join(map(repr, unknown))}")
+        raise ArgumentError("fields", expected=f"any of {', '.join(FIELDS)}", found=", ".join(map(repr, unknown)))
     chosen = tuple(name for name in names if name not in ALWAYS)
     if not chosen:
         raise ArgumentError("fields", expected=f"at least one of {', '.join(FIELDS)}", found="none")
@@ -400,26 +339,5 @@ def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
 
 def _check_history(history: int) -> int:
     if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
-        raise ArgumentError("history", expected="a number of scans of 1 or more", found=f"{history!r}")
+        raise ArgumentError("history", expected="a number of scans of 1 or more", found=repr(history))
     return int(history)
-
-
-_T = TypeVar("_T")
-
-
-def _the_one(values: Mapping[str, _T], what: str) -> _T:
-    """Return the value that all places share.
-
-    Raises:
-        FormatError: two differ; names the places.
-    """
-    (place, value), *others = values.items()
-    for other, found in others:
-        if found != value:
-            raise FormatError(
-                other,
-                expected=f"the {what} of {place} ({value})",
-                found=f"{found}",
-                advice="choose sequences alike with split=[names]",
-            )
-    return value

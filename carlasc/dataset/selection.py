@@ -1,9 +1,10 @@
-"""Which sequences and frames a Dataset is made of: splits, sequences and their grids put together, frames that have everything."""
+"""The sequences and frames of a Dataset: the sequences of a split, their grids, and the frames that have all fields."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
+
+_T = TypeVar("_T")
 
 _RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
 
@@ -22,11 +25,11 @@ class Part:
 
     Attributes:
         scans: where scans, poses and metadata are read from.
-        grids: where grids are read from: the same, the sequence's other `<coordinates>` folder, or one of another root. None
-            where no grid is needed.
-        grid: name of the grid there.
-        frames: the frames that are samples, rising.
-        scanned: the frames that have a scan.
+        grids: where grids are read from: the same sequence, its other `<coordinates>` folder, or a sequence of another source.
+            None if no grid is needed.
+        grid: name of the grid in `grids`.
+        frames: numbers of the frames that are samples, increasing.
+        scanned: numbers of the frames that have a scan.
     """
 
     scans: Sequence
@@ -36,7 +39,7 @@ class Part:
     scanned: frozenset[int]
 
     def history(self, frame: int, length: int) -> list[int | None]:
-        """Return the frames of a stack, oldest first; None before the sequence's start and before a gap."""
+        """Return the frame numbers of a stack, oldest first; None before the start of the sequence and before a gap."""
         past: list[int | None] = [None] * length
         for back in range(length):
             if frame - back not in self.scanned:
@@ -45,7 +48,7 @@ class Part:
         return past
 
     def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
-        """Return (T, 4, 4) transforms of past sensor frames to that of `frame`; the identity for itself and for None."""
+        """Return (T, 4, 4) transforms from past sensor frames to that of `frame`; the identity for `frame` itself and for None."""
         transforms = np.tile(np.eye(4), (len(past), 1, 1))
         others = {row: number for row, number in enumerate(past) if number is not None and number != frame}
         if others:
@@ -57,8 +60,8 @@ class Part:
         """Check that every frame has a pose that can be inverted.
 
         Raises:
-            MissingDataError: there is no poses.txt.
-            FormatError: it has too few lines, or a line is no pose.
+            MissingDataError: poses.txt does not exist.
+            FormatError: it has too few lines, or a line is not a pose.
         """
         where = f"{self.scans.location}/{layout.POSES}"
         poses = self.scans.poses
@@ -69,29 +72,28 @@ class Part:
         if not rigid.all():
             line = int(np.argmin(rigid))
             raise FormatError(
-                where,
-                expected="rigid transforms",
-                found=f"none in line {line + 1}",
-                advice=f"{poses[line, :3].ravel().tolist()}",
+                f"{where}, line {line + 1}",
+                expected="a rigid transform",
+                found=str(poses[line, :3].ravel().tolist()),
             )
 
 
-def choose(source: Source, split: str | Iterable[str] | None, coordinates: Coordinates) -> list[Sequence]:
-    """Return the sequences of a split, or of the given names, in their Source's order: those that scans are read from.
+def choose_sequences(source: Source, split: str | Iterable[str] | None, coordinates: Coordinates) -> list[Sequence]:
+    """Return the sequences of a split, or those with the given names, in the order of the source. Scans are read from them.
 
     Raises:
         ArgumentError: `split` is neither one of the splits nor a list of names.
-        MissingDataError: nothing there has that split or name.
+        MissingDataError: no sequence has that split or name.
     """
     groups = _groups(source)
     return [_with_scans(groups[key], coordinates) for key in _match(source, groups, split)]
 
 
-def find_grids(chosen: list[Sequence], source: Source, coordinates: Coordinates) -> list[Sequence]:
-    """Return, for each sequence, the one that its grids are read from.
+def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coordinates) -> list[Sequence]:
+    """Return, for each sequence, the sequence that its grids are read from.
 
-    Sequences go together by split and name; by name alone where a path tells no split; and two roots that are each just one
-    sequence go together whatever their names.
+    Sequences are matched by split and name, or by name alone if a path has no split. If both sources are a single sequence,
+    these are matched whatever their names.
 
     Raises:
         MissingDataError: a sequence has no counterpart.
@@ -108,23 +110,23 @@ def find_grids(chosen: list[Sequence], source: Source, coordinates: Coordinates)
         exact = [group for group in candidates if any(member.location == scans.location for member in group.values())]
         group = next(iter(exact or candidates or only), {})
         if coordinates not in group:
-            there = ", ".join(
+            existing = ", ".join(
                 sorted(f"{member.split or '?'}/{member.name}" for g in groups.values() for member in g.values())
             )
             raise MissingDataError(
                 source.location,
                 expected=f"{coordinates} grids of {scans.split or '?'}/{scans.name}",
-                found=f"{'only ' + ', '.join(group) if group else 'the sequences ' + there}",
+                found=f"only {', '.join(group)}" if group else f"the sequences {existing}",
             )
         found.append(group[coordinates])
     return found
 
 
-def grid_named(grids: Sequence, grid: str | GridSpec) -> str:
+def find_grid_name(grids: Sequence, grid: str | GridSpec) -> str:
     """Return the name of a sequence's grid, given by name or by geometry.
 
     Raises:
-        MissingDataError: it has no such grid.
+        MissingDataError: the sequence has no such grid.
     """
     if isinstance(grid, str):
         if grid in grids.grids:
@@ -133,12 +135,12 @@ def grid_named(grids: Sequence, grid: str | GridSpec) -> str:
         for name, spec in grids.grids.items():
             if spec == grid:
                 return name
-    there = ", ".join(f"{name} ({spec})" for name, spec in grids.grids.items()) or "none"
+    existing = ", ".join(f"{name} ({spec})" for name, spec in grids.grids.items()) or "none"
     raise MissingDataError(
         grids.location,
         expected=f"the grid {grid}",
-        found=f"{there}",
-        advice="give another grid=, or for scans alone a GridSpec",
+        found=existing,
+        advice="give another `grid`, or a GridSpec if only scans are needed",
     )
 
 
@@ -146,7 +148,7 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
     """Return the frames that have all fields of `wanted`.
 
     Raises:
-        MissingDataError: a field is nowhere in the sequence.
+        MissingDataError: no frame of a sequence has a field.
     """
     common: NDArray[np.int64] | None = None
     for sequence, field in wanted:
@@ -156,17 +158,35 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
                 sequence.location,
                 expected=f"the field {field}",
                 found="no frame that has it",
-                advice="leave the sequence out with split=[names], or do not ask for the field",
+                advice="leave the sequence out with `split`, a list of names, or do not ask for the field",
             )
         common = frames if common is None else np.intersect1d(common, frames, assume_unique=True)
     return np.empty(0, np.int64) if common is None else common
+
+
+def common_value(values: Mapping[str, _T], what: str) -> _T:
+    """Return the value that all places share; `values` has it by place.
+
+    Raises:
+        FormatError: two places differ; names both.
+    """
+    (place, value), *others = values.items()
+    for other, found in others:
+        if found != value:
+            raise FormatError(
+                other,
+                expected=f"the {what} of {place} ({value})",
+                found=str(found),
+                advice="choose sequences that agree with `split`, a list of names",
+            )
+    return value
 
 
 _Key = tuple[str | None, str, str]  # split, name, and the path of the sequence's folder
 
 
 def _groups(source: Source) -> dict[_Key, dict[str, Sequence]]:
-    """Put the `<coordinates>` folders of each sequence together."""
+    """Return the `<coordinates>` folders of each sequence."""
     groups: dict[_Key, dict[str, Sequence]] = {}
     for path, sequence in source.sequences().items():
         folder, _, last = path.rpartition("/")
@@ -183,7 +203,7 @@ def _with_scans(group: dict[str, Sequence], coordinates: Coordinates) -> Sequenc
             other.location,
             expected=f"{coordinates} data",
             found=f"only {other.coordinates}",
-            advice=f"give coordinates={other.coordinates!r}",
+            advice=f"give `coordinates={other.coordinates!r}`",
         )
     return next((sequence for sequence in candidates if len(sequence.frames("points"))), candidates[0])
 
@@ -194,27 +214,29 @@ def _match(source: Source, groups: Mapping[_Key, object], split: str | Iterable[
     if isinstance(split, str):
         if split.lower() not in map(str.lower, layout.SPLITS):
             raise ArgumentError(
-                f"split {split!r}: expected {', '.join(layout.SPLITS)} in any case, or a list of names of sequences"
+                "split",
+                expected=f"{', '.join(layout.SPLITS)} in any case, or a list of names of sequences",
+                found=repr(split),
             )
         chosen = [key for key in groups if (key[0] or "").lower() == split.lower()]
         if not chosen:
-            there = ", ".join(sorted({key[0] or "none" for key in groups}))
+            existing = ", ".join(sorted({key[0] or "none" for key in groups}))
             raise MissingDataError(
                 source.location,
                 expected=f"the split {split}",
-                found=f"{there}",
-                advice="give the root that holds it, or split=None",
+                found=existing,
+                advice="give a folder that holds it, or `split=None`",
             )
         return chosen
     names = list(split)
     for name in names:
         if not any(name in _names(key) for key in groups):
-            there = ", ".join(sorted(key[1] for key in groups))
-            raise MissingDataError(source.location, expected=f"the sequence {name}", found=f"{there}")
+            existing = ", ".join(sorted(key[1] for key in groups))
+            raise MissingDataError(source.location, expected=f"the sequence {name}", found=existing)
     return [key for key in groups if not _names(key).isdisjoint(names)]
 
 
 def _names(key: _Key) -> set[str]:
-    """Return what a sequence may be called: "Town01_Light", "Train/Town01_Light", or its path."""
+    """Return the names of a sequence: "Town01_Light", "Train/Town01_Light", and its path."""
     split, name, path = key
     return {name, f"{split}/{name}", path}

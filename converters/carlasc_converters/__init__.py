@@ -1,1 +1,1 @@
-"""Converters of other data sets into the CarlaSC layout, found through the entry-point group `carlasc.converters`."""
+"""Converters of other data sets into the CarlaSC layout. `carlasc` finds them through the entry-point group `carlasc.converters`."""

@@ -1,4 +1,4 @@
-"""SemanticKITTI, and KITTI odometry roots without labels (FORMAT section 6)."""
+"""SemanticKITTI, and KITTI odometry data without labels: see the format page, `docs/format.md#semantickitti`."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
-_MOVING_TO_BASE = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
+_STANDING = {  # class of moving actors -> class of the same actors when they stand
+    moving: SEMANTICKITTI.id_of(SEMANTICKITTI.names[moving].removeprefix("moving-")) for moving in SEMANTICKITTI.moving
+}
 _TEST_FIRST, _VALIDATION = 11, 8
 
 
 class SemanticKitti(Converter):
-    """A SemanticKITTI root, one of its sequences, or a KITTI odometry root."""
+    """Reads SemanticKITTI, one of its sequences, or KITTI odometry data."""
 
-    title: ClassVar[str] = "SemanticKITTI, or a KITTI odometry root without labels"
+    title: ClassVar[str] = "SemanticKITTI, or KITTI odometry data without labels"
     classes = SEMANTICKITTI
     to_carla = REMAPS["semantickitti_to_carla"]
     sensor = "Velodyne HDL-64E"
@@ -37,24 +39,24 @@ class SemanticKitti(Converter):
         """Return the sequences, by number.
 
         Raises:
-            MissingDataError: there is none.
+            MissingDataError: no sequence exists.
         """
-        folders = find_sequences(self.root)
+        folders = find_sequences(self.source)
         return [KittiRecording(folder, f"KITTI_{folder.name}", _split_of(folder.name)) for folder in folders]
 
     @classmethod
     def exporter(cls, **options: Any) -> Exporter:
-        """Return what writes SemanticKITTI's files."""
+        """Return the exporter that writes SemanticKITTI's files."""
         from carlasc_converters.kitti_export import KittiExporter
 
         return KittiExporter(**options)
 
 
 class KittiRecording(Recording):
-    """One sequence's folder: velodyne/, labels/, voxels/, poses.txt, calib.txt, times.txt.
+    """One sequence: a folder with velodyne/, labels/, voxels/, poses.txt, calib.txt and times.txt.
 
     Attributes:
-        folder: where it is.
+        folder: this folder.
     """
 
     def __init__(self, folder: Path, name: str, split: Split) -> None:
@@ -71,7 +73,7 @@ class KittiRecording(Recording):
         return KittiFrame(str(self.folder), number, self.has_labels)
 
     def poses(self, *, force: bool = False) -> NDArray[np.float64] | None:
-        """Return inv(Tr) @ P @ Tr of each line of poses.txt: it holds poses of the left camera."""
+        """Return inv(Tr) @ P @ Tr for each pose P in poses.txt, because the file holds poses of the left camera."""
         path = next((path for path in self._pose_files() if path.is_file()), None)
         if path is None:
             return None
@@ -80,7 +82,7 @@ class KittiRecording(Recording):
         return np.linalg.inv(camera_T_lidar) @ check_rigid(camera_poses, str(path)) @ camera_T_lidar
 
     def _pose_files(self) -> tuple[Path, ...]:
-        """Where poses may be: in the sequence, or, in odometry roots, in poses/ beside sequences/."""
+        """Return where poses may be: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""
         return self.folder / "poses.txt", self.folder.parent.parent / "poses" / f"{self.folder.name}.txt"
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
@@ -90,11 +92,13 @@ class KittiRecording(Recording):
             return check_rigid(found["Tr"], f"{path}: Tr")
         if force:
             return np.eye(4)
-        what = "no such file" if found is None else f"only {', '.join(found) or 'no key'}"
         error = MissingDataError if found is None else FormatError
         raise error(
-            f"{path}: expected Tr, which takes LiDAR points to the camera whose poses {poses.name} holds, found {what}: copy calib.txt of the KITTI"
-            " odometry data, estimate poses from the scans (`--poses kiss-icp`), or take them for the LiDAR's own (`--force`)"
+            path,
+            expected=f"Tr, which takes LiDAR points to the camera whose poses {poses.name} holds",
+            found="no such file" if found is None else f"only {', '.join(found) or 'other lines'}",
+            advice='copy calib.txt of the KITTI odometry data, estimate poses from the scans with `poses="kiss-icp"`, or, if the'
+            " poses are those of the LiDAR, accept them with `force=True`",
         )
 
     def times(self) -> NDArray[np.float64] | None:
@@ -103,14 +107,15 @@ class KittiRecording(Recording):
         return layout.decode_times(path.read_bytes(), str(path)) if path.is_file() else None
 
     def problems(self) -> list[tuple[int, str]]:
-        """Name the frames that have labels or voxels, but no scan."""
-        there = {frame.number for frame in self.frames}
+        """Return the frames that have labels or voxels, but no scan."""
+        scanned = {frame.number for frame in self.frames}
         others = {*frames_of(self.folder / "labels", ".label"), *frames_of(self.folder / "voxels", ".label")}
-        scan = self.folder / "velodyne"
-        return [
-            (number, f"{scan / f'{number:06d}.bin'}: expected a scan beside its labels, found no such file")
-            for number in sorted(others - there)
-        ]
+        found = []
+        for number in sorted(others - scanned):
+            file = self.folder / "velodyne" / f"{number:06d}.bin"
+            error = MissingDataError(file, expected="a scan beside its labels", found="no such file")
+            found.append((number, str(error)))
+        return found
 
 
 @dataclass(frozen=True)
@@ -140,35 +145,36 @@ class KittiFrame(FrameHandle):
             raise FormatError(
                 self._label_file,
                 expected=f"a label for each of {len(points)} points",
-                found=f"{len(labels)}",
-                advice="of another scan, or cut short",
+                found=str(len(labels)),
+                advice="the file belongs to another scan, or is incomplete",
             )
         return FrameContent(points, labels, instances)
 
     def read_labels(self) -> tuple[NDArray[np.uint16] | None, NDArray[np.uint32] | None]:
-        """Read classes (the low 16 bits) and instances (the high ones)."""
+        """Read classes (the low 16 bits) and instances (the high 16 bits)."""
         if not self.labelled:
             return None, None
         both = _read_array(self._label_file, np.dtype("<u4"), 1)[:, 0]
-        labels = both.astype(np.uint16)  # the low half
+        labels = both.astype(np.uint16)  # keeps the low 16 bits
         actors = both >> 16
-        # Instances are counted anew in each class, and a car is the same whether it moves or not.
+        # SemanticKITTI numbers the instances of each class from 1, so the class is part of an actor's number.
+        # A moving car and the same car standing get the same number.
         return labels, np.where(actors > 0, _CLASS_PART[labels] | actors, np.uint32(0))
 
     def read_voxels(self) -> VoxelContent | None:
-        """Read the frame's voxels; SemanticKITTI has them for every fifth scan."""
+        """Read the frame's voxels, which SemanticKITTI has for every fifth scan."""
         return read_voxel_files(Path(self.folder) / "voxels", self.number)
 
 
 def find_sequences(root: Path) -> list[Path]:
-    """Find the sequences' folders: below `sequences/`, below `dataset/sequences/`, or the folder itself.
+    """Return the folders of the sequences: those in `sequences/` or `dataset/sequences/`, or the folder itself.
 
     Raises:
-        MissingDataError: there is none.
+        MissingDataError: no sequence exists.
     """
     if not root.is_dir():
         raise MissingDataError(
-            root, expected="a folder", found=f"{'a file' if root.exists() else 'nothing'}", advice="check the path"
+            root, expected="a folder", found="a file" if root.exists() else "nothing", advice="check the path"
         )
     if (root / "velodyne").is_dir():
         return [root.resolve()]
@@ -184,7 +190,7 @@ def find_sequences(root: Path) -> list[Path]:
 
 
 def frames_of(folder: Path, suffix: str) -> list[int]:
-    """Return the sorted frame numbers of a folder's files; none where there is no such folder."""
+    """Return the sorted frame numbers of a folder's files; none if the folder does not exist."""
     if not folder.is_dir():
         return []
     numbers = (layout.frame_of(path.name, suffix) for path in folder.iterdir())
@@ -192,19 +198,19 @@ def frames_of(folder: Path, suffix: str) -> list[int]:
 
 
 def read_calibration(path: Path) -> dict[str, Transform]:
-    """Read calib.txt: "NAME:" and 12 numbers a line; other keys with other numbers are passed over.
+    """Read calib.txt: "NAME:" and 12 numbers per line. Lines with other values are ignored.
 
     Returns:
         (4, 4) by name.
 
     Raises:
-        FormatError: it is no text, or Tr has not 12 numbers.
+        FormatError: the file is not text, or Tr does not have 12 numbers.
     """
     try:
         lines = path.read_text().splitlines()
     except UnicodeDecodeError as error:
         raise FormatError(
-            path, expected="NAME: and 12 numbers a line", found="something else", advice=f"{error}"
+            path, expected="NAME: and 12 numbers per line", found=f"a file that is not text ({error})"
         ) from error
     found = {}
     for line in lines:
@@ -216,12 +222,12 @@ def read_calibration(path: Path) -> dict[str, Transform]:
         if colon and len(numbers) == 12:
             found[name.strip()] = np.vstack([np.reshape(numbers, (3, 4)), (0.0, 0.0, 0.0, 1.0)])
         elif name.strip() == "Tr":
-            raise FormatError(path, expected="12 numbers after Tr:", found=f"{values.strip()!r}")
+            raise FormatError(path, expected="12 numbers after Tr:", found=repr(values.strip()))
     return found
 
 
 def _split_of(name: str) -> Split:
-    """Return the split of a sequence by its number; folders of other names are for training."""
+    """Return the split of a sequence by its number; folders with other names belong to the training split."""
     number = int(name) if name.isascii() and name.isdigit() else 0
     return "Val" if number == _VALIDATION else "Test" if _TEST_FIRST <= number <= 21 else "Train"
 
@@ -233,9 +239,14 @@ def _read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
         raise MissingDataError(path, expected="a file", found="nothing", advice="copy it again") from None
     row = dtype.itemsize * columns
     if len(data) % row:
-        raise FormatError(path, expected=f"a multiple of {row} bytes", found=f"{len(data)}", advice="cut short?")
+        raise FormatError(
+            path,
+            expected=f"a multiple of {row} bytes",
+            found=str(len(data)),
+            advice="the file is incomplete: copy it again",
+        )
     return data.view(dtype).reshape(-1, columns)
 
 
 _CLASS_PART = np.arange(1 << 16, dtype=np.uint32) << 16
-_CLASS_PART[list(_MOVING_TO_BASE)] = _CLASS_PART[list(_MOVING_TO_BASE.values())]
+_CLASS_PART[list(_STANDING)] = _CLASS_PART[list(_STANDING.values())]

@@ -1,4 +1,4 @@
-"""SemanticKITTI's voxel files: labels as uint16, masks of one bit a voxel, first voxel in the highest bit (FORMAT section 6)."""
+"""SemanticKITTI's voxel files: uint16 labels, and masks of one bit per voxel. See the format page, `docs/format.md#semantickitti`."""
 
 from __future__ import annotations
 
@@ -14,34 +14,33 @@ from carlasc.errors import FormatError
 GRID = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
 MASKS = (".bin", ".invalid", ".occluded")
 _SUFFIXES = (".label", *MASKS)
+_COPY = "the file is incomplete: copy it again"
 
 
 def pack_bits(mask: NDArray[np.bool_]) -> bytes:
-    """Return a mask as bits, C order, most significant bit first."""
+    """Return a mask as packed bits: C order, the first voxel in the most significant bit."""
     return np.packbits(mask.reshape(-1)).tobytes()
 
 
 def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> NDArray[np.bool_]:
-    """Read a mask.
+    """Return the mask of `size` that packed bits hold.
 
     Raises:
-        FormatError: the number of bytes does not fit the size.
+        FormatError: the number of bytes does not fit the size; `where` is the file.
     """
     voxels = int(np.prod(size))
     if len(data) != -(-voxels // 8):
-        raise FormatError(
-            where, expected=f"{-(-voxels // 8)} bytes of packed bits", found=f"{len(data)}", advice="cut short?"
-        )
+        raise FormatError(where, expected=f"{-(-voxels // 8)} bytes of packed bits", found=str(len(data)), advice=_COPY)
     return np.unpackbits(np.frombuffer(data, np.uint8), count=voxels).reshape(size).astype(np.bool_)
 
 
 def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
-    """Read the voxels of a frame: labels, and what is known of them; None where there are no labels.
+    """Read a frame's voxel files; None if the frame has no labels.
 
-    A raw 0 is empty; an invalid voxel is not known.
+    A voxel of class 0 is free; an invalid voxel is unknown.
 
     Raises:
-        FormatError: a file has another size.
+        FormatError: the size of a file does not fit the grid.
     """
     files = {
         f"{frame:06d}{suffix}": path.read_bytes()
@@ -54,10 +53,10 @@ def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
     voxels = int(np.prod(GRID.size))
     if len(data) != 2 * voxels:
         raise FormatError(
-            f"{folder / f'{frame:06d}.label'}",
+            folder / f"{frame:06d}.label",
             expected=f"{2 * voxels} bytes (256 x 256 x 32 uint16)",
-            found=f"{len(data)}",
-            advice="cut short?",
+            found=str(len(data)),
+            advice=_COPY,
         )
     labels = np.frombuffer(data, "<u2").reshape(GRID.size)
     known = np.ones(GRID.size, np.bool_)

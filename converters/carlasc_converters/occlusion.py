@@ -1,4 +1,4 @@
-"""Which voxels a sensor at the origin cannot see for what is in the others (FORMAT section 6: `.occluded`)."""
+"""Occluded voxels: those that a sensor at the origin cannot see because of occupied voxels before them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from carlasc.core.grids import GridSpec
 
 
 def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.bool_]:
-    """Return the voxels whose line to the sensor meets an occupied voxel, themselves counted.
+    """Return the occupied voxels, and the voxels whose line to the sensor passes through an occupied one.
 
-    The line goes from a voxel's centre to the sensor, which is the origin, through one voxel after the other (Amanatides and Woo 1987); it ends
-    at the sensor or where it leaves the grid.
+    The line goes from the centre of a voxel to the sensor, which is at the origin, from voxel to voxel (Amanatides and Woo 1987).
+    It ends at the sensor, or where it leaves the grid.
 
     Args:
         occupied: (X, Y, Z) bool.
-        spec: their geometry; Cartesian.
+        spec: geometry of the grid, Cartesian.
+
+    Returns:
+        (X, Y, Z) bool.
     """
     sensor = -np.array(spec.lower) / spec.voxel_size
     occluded: NDArray[np.bool_] = _occlude(np.ascontiguousarray(occupied), sensor)
@@ -36,11 +39,12 @@ def _occlude(occupied: NDArray[np.bool_], sensor: NDArray[np.float64]) -> NDArra
 
 @numba.njit(cache=True)
 def _meets(occupied: NDArray[np.bool_], sensor: NDArray[np.float64], x: int, y: int, z: int) -> bool:
-    """Walk from a voxel to the sensor; coordinates are in voxels."""
+    """Return whether the line from a voxel to the sensor meets an occupied voxel. Coordinates are in voxels."""
     cell = (x, y, z)
     rx, ry, rz = sensor[0] - x - 0.5, sensor[1] - y - 0.5, sensor[2] - z - 0.5
     sx, sy, sz = (1 if rx > 0 else -1), (1 if ry > 0 else -1), (1 if rz > 0 else -1)
-    # The share of the line between two faces of an axis, and the share at which the next face comes: the first is half a voxel away.
+    # Per axis: the fraction of the line between two faces (d), and the fraction at which the next face comes (t).
+    # The first face is half a voxel away.
     dx = 1 / abs(rx) if rx != 0 else np.inf
     dy = 1 / abs(ry) if ry != 0 else np.inf
     dz = 1 / abs(rz) if rz != 0 else np.inf

@@ -1,4 +1,4 @@
-"""SemanticPOSS: SemanticKITTI's files, other classes, one LiDAR of 40 channels (FORMAT section 6)."""
+"""SemanticPOSS: the files of SemanticKITTI, with other classes, from one LiDAR of 40 channels."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from carlasc.core.geometry import Transform
 from carlasc.core.tables import REMAPS, SEMANTICPOSS
 from carlasc_converters.kitti import KittiRecording, find_sequences
 
-_VALIDATION = "02"  # of 00..05: the part that papers about it test on
+_VALIDATION = "02"  # of 00..05: the sequence on which papers report
 
 
 class SemanticPoss(Converter):
-    """A SemanticPOSS root, or one of its sequences."""
+    """Reads SemanticPOSS, or one of its sequences."""
 
     title: ClassVar[str] = "SemanticPOSS"
     classes = SEMANTICPOSS
@@ -29,16 +29,16 @@ class SemanticPoss(Converter):
         """Return the sequences, by number.
 
         Raises:
-            MissingDataError: there is none.
+            MissingDataError: no sequence exists.
         """
         return [
             PossRecording(folder, f"POSS_{folder.name}", "Val" if folder.name == _VALIDATION else "Train")
-            for folder in find_sequences(self.root)
+            for folder in find_sequences(self.source)
         ]
 
 
 class PossRecording(KittiRecording):
-    """One sequence; where it has a file of poses and no calib.txt they are the LiDAR's own."""
+    """One sequence. If it has no calib.txt, its poses are those of the LiDAR."""
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
         return super()._calibration(poses, force=force) if (self.folder / "calib.txt").is_file() else np.eye(4)

@@ -1,4 +1,4 @@
-"""What a run is made of: a dataclass, and a YAML file a network and data set."""
+"""The settings of a run: a dataclass, read from one YAML file per network and data set."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ class Config:
 
     Attributes:
         network: one of `NETWORKS`.
-        history: T, scans in a stack; more than 1 for MotionSC only.
+        history: T, number of scans in a stack; more than 1 for MotionSC only.
         align: move past scans into the newest one's frame by their poses.
-        shuffle_history: put the past scans of each stack in random order (to find out what the order is worth).
+        shuffle_history: put the past scans of each stack in random order (to measure what their order contributes).
         grid: which grid of the data to predict.
-        remap: to the classes predicted.
+        remap: maps the labels to the predicted classes.
         train: split to train on, or names of sequences.
         val: split to choose the best epoch by.
         test: split to report.
-        flips: axes along which samples are mirrored at random.
+        flips: directions in which samples are mirrored at random: "x", "y", "xy" or "".
         class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the training split), "none", or the file
             that `carlasc stats --json` wrote.
-        free_ratio: free voxels that take part in the loss for each occupied one, drawn at random a batch; 0 takes all (SSCNet: 2).
+        free_ratio: number of free voxels in the loss per occupied one, drawn at random for each batch; 0 takes all (SSCNet: 2).
         epochs: passes over the training split.
-        batch_size: samples a step, over all processes together.
-        learning_rate: Adam's, at first.
+        batch_size: samples per step, over all processes together.
+        learning_rate: learning rate of Adam in the first epoch.
         decay: factor on the learning rate after each epoch.
-        patience: stop after so many epochs without a better mIoU; None never does.
+        patience: stop after this number of epochs without a better mIoU; None never stops early.
         precision: "float32", or "bf16" for mixed precision.
-        compile: run through torch.compile.
-        workers: processes that load data, a process of training.
+        compile: compile the network with torch.compile.
+        workers: number of processes that load data, for each training process.
         seed: of weights, order, flips and draws.
     """
 
@@ -72,43 +72,41 @@ class Config:
             if kind is float and isinstance(value, int) and not isinstance(value, bool):
                 object.__setattr__(self, name, float(value))
             elif not _fits(value, kind):
-                raise ArgumentError(name, expected=f"{_describe(kind)}", found=f"{value!r}")
+                raise ArgumentError(name, expected=_describe(kind), found=repr(value))
         for name in ("history", "epochs", "batch_size"):
             if getattr(self, name) < 1:
-                raise ArgumentError(name, expected="1 or more", found=f"{getattr(self, name)}")
+                raise ArgumentError(name, expected="1 or more", found=str(getattr(self, name)))
         if self.history > 1 and self.network != "motionsc":
             raise ArgumentError(
-                "history", expected=f"1 for {self.network}", found=f"{self.history}", advice="only motionsc takes more"
+                "history", expected=f"1 for {self.network}", found=str(self.history), advice="only motionsc takes more"
             )
         if not set(self.flips) <= {"x", "y"}:
-            raise ArgumentError("flips", expected="x, y, xy or nothing", found=f"{self.flips!r}")
+            raise ArgumentError("flips", expected="x, y, xy or nothing", found=repr(self.flips))
 
     @classmethod
     def read(cls, path: Path, overrides: Iterable[str] = ()) -> Config:
-        """Read a YAML file; `overrides` are "key=value" texts that win over it.
+        """Read a YAML file. `overrides` are "key=value" texts that replace its values.
 
         Raises:
-            FormatError: the file is no table of settings, or holds one that there is not.
-            ArgumentError: an override is none, or a value makes no sense.
+            FormatError: the file does not hold settings.
+            ArgumentError: an override is not "key=value", a key does not exist, or a value is wrong.
         """
         yaml = import_extra("yaml", "torch")
         try:
             values = yaml.safe_load(path.read_text())
         except (OSError, yaml.YAMLError) as error:
-            raise FormatError(
-                f"{path}: expected a YAML file of settings, found something else: {error}".replace("\n", " ")
-            ) from error
+            raise FormatError(path, expected="a YAML file of settings", found=f"something else ({error})") from error
         if not isinstance(values, Mapping):
             raise FormatError(path, expected="settings as `key: value` lines", found=f"{type(values).__name__}")
         settings: dict[str, Any] = dict(values)
         for text in overrides:
             key, equals, value = text.partition("=")
             if not equals:
-                raise ArgumentError("--set", expected="key=value", found=f"{text!r}")
+                raise ArgumentError("--set", expected="key=value", found=repr(text))
             settings[key] = yaml.safe_load(value)
         names = [field.name for field in dataclasses.fields(cls)]
         if unknown := set(settings) - set(names):
-            raise ArgumentError(path, expected=f"some of {', '.join(names)}", found=f"{', '.join(sorted(unknown))}")
+            raise ArgumentError(path, expected=f"some of {', '.join(names)}", found=", ".join(sorted(unknown)))
         if "network" not in settings:
             raise FormatError(path, expected="the key network", found="none")
         return cls(**settings)

@@ -1,4 +1,4 @@
-"""Data sets and loaders of a run: which samples, in which order, flipped how; and the weights of the classes."""
+"""Data sets and loaders of a run, and the class weights of the loss."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler, Subset
 
 from carlasc import Dataset, Flip
-from carlasc.core.classes import class_weights as weights_of
-from carlasc.core.tables import REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
+from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
+from carlasc.core import class_weights as weights_of
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics import semantickitti
 from completion.config import Config
@@ -25,7 +25,7 @@ Sample = dict[str, Any]
 
 
 class ShuffleHistory:
-    """Puts the past scans of a stack in random order; the newest stays last. The order follows from the seed and the frame."""
+    """Puts the past scans of a stack in random order; the newest stays last. The order depends on the seed and the frame."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -38,7 +38,7 @@ class ShuffleHistory:
 
 
 class SemanticKittiRule:
-    """Takes raw SemanticKITTI ids to the benchmark's classes, and voxels of classes that it ignores out of what is known."""
+    """Maps SemanticKITTI's ids to the classes of the benchmark, and marks voxels of ignored classes as unknown."""
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample in the benchmark's classes."""
@@ -62,41 +62,41 @@ class Compose:
         return sample
 
     def set_epoch(self, epoch: int) -> None:
-        """Tell those that draw anew each epoch."""
+        """Pass the epoch to the transforms that use it."""
         for transform in self.transforms:
             if hasattr(transform, "set_epoch"):
                 transform.set_epoch(epoch)
 
 
-def open_split(root: str | Path, split: str | list[str], config: Config, *, training: bool = False) -> Dataset:
-    """Open a split of a data set as `config` says.
+def open_split(source: str | Path, split: str | list[str], config: Config, *, training: bool = False) -> Dataset:
+    """Open a split of a data set with the settings of a run.
 
     Raises:
-        MissingDataError: there is no such split, or no frame in it.
+        MissingDataError: the split does not exist, or has no frame.
         ArgumentError: the history is longer than every sequence.
     """
     kitti = config.remap == "semantickitti19"
     remap = None if kitti else config.remap
     try:
-        data = Dataset(root, split, history=config.history, grid=config.grid, remap=remap, align=config.align)
+        data = Dataset(source, split, history=config.history, grid=config.grid, remap=remap, align=config.align)
     except MissingDataError as error:
-        raise MissingDataError(f"split {split!r}: {error}") from error
+        raise error.within(f"split {split!r}") from error
     frames = {sequence.location: len(sequence.scan_frames()) for sequence in data.sequences}
     longest = max(frames, key=lambda location: frames[location])
     if config.history > frames[longest]:
         raise ArgumentError(
             "history",
             expected=f"at most the {frames[longest]} frames of {longest} (the longest sequence)",
-            found=f"{config.history}",
+            found=str(config.history),
         )
     transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history else []
     if kitti:
         if data.classes is not SEMANTICKITTI:
             raise ArgumentError(
-                "remap semantickitti19",
-                expected="SemanticKITTI's ids",
-                found=f"{data.classes.name}",
-                advice="take carlasc11",
+                "remap",
+                expected=f"one for data with the classes {data.classes.name}",
+                found=config.remap,
+                advice="set remap=carlasc11 for CarlaSC's classes",
             )
         data.classes = SEMANTICKITTI19
         transforms.append(SemanticKittiRule())
@@ -107,23 +107,23 @@ def open_split(root: str | Path, split: str | list[str], config: Config, *, trai
 
 
 class TrainLoader:
-    """Batches of the training split: another order and other flips each epoch, the same for the same seed and epoch.
+    """Batches of the training split. Order and flips differ between epochs, and depend only on the seed and the epoch.
 
     Args:
         data: the split.
         config: batch size (over all processes), workers, seed.
         rank: of this process.
-        world: number of processes; each takes every world-th sample.
+        world: number of processes; each takes every `world`-th sample.
     """
 
     def __init__(self, data: Dataset, config: Config, rank: int = 0, world: int = 1) -> None:
         if config.batch_size % world:
             raise ArgumentError(
-                "batch_size", expected=f"a multiple of the {world} processes", found=f"{config.batch_size}"
+                "batch_size", expected=f"a multiple of the {world} processes", found=str(config.batch_size)
             )
         if len(data) < world:
             raise ArgumentError(
-                "training split", expected=f"a sample for each of the {world} processes", found=f"{len(data)}"
+                "training split", expected=f"a sample for each of the {world} processes", found=str(len(data))
             )
         self.data = data
         self.sampler: DistributedSampler[Sample] = DistributedSampler(data, world, rank, shuffle=True, seed=config.seed)
@@ -141,7 +141,7 @@ class TrainLoader:
 
 
 def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Sample]:
-    """Return a loader of each sample once, in order; each process takes every world-th one."""
+    """Return a loader that gives each sample once, in order. Each process takes every `world`-th sample."""
     mine: Any = data if world == 1 else Subset(data, range(rank, len(data), world))
     return _loader(mine, config, max(1, config.batch_size // world))
 
@@ -164,11 +164,11 @@ def to_device(batch: Sample, device: torch.device) -> tuple[Tensor, Tensor]:
     return occupancy, labels.masked_fill(~batch["known"].to(device, non_blocking=True), IGNORE)
 
 
-def class_weights(root: str | Path, data: Dataset, config: Config) -> NDArray[np.float32]:
-    """Return the (K,) weights of the loss for the training split `data` of `root`.
+def class_weights(source: str | Path, data: Dataset, config: Config) -> NDArray[np.float32]:
+    """Return the (K,) class weights of the loss for the training split `data` of `source`.
 
     Raises:
-        ArgumentError: the published counts are asked for, but the classes are not CarlaSC's.
+        ArgumentError: the published counts are used, but the classes are not CarlaSC's.
         FormatError: the file of `carlasc stats` does not hold counts.
     """
     num_classes = max(data.classes.names) + 1
@@ -176,21 +176,25 @@ def class_weights(root: str | Path, data: Dataset, config: Config) -> NDArray[np
     if config.class_weights == "none":
         return np.ones(num_classes, np.float32)
     if config.class_weights == "train":
-        weights = weights_of(_count_voxels(root, config, num_classes))
+        weights = weights_of(_count_voxels(source, config, num_classes))
     elif config.class_weights == "table":
-        if (found := data.sequences[0].metadata.classes.name) != "carla":
-            raise ArgumentError(f"class_weights: the table is of CARLA's classes, found data of {found}: take `train`")
+        if (found := data.sequences[0].metadata.classes.name) != CARLA.name:
+            raise ArgumentError(
+                "class_weights",
+                expected=f"train for data with the classes {found}",
+                found="table, which is for CarlaSC's",
+            )
         weights = weights_of(TRAIN_VOXEL_COUNTS, remap)
     else:
         weights = _read_weights(Path(config.class_weights), data)
     if len(weights) != num_classes:
-        raise FormatError("class weights", expected=f"{num_classes} of them", found=f"{len(weights)}")
+        raise FormatError("class weights", expected=str(num_classes), found=str(len(weights)))
     return weights.astype(np.float32)
 
 
-def _count_voxels(root: str | Path, config: Config, num_classes: int) -> NDArray[np.int64]:
+def _count_voxels(source: str | Path, config: Config, num_classes: int) -> NDArray[np.int64]:
     """Count the known voxels of each class over the training split."""
-    data = open_split(root, config.train, replace(config, history=1, shuffle_history=False))
+    data = open_split(source, config.train, replace(config, history=1, shuffle_history=False))
     counts = np.zeros(num_classes, np.int64)
     for index in range(len(data)):
         sample = data[index]
@@ -199,7 +203,7 @@ def _count_voxels(root: str | Path, config: Config, num_classes: int) -> NDArray
 
 
 def _read_weights(path: Path, data: Dataset) -> NDArray[np.float64]:
-    """Read the weights that `carlasc stats --json` printed into a file."""
+    """Read the class weights from a file with the output of `carlasc stats --json`."""
     try:
         named = json.loads(path.read_text())["class_weights"]
         weights = np.zeros(max(data.classes.names) + 1)
@@ -208,8 +212,7 @@ def _read_weights(path: Path, data: Dataset) -> NDArray[np.float64]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError(
             path,
-            expected=f"what `carlasc stats --json` prints, with a weight for each class of {data.classes.name}",
-            found="something else",
-            advice=f"{error}",
+            expected=f"the output of `carlasc stats --json`, with a weight for each class of {data.classes.name}",
+            found=f"something else ({error})",
         ) from error
     return weights

@@ -1,4 +1,4 @@
-"""Networks made fast for inference: one call from occupancy to labels, compiled with the weights as constants."""
+"""Networks for inference: one call from occupancy to labels, compiled with the weights as constants."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Mode = Literal["eager", "compile"]
 
 
 class Completer(nn.Module):
-    """A network with what stands around it at inference: occupancy goes in as bytes, classes come out as bytes.
+    """A network from occupancy as bytes to classes as bytes.
 
     Args:
         network: in eval mode.
-        dtype: what the network computes in.
+        dtype: the type in which the network computes.
     """
 
     def __init__(self, network: nn.Module, dtype: torch.dtype = torch.float32) -> None:
@@ -37,9 +37,9 @@ class Completer(nn.Module):
 
 
 class Compiled:
-    """A module compiled with its weights frozen into the code, one program a shape of input.
+    """A module that is compiled with its weights as constants, once per shape of input.
 
-    Batch norms fold into convolutions, and weights are laid out for the processor once: on a CPU that is nearly all of the gain.
+    Batch norms are folded into convolutions, and the weights are laid out for the processor once. On a CPU this is most of the gain.
     """
 
     def __init__(self, module: nn.Module, cudagraphs: bool = False) -> None:
@@ -52,7 +52,7 @@ class Compiled:
         with torch.no_grad():
             if occupancy.shape in self._shapes:
                 return self._program(occupancy)
-            with inductor.patch(self._settings):  # read while compiling, here, not when the program is made
+            with inductor.patch(self._settings):  # the first call compiles, and reads these settings
                 labels: Tensor = self._program(occupancy)
         self._shapes.add(occupancy.shape)
         return labels
@@ -61,24 +61,24 @@ class Compiled:
 def prepare(
     network: nn.Module, device: torch.device, mode: Mode = "compile", *, bf16: bool | None = None
 ) -> Callable[[Tensor], Tensor]:
-    """Make a network ready for inference.
+    """Prepare a network for inference.
 
     Args:
-        network: is put into eval mode, moved, and, for bf16, converted in place.
-        device: what to compute on.
-        mode: "eager" runs it as it stands; "compile" compiles it at the first call (a minute or so) and is several times faster then. On CUDA
-            the compiled program is replayed as a CUDA graph, with channels last.
-        bf16: compute in bfloat16; None does so on CUDA in the mode "compile".
+        network: the network. It is put into eval mode, moved to the device and, for bf16, converted, all in place.
+        device: the device that computes.
+        mode: "eager" runs the network without compiling; "compile" compiles it at the first call, which takes about a minute, and is
+            several times faster afterwards. On CUDA the program is replayed as a CUDA graph, with channels last.
+        bf16: compute in bfloat16; None does so on CUDA with "compile".
 
     Returns:
         A function from (B, T, X, Y, Z) occupancy, uint8 or float, on the device, to (B, X, Y, Z) uint8 labels.
 
     Raises:
-        DependencyError: there is no C++ compiler for torch.compile.
-        ArgumentError: there is no such mode.
+        DependencyError: torch.compile needs a C++ compiler, and none is installed.
+        ArgumentError: `mode` has another value.
     """
     if mode not in ("eager", "compile"):
-        raise ArgumentError("mode", expected="eager or compile", found=f"{mode!r}")
+        raise ArgumentError("mode", expected="eager or compile", found=repr(mode))
     if bf16 is None:
         bf16 = mode == "compile" and device.type == "cuda"
     dtype = torch.bfloat16 if bf16 else torch.float32
@@ -93,9 +93,12 @@ def prepare(
 
 
 def check_compiler(device: torch.device) -> None:
-    """Raise DependencyError where torch.compile would not find the compiler that it needs."""
+    """Raise DependencyError if torch.compile will not find the C++ compiler that it needs."""
     names = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
     if device.type == "cpu" and sys.platform != "win32" and not any(shutil.which(name) for name in names):
         raise DependencyError(
-            f"torch.compile needs a C++ compiler, and there is no {' or '.join(names)}: install one (Debian: apt install g++), or run eagerly"
+            "torch.compile",
+            expected="a C++ compiler",
+            found=f"no {' or '.join(names)}",
+            advice="install one (Debian: apt install g++), or run eagerly",
         )

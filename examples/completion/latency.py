@@ -16,22 +16,22 @@ from carlasc import GridSpec
 from completion.inference import Mode, prepare
 from completion.networks import build_network
 
-_STACKS = 8  # a million voxels of the published grid
+_STACKS = 8  # together a million voxels of the published grid
 
 
 @dataclass(frozen=True)
 class Latency:
-    """What a network takes for one frame, from occupancy to labels.
+    """Time and memory of a network for one frame, from occupancy to labels.
 
     Attributes:
-        network: its name.
+        network: name of the network.
         history: T.
         mode: "eager" or "compile".
-        median_ms: of the repetitions.
-        fastest_ms: of the repetitions; on a machine that does other work, too, the better figure for ratios.
-        memory_mb: peak of the GPU's memory, or of the whole process on a CPU.
-        speedup: against the first mode of the same run (eager float32), fastest against fastest.
-        differing: voxels in a million whose label is not the first mode's.
+        median_ms: median time of the repetitions.
+        fastest_ms: shortest time of the repetitions; more reliable for ratios if the machine does other work at the same time.
+        memory_mb: peak memory of the GPU, or of the whole process on a CPU.
+        speedup: shortest time of the first mode of the same run (eager float32), divided by this mode's.
+        differing: number of voxels per million whose label differs from the first mode's.
     """
 
     network: str
@@ -54,9 +54,10 @@ def measure_network(
     repetitions: int = 100,
     modes: Sequence[Mode] = ("eager", "compile"),
 ) -> list[Latency]:
-    """Measure a network in one mode after the other; speed and labels are compared with the first.
+    """Measure a network in several modes. Speed and labels are compared with those of the first mode.
 
-    Weights are random: they do not change the time. Occupancy is as dense as a scan's: 1 voxel in 20. Labels are compared on `_STACKS` stacks.
+    Weights are random, because they do not change the time. Occupancy is as dense as that of a scan: 1 voxel in 20. Labels are
+    compared on `_STACKS` stacks.
     """
     rng = np.random.default_rng(0)
     stacks = torch.from_numpy((rng.random((_STACKS, 1, history, *spec.size)) < 0.05).astype(np.uint8)).to(device)
@@ -89,7 +90,7 @@ def measure_network(
 
 
 def randomise(network: nn.Module) -> nn.Module:
-    """Give batch norms the statistics of random features, so that logits spread and no two classes tie."""
+    """Give batch norms the statistics of random features, so that logits differ and no two classes are equal."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
             for tensor, spread in ((module.running_mean, 0.1), (module.running_var, 0.3)):
@@ -99,7 +100,7 @@ def randomise(network: nn.Module) -> nn.Module:
 
 
 def _time_ms(run: Callable[[torch.Tensor], torch.Tensor], occupancy: torch.Tensor, device: torch.device) -> float:
-    """Time a call. One thread on a CPU is timed in processor time, which other work on the machine does not stretch."""
+    """Return the time of a call. With one thread on a CPU it is processor time, which other work on the machine does not change."""
     clock = time.process_time if device.type == "cpu" and torch.get_num_threads() == 1 else time.perf_counter
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""The loss: weighted cross-entropy over known voxels, at every scale that a network gives."""
+"""The loss: weighted cross-entropy over known voxels, at every scale of a network's output."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy, one_hot
 
-IGNORE = 255  # a label that takes no part
+IGNORE = 255  # label of voxels that are left out
 FREE = 0
 
 
 def completion_loss(outputs: Tensor | Sequence[Tensor], target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weighted sums of the cross-entropy and the sums of the weights, one of each a scale.
+    """Return the weighted sum of the cross-entropy, and the sum of the weights, at each scale.
 
-    The loss is the mean over the scales of their quotients. Several processes add up their weights before they divide: each then has
-    its share of the loss of the whole batch.
+    The loss is the mean over the scales of sum / weight. Several processes add up their weights before they divide, which gives each
+    process its part of the loss of the whole batch.
 
     Args:
         outputs: (B, X, Y, Z, K) logits, or a list of them at 1/1, 1/2, 1/4, ... of the scale.
-        target: (B, X, Y, Z) int64 labels, `IGNORE` where a voxel takes no part.
+        target: (B, X, Y, Z) int64 labels, `IGNORE` for voxels that are left out.
         class_weights: (K,) float32.
 
     Returns:
@@ -38,13 +38,13 @@ def completion_loss(outputs: Tensor | Sequence[Tensor], target: Tensor, class_we
 
 
 def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
-    """Return labels over blocks: the most frequent occupied class, else free if any voxel is known free, else `IGNORE`.
+    """Return one label per block: the most frequent occupied class, else free if any voxel is free, else `IGNORE`.
 
-    A tie goes to the lowest class.
+    If two classes are equally frequent, the lower id is taken.
 
     Args:
         target: (B, X, Y, Z) int64; X, Y and Z multiples of `block`.
-        block: voxels an axis.
+        block: voxels per axis of a block.
         num_classes: K.
 
     Returns:
@@ -65,7 +65,7 @@ def balance_free(target: Tensor, ratio: float, generator: torch.Generator) -> Te
     Args:
         target: (B, X, Y, Z) int64 labels.
         ratio: free voxels for each occupied one.
-        generator: on the target's device.
+        generator: random generator on the target's device.
 
     Returns:
         The target with the other free voxels set to `IGNORE`.

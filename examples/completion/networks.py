@@ -28,27 +28,27 @@ def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1)
     Args:
         name: one of `completion.config.NETWORKS`.
         num_classes: K.
-        spec: the grid that it is fed and predicts.
+        spec: the grid of its input and output.
         history: T, scans in a stack.
 
     Raises:
-        ArgumentError: there is no such network, or the grid's cells do not divide as it needs.
+        ArgumentError: no network has that name, or the size of the grid is not a multiple of what it needs.
     """
     if name not in _BUILDERS:
-        raise ArgumentError("network", expected=f"one of {', '.join(_BUILDERS)}", found=f"{name!r}")
+        raise ArgumentError("network", expected=f"one of {', '.join(_BUILDERS)}", found=repr(name))
     if history > 1 and name != "motionsc":
-        raise ArgumentError("history", expected=f"1 for {name}", found=f"{history}", advice="only motionsc takes more")
+        raise ArgumentError("history", expected=f"1 for {name}", found=str(history), advice="only motionsc takes more")
     network = _BUILDERS[name](num_classes, spec.size[2], history)
     check_size(network, name, spec.size)
     return network
 
 
 def check_size(network: nn.Module, name: str, size: tuple[int, int, int]) -> None:
-    """Raise ArgumentError where a grid of `size` cannot be halved as often as the network does."""
+    """Raise ArgumentError if `size` is not a multiple of the network's `divisors`."""
     divisors: Any = network.divisors
     if any(cells % divisor for cells, divisor in zip(size, divisors, strict=True)):
         raise ArgumentError(
             name,
             expected=f"a grid of multiples of {' x '.join(map(str, divisors))} cells",
-            found=f"{' x '.join(map(str, size))}",
+            found=" x ".join(map(str, size)),
         )

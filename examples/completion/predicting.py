@@ -1,4 +1,4 @@
-"""Completing every frame of a data set, or a folder of raw scans, into `.label` grids of the layout."""
+"""Completion of every frame of a data set, or of a folder of raw scans. The results are `.label` grids of the CarlaSC layout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from carlasc import ClassTable, Dataset, GridSpec
-from carlasc.core.tables import CARLASC11, SEMANTICKITTI19
+from carlasc.core import CARLASC11, SEMANTICKITTI19, FrameRange, Frames
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Metadata, layout
 from carlasc.storage.folders.folder import FolderWriter
@@ -29,14 +29,14 @@ _TABLES = {len(table.names): table for table in (CARLASC11, SEMANTICKITTI19)}
 
 @dataclass(frozen=True)
 class Model:
-    """Weights together with what they are of.
+    """Weights, with the network and the classes that they belong to.
 
     Attributes:
         network: name of the network.
-        history: T, scans it wants.
+        history: T, number of scans that it takes.
         classes: table of the ids it predicts.
-        state: its state dict.
-        where: the file.
+        state: the state dict.
+        where: the file, for error messages.
     """
 
     network: str
@@ -47,16 +47,18 @@ class Model:
 
     @classmethod
     def read(cls, path: Path, history: int | None = None) -> Model:
-        """Read weights, and find out which network they are of; a run's config.yaml beside them says how many scans it wants.
+        """Read weights, and find out which network they belong to.
+
+        `history` is read from a config.yaml beside the weights if it is None.
 
         Raises:
-            FormatError: they are of no network of ours, or of an unknown set of classes.
+            FormatError: they belong to none of our networks, or to an unknown number of classes.
         """
         state = read_weights(path)
         name, num_classes = identify(state, str(path))
         if num_classes not in _TABLES:
             raise FormatError(
-                path, expected="weights for 11 classes (CarlaSC) or 20 (SemanticKITTI)", found=f"{num_classes}"
+                path, expected="weights for 11 classes (CarlaSC) or 20 (SemanticKITTI)", found=str(num_classes)
             )
         if history is None:
             settings = path.parent / "config.yaml"
@@ -67,7 +69,7 @@ class Model:
         """Return a function from a (T, X, Y, Z) stack to (X, Y, Z) labels.
 
         Raises:
-            FormatError: the weights are of another grid, number of classes or history; names the layer and both shapes.
+            FormatError: the weights are for another grid, number of classes or history; names the layer and both shapes.
         """
         network = build_network(self.network, len(self.classes.names), spec, self.history)
         load_weights(network, self.state, self.where)
@@ -82,49 +84,44 @@ class Model:
 
 def predict_dataset(
     model: Model,
-    root: str,
+    source: str,
     out: Path | None,
     device: torch.device,
     mode: Mode,
     *,
     split: str | list[str] | None = None,
     grid: str | GridSpec = layout.EVALUATION,
-    frames: tuple[int | None, int | None] | None = None,
+    frames: Frames = None,
     name: str = "completion",
     progress: Progress | None = None,
 ) -> int:
-    """Complete frames of a data set; those that are there already are left as they are.
+    """Complete frames of a data set. Frames whose grid exists already are skipped.
 
     Args:
         model: the weights.
-        root: the data; it needs scans, and for `grid` a params.json or a geometry.
-        out: where grids go, as the grid `evaluation` of sequences with the model's classes. None: beside the data, as the grid `name`.
-        device: what to compute on.
+        source: the data. They need scans, and the grid `grid` unless this is a GridSpec.
+        out: where grids are written, as the grid `evaluation` of sequences with the model's classes. None: into the data, as the grid `name`.
+        device: the device that computes.
         mode: "eager" or "compile".
-        split: a split, names of sequences, or all.
-        grid: whose geometry is predicted.
-        frames: (first, last + 1), None at an open end.
-        name: the grid's folder beside the data.
+        split: a split, or names of sequences; None takes all.
+        grid: the grid whose geometry is predicted.
+        frames: range of frame numbers.
+        name: folder of the grid in the data.
         progress: called with (done, total).
 
     Returns:
-        How many frames were completed.
+        The number of frames that were completed.
 
     Raises:
-        ArgumentError: the data are no folder that could take grids.
-        ConflictError: the grid is there, and of something else.
+        ArgumentError: `out` is None and the data are not a folder.
+        ConflictError: the grid exists, and was made by another network or on another grid.
     """
-    data = Dataset(root, split, history=model.history, grid=grid, fields=("occupancy",), remap=None)
-    if out is None and not Path(root).is_dir():
-        raise ArgumentError(
-            root, expected="a folder to write beside the data", found="none", advice="say where to write"
-        )
-    first, stop = frames or (None, None)
+    data = Dataset(source, split, history=model.history, grid=grid, fields=("occupancy",), remap=None)
+    if out is None and not Path(source).is_dir():
+        raise ArgumentError("out", expected=f"a folder to write to, because {source} is not one", found="none")
+    chosen = FrameRange.of(frames)
     jobs = [
-        (sequence, frame)
-        for sequence in data.sequences
-        for frame in sequence.frames("points").tolist()
-        if (first is None or frame >= first) and (stop is None or frame < stop)
+        (sequence, frame) for sequence in data.sequences for frame in chosen.select(sequence.frames("points")).tolist()
     ]
     complete = model.complete_on(data.spec, device, mode)
     folder = layout.EVALUATION if out else name
@@ -132,8 +129,8 @@ def predict_dataset(
     made = 0
     for done, (sequence, frame) in enumerate(jobs, 1):
         if sequence.path not in writers:
-            writers[sequence.path] = _begin(
-                out or Path(root), sequence.path, folder, data.spec, model, beside=out is None
+            writers[sequence.path] = _open_writer(
+                out or Path(source), sequence.path, folder, data.spec, model, beside=out is None
             )
         writer = writers[sequence.path]
         if not writer.has(f"{folder}/labels", frame):
@@ -159,35 +156,35 @@ def predict_scans(
     """Complete a folder of raw `.bin` scans (float32 x, y, z and a 4th value), one by one.
 
     Args:
-        model: the weights, of single scans.
-        folder: the scans; numbered in the order of their names, unless these are frame numbers.
-        out: takes the grids, as the grid `evaluation` of one sequence.
-        device: what to compute on.
+        model: the weights, for single scans.
+        folder: the scans. Their names are frame numbers; if not, they are numbered in the order of their names.
+        out: where grids are written, as the grid `evaluation` of one sequence.
+        device: the device that computes.
         mode: "eager" or "compile".
         spec: the grid to predict, in the sensor's frame.
-        right_handed: y is left (KITTI, nuScenes): scans are mirrored into CarlaSC's frame, and grids are in that frame.
+        right_handed: y is to the left (KITTI, nuScenes): scans are mirrored into CarlaSC's axes, and grids are in these axes.
         progress: called with (done, total).
 
     Returns:
-        How many scans were completed.
+        The number of scans that were completed.
 
     Raises:
-        ArgumentError: the weights want more than one scan.
-        MissingDataError: there are no scans.
+        ArgumentError: the network takes more than one scan.
+        MissingDataError: the folder has no scans.
     """
     if model.history > 1:
         raise ArgumentError(
             "history",
             expected="1 for scans without poses",
-            found=f"{model.history}",
-            advice="give a data set of the layout",
+            found=str(model.history),
+            advice="give a data set in the CarlaSC layout",
         )
     files = sorted(folder.glob("*.bin"))
     if not files:
         raise MissingDataError(folder, expected=".bin scans", found="none")
     numbers = [layout.frame_of(file.name, ".bin") for file in files]
     complete = model.complete_on(spec, device, mode)
-    writer = _begin(out, "cartesian", layout.EVALUATION, spec, model, beside=False)
+    writer = _open_writer(out, "cartesian", layout.EVALUATION, spec, model, beside=False)
     for done, (file, number) in enumerate(zip(files, numbers, strict=True), 1):
         points = layout.field_named("points").decode(file.read_bytes(), str(file))[:, :3]
         if right_handed:
@@ -202,13 +199,13 @@ def predict_scans(
     return len(files)
 
 
-def _begin(out: Path, path: str, grid: str, spec: GridSpec, model: Model, *, beside: bool) -> FolderWriter:
-    """Start a sequence's predictions: their geometry, and which classes they are of."""
+def _open_writer(out: Path, path: str, grid: str, spec: GridSpec, model: Model, *, beside: bool) -> FolderWriter:
+    """Write the geometry and the classes of a sequence's predictions, and return its writer."""
     writer = FolderSink(out).sequence(path)
     record = {"classes": model.classes.name, "network": model.network, "history": model.history}
     params = spec.to_params(len(model.classes.names)) | {"carlasc": record}
-    there = writer.read_document(layout.params_file(grid))
-    if there is not None and json.loads(there) != params:
+    existing = writer.read_document(layout.params_file(grid))
+    if existing is not None and json.loads(existing) != params:
         raise ConflictError(
             f"{writer.location}/{layout.params_file(grid)}",
             expected=f"predictions of {model.network} on this grid",

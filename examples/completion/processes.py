@@ -1,4 +1,4 @@
-"""One process or several: what torchrun tells, and the few words that processes exchange."""
+"""One or more training processes, and what they exchange."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Processes:
-    """Who we are among the processes of a run.
+    """The processes of a run, as one of them sees them.
 
     Attributes:
         rank: number of this process.
-        world: how many there are.
-        device: what this one computes on.
+        world: number of processes.
+        device: the device of this process.
     """
 
     rank: int
@@ -33,30 +33,30 @@ class Processes:
         return self.rank == 0
 
     def sum(self, value: Tensor) -> Tensor:
-        """Return the sum of every process's tensor."""
+        """Return the sum of the tensors of all processes."""
         if self.world > 1:
             value = value.clone()
             dist.all_reduce(value)
         return value
 
     def share(self, tensors: Iterable[Tensor]) -> None:
-        """Give every process the first one's values: each has seen other batches, and so has other means in its batch norms."""
+        """Copy the tensors of the first process to all others: the statistics of batch norms differ, because each process has seen other batches."""
         if self.world > 1:
             for tensor in tensors:
                 dist.broadcast(tensor, 0)
 
     def wait(self) -> None:
-        """Wait until every process is here."""
+        """Wait until every process has reached this call."""
         if self.world > 1:
             dist.barrier()
 
 
 @contextmanager
 def join_processes(device: str = "auto") -> Iterator[Processes]:
-    """Join the processes that `torchrun` started; without it there is just this one.
+    """Join the processes that `torchrun` started; without it, this is the only process.
 
     Args:
-        device: "cuda", "cpu", or "auto": a GPU where there is one. Under torchrun each process takes its own GPU.
+        device: "cuda", "cpu", or "auto": a GPU if one is available. Under torchrun, each process uses its own GPU.
     """
     name = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     world, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))

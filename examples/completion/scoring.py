@@ -1,4 +1,4 @@
-"""Scoring a network on a split."""
+"""The score of a network on a split."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from completion.processes import Processes
 def score(
     network: nn.Module, loader: DataLoader[dict[str, Any]], num_classes: int, processes: Processes, bf16: bool = False
 ) -> ConfusionMatrix:
-    """Return the confusion of a network's predictions over the known voxels of every process's share of a split."""
+    """Return the confusion matrix of a network over the known voxels of a split, summed over all processes."""
     network.eval()
     matrix = ConfusionMatrix(num_classes)
     for batch in loader:

@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a run: curves, and pictures of predictions beside the truth."""
+"""Curves, and pictures of predictions beside the truth, for TensorBoard."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from carlasc.errors import import_extra
 from carlasc.metrics import ConfusionMatrix
 from completion.scoring import predict
 
-_PICTURES = 3  # frames shown, spread over the split
+_PICTURES = 3  # number of frames, spread over the split
 
 
 class Board:
-    """Writes TensorBoard's files; does nothing where it is not enabled."""
+    """Writes TensorBoard's files; does nothing if it is not enabled."""
 
     def __init__(self, folder: Path, classes: ClassTable, *, enabled: bool = True) -> None:
         self.classes = classes
@@ -64,7 +64,7 @@ class Board:
 
 
 def view_from_above(labels: NDArray[Any], classes: ClassTable) -> NDArray[np.uint8]:
-    """Return an (X, Y, 3) picture of (X, Y, Z) labels: the colour of the highest occupied voxel, white where there is none.
+    """Return an (X, Y, 3) picture of (X, Y, Z) labels: the colour of the highest occupied voxel, white if there is none.
 
     Forward (x) is up.
     """

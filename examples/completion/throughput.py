@@ -1,4 +1,4 @@
-"""How many training samples a second the loader gives, and how many the network takes: which one waits for the other."""
+"""Training samples per second of the loader and of the network: the slower one limits the training."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from completion.networks import build_network
 
 @dataclass(frozen=True)
 class Throughput:
-    """Samples a second.
+    """Samples per second.
 
     Attributes:
-        loader: of the loader alone, nothing done with the batches.
-        network: of forward, loss, backward and step on one batch that is there already.
+        loader: of the loader alone.
+        network: of forward, loss, backward and step on one batch in memory.
     """
 
     loader: float
     network: float
 
 
-def measure_throughput(root: str | Path, config: Config, device: torch.device, batches: int = 20) -> Throughput:
-    """Measure loader and network apart, with the settings of a run; first batches, which start workers and warm up, are not counted."""
-    data = open_split(root, config.train, config, training=True)
+def measure_throughput(source: str | Path, config: Config, device: torch.device, batches: int = 20) -> Throughput:
+    """Measure loader and network separately, with the settings of a run. The first batches, during which workers start, are not counted."""
+    data = open_split(source, config.train, config, training=True)
     loader = TrainLoader(data, config)
     endless = itertools.chain.from_iterable(loader.epoch(number) for number in itertools.count())
-    warm = max(2, 2 * config.workers)  # what workers have ready when the clock starts
+    warm = max(2, 2 * config.workers)  # batches that workers may have prepared before the measurement
     batch = next(itertools.islice(endless, warm, None))
     start = time.perf_counter()
     loaded = sum(len(loaded["frame"]) for loaded in itertools.islice(endless, batches))

@@ -1,4 +1,4 @@
-"""Simulated towns with their ground truth, laid out as a data set."""
+"""Simulated towns with their ground truth, as a data set."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Town:
     """A drive through a town.
 
     Attributes:
-        name: of the sequence; the first frame is put behind it.
+        name: name of the sequence, without the first frame, which is appended.
         split: "Train", "Val" or "Test".
-        seed: town, traffic, sensors and noise are drawn from it.
+        seed: seed of town, traffic, sensors and noise.
         traffic: "light", "medium" or "heavy".
-        first_frame: where the drive is joined; it starts, at rest, with frame 0.
+        first_frame: first frame of the drive that is used. The drive starts at rest with frame 0.
     """
 
     name: str
@@ -44,17 +44,17 @@ def build_towns(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Simulate each town and make its ground truth; what is there already is left as it is.
+    """Simulate each town and make its ground truth. Frames that exist are skipped.
 
     Args:
         out: root of the data set.
-        towns: what to simulate.
-        frames: of each, 0.1 s apart.
-        sensors: LiDARs a frame, the ego one among them.
-        points: rays a scan.
+        towns: the towns.
+        frames: number of frames of each town, 0.1 s apart.
+        sensors: number of LiDARs per frame, the ego LiDAR included.
+        points: number of rays per scan.
         spec: the grid; the published one if None.
-        workers: processes side by side; all cores if None.
-        progress: called with (towns done, towns).
+        workers: number of processes; None uses all cores.
+        progress: called with the number of finished towns and the number of all towns.
     """
     for done, town in enumerate(towns, 1):
         folder = out / town.path

@@ -1,4 +1,4 @@
-"""The training loop: epochs of steps, a score after each, the best kept, and a checkpoint to go on from."""
+"""The training loop: after each epoch a score, the best weights so far, and a checkpoint."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ LAST, BEST, CONFIG = "last.pt", "best.safetensors", "config.yaml"
 
 @dataclass
 class Progress:
-    """How far a run is.
+    """The state of a run.
 
     Attributes:
-        epoch: epochs done.
-        best_epoch: the one whose weights are kept, counted from 1; 0 before the first.
+        epoch: number of finished epochs.
+        best_epoch: the epoch with the best weights, counted from 1; 0 before the first.
         best_miou: its mIoU on the validation split.
         losses: mean training loss of each epoch.
-        mious: mIoU on the validation split after each.
-        samples_per_s: training samples a second of each epoch.
+        mious: mIoU on the validation split after each epoch.
+        samples_per_s: training samples per second in each epoch.
     """
 
     epoch: int = 0
@@ -50,32 +50,32 @@ class Progress:
     samples_per_s: list[float] = field(default_factory=list)
 
     def is_over(self, config: Config) -> bool:
-        """Whether all epochs are done, or none got better for too long."""
+        """Whether all epochs are done, or the score has not improved for `patience` epochs."""
         stalled = config.patience is not None and self.epoch - self.best_epoch >= config.patience
         return self.epoch >= config.epochs or stalled
 
 
-def train(root: str | Path, config: Config, out: Path, processes: Processes, *, resume: bool = False) -> Progress:
+def train(source: str | Path, config: Config, out: Path, processes: Processes, *, resume: bool = False) -> Progress:
     """Train a network on a data set.
 
-    Writes to `out`: config.yaml, last.pt (to go on from), best.safetensors (the weights of the best epoch by mIoU) and TensorBoard's files.
+    Writes to `out`: config.yaml, last.pt (to continue from), best.safetensors (the weights of the best epoch by mIoU) and TensorBoard's files.
 
     Args:
-        root: the data, anything that `carlasc.open` takes.
+        source: the data, anything that `carlasc.open` takes.
         config: the settings.
         out: folder of the run.
-        processes: which process this is of how many.
-        resume: go on from last.pt; the result is that of a run that was never stopped.
+        processes: the processes of the run, and which one this is.
+        resume: continue from last.pt; the result is that of a run without interruption.
 
     Raises:
-        CarlascError: a split is empty, a loss is no number, memory is short, or `out` holds another run; one line each.
+        CarlascError: a split is empty, the loss is not finite, memory does not suffice, or `out` holds another run.
     """
-    data = open_split(root, config.train, config, training=True)
+    data = open_split(source, config.train, config, training=True)
     loader = TrainLoader(data, config, processes.rank, processes.world)
-    val = open_split(root, config.val, config)
+    val = open_split(source, config.val, config)
     val_loader = eval_loader(val, config, processes.rank, processes.world)
     num_classes = max(data.classes.names) + 1
-    weights = torch.from_numpy(class_weights(root, data, config)).to(processes.device)
+    weights = torch.from_numpy(class_weights(source, data, config)).to(processes.device)
 
     torch.manual_seed(config.seed)
     network = build_network(config.network, num_classes, data.spec, config.history).to(processes.device)
@@ -119,7 +119,7 @@ def _begin(out: Path, config: Config, processes: Processes) -> Progress:
             out / LAST,
             expected="no earlier run",
             found="one",
-            advice="go on with it (--resume), or choose another folder",
+            advice="continue it with `resume=True` (`--resume`), or choose another folder",
         )
     processes.wait()
     if processes.first:
@@ -128,17 +128,16 @@ def _begin(out: Path, config: Config, processes: Processes) -> Progress:
 
 
 def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
-    """Load last.pt; nothing else is remembered, because order, flips and draws follow from seed and epoch."""
+    """Load last.pt. Nothing else is needed, because order, flips and draws depend on the seed and the epoch only."""
     before = Config.read(out / CONFIG) if (out / CONFIG).is_file() else config
     changed = [f.name for f in dataclasses.fields(Config) if getattr(before, f.name) != getattr(config, f.name)]
     if changed := [name for name in changed if name not in ("epochs", "patience", "workers")]:
         raise ConflictError(
             out / CONFIG,
-            expected="the settings of the run to go on with",
-            found="others",
-            advice=f"{', '.join(changed)}",
+            expected="the settings of the run that is resumed",
+            found=f"others: {', '.join(changed)}",
         )
-    read_weights(out / LAST)  # says so if there is none
+    read_weights(out / LAST)  # raises if the file does not exist
     state = read_checkpoint(out / LAST)
     load_weights(parts["network"], state["network"], str(out / LAST))
     for name in ("optimizer", "schedule"):
@@ -166,7 +165,7 @@ def _train_epoch(
     config: Config,
     processes: Processes,
 ) -> float:
-    """Run an epoch's steps; return the mean loss."""
+    """Make the steps of an epoch; return the mean loss."""
     network.train()
     total = 0.0
     for step, batch in enumerate(loader.epoch(epoch)):
@@ -177,13 +176,17 @@ def _train_epoch(
                 raise
             smaller = max(1, config.batch_size // 2)
             raise CarlascError(
-                f"out of memory at batch size {config.batch_size}: try --set batch_size={smaller}"
-                + ("" if config.precision == "bf16" else " or --set precision=bf16")
+                f"batch size {config.batch_size}",
+                problem="out of memory",
+                advice=f"try --set batch_size={smaller}"
+                + ("" if config.precision == "bf16" else " or --set precision=bf16"),
             ) from error
         if not math.isfinite(loss):
             names = ", ".join(f"{s} {int(f)}" for s, f in zip(batch["sequence"], batch["frame"], strict=True))
             raise CarlascError(
-                f"epoch {epoch + 1}, batch {step + 1}: the loss is {loss} (frames {names}): try a smaller learning rate; the last epoch is in {LAST}"
+                f"epoch {epoch + 1}, batch {step + 1}",
+                problem=f"the loss is {loss} (frames {names})",
+                advice=f"try a smaller learning rate; the last finished epoch is in {LAST}",
             )
         total += loss
         if processes.first and sys.stderr.isatty():
@@ -204,7 +207,7 @@ def _train_step(
     config: Config,
     processes: Processes,
 ) -> float:
-    """One step on the loss of the whole batch, all processes' shares together; return that loss."""
+    """Make one step on the loss of the whole batch, summed over the processes; return this loss."""
     occupancy, target = to_device(batch, processes.device)
     if config.free_ratio:
         draw = torch.Generator(processes.device).manual_seed(_mix(config.seed, *place, processes.rank))
@@ -221,7 +224,7 @@ def _train_step(
 
 
 def _mix(*numbers: int) -> int:
-    """One seed of several numbers."""
+    """Return one seed made from several numbers."""
     mixed = 0
     for number in numbers:
         mixed = (mixed * 1_000_003 + number + 1) % (2**63)

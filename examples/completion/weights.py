@@ -1,4 +1,4 @@
-"""Reading and writing weights: state dicts as `.pt` or `.safetensors`. No code in a file is ever run."""
+"""Reading and writing of weights: state dicts as `.pt` or `.safetensors`. Code in a file is never run."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def read_weights(path: Path) -> StateDict:
     """Read a state dict onto the CPU.
 
     Raises:
-        MissingDataError: there is no such file.
-        FormatError: it is no state dict; a pickle that would run code is refused.
+        MissingDataError: the file does not exist.
+        FormatError: it is not a state dict, or a pickle that would run code.
     """
     if not path.is_file():
         raise MissingDataError(path, expected="weights", found="nothing")
@@ -38,12 +38,12 @@ def read_weights(path: Path) -> StateDict:
         try:
             return safetensors.load_file(path, device="cpu")
         except Exception as error:
-            raise FormatError(path, expected="safetensors", found="something else", advice=f"{error}") from error
+            raise FormatError(path, expected="safetensors", found=f"something else ({error})") from error
     state = read_checkpoint(path)
     if "network" in state and "epoch" in state:  # a checkpoint of ours
         state = state["network"]
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
-        raise FormatError(path, expected="a state dict (names to tensors)", found=f"{_describe(state)}")
+        raise FormatError(path, expected="a state dict (names to tensors)", found=_describe(state))
     return state
 
 
@@ -51,14 +51,14 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a dict of tensors and plain values, `weights_only`.
 
     Raises:
-        FormatError: it is something else.
+        FormatError: the file holds something else.
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FormatError(
-            path, expected="a state dict", found="something else, which was not run", advice=f"{reason}"
+            path, expected="a state dict", found=f"something else, which was not run ({reason})"
         ) from error
     if not isinstance(state, Mapping):
         raise FormatError(path, expected="a state dict (names to tensors)", found=f"{type(state).__name__}")
@@ -66,7 +66,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def write_weights(path: Path, network: nn.Module) -> None:
-    """Write a network's state dict, as safetensors where the ending says so; whole or not at all."""
+    """Write a network's state dict, as safetensors if the name ends so. The file is complete or does not exist."""
     state = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     if path.suffix == ".safetensors":
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def write_weights(path: Path, network: nn.Module) -> None:
 
 
 def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a dict of tensors and plain values; whole or not at all."""
+    """Write a dict of tensors and plain values. The file is complete or does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(dict(state), _beside(path))
     os.replace(_beside(path), path)
@@ -93,30 +93,33 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
     for name, value in own.items():
         if name not in state:
             raise FormatError(
-                where, expected=f"the layer {name} {_shape(value)}", found="none", advice="weights of another network?"
+                where,
+                expected=f"the layer {name} {_shape(value)}",
+                found="none",
+                advice="the weights may belong to another network",
             )
         if state[name].shape != value.shape:
             raise FormatError(
                 f"{where}: layer {name}",
-                expected=f"{_shape(value)}",
-                found=f"{_shape(state[name])}",
-                advice=f"{_advice(name)}",
+                expected=_shape(value),
+                found=_shape(state[name]),
+                advice=_advice(name),
             )
     if unknown := [name for name in state if name not in own]:
         raise FormatError(
             where,
             expected=f"no layer {unknown[0]}",
-            found=f"{_shape(state[unknown[0]])}",
-            advice="weights of another network?",
+            found=_shape(state[unknown[0]]),
+            advice="the weights may belong to another network",
         )
     network.load_state_dict(dict(state), strict=True)
 
 
 def identify(state: Mapping[str, Tensor], where: str) -> tuple[str, int]:
-    """Tell from a state dict which network it is of, and for how many classes.
+    """Return the name of the network that a state dict belongs to, and the number of classes.
 
     Raises:
-        FormatError: none of ours.
+        FormatError: it belongs to none of our networks.
     """
     name = next((name for name, mark in _MARKS.items() if mark in state), None)
     if name is None:
@@ -133,10 +136,10 @@ def identify(state: Mapping[str, Tensor], where: str) -> tuple[str, int]:
 
 def _advice(layer: str) -> str:
     if "conv3d_" in layer:
-        return "weights of another history (T)"
+        return "the weights are for another history (T)"
     if "classes" in layer:
-        return "weights of another number of classes"
-    return "weights of another grid (cells along z) or network"
+        return "the weights are for another number of classes"
+    return "the weights are for another grid (cells along z) or network"
 
 
 def _describe(state: Mapping[str, Any]) -> str:

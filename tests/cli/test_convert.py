@@ -30,7 +30,7 @@ def test_the_list_names_the_converters():
 
 
 def test_there_and_back_by_two_commands(source, tmp_path):
-    options = ("--labels", "kitti", "--frame", "kitti", "--grids", "voxels", "--flow", "none")
+    options = ("--classes", "semantickitti", "--axes", "right", "--grids", "voxels", "--flow", "none")
     result = run("convert", "kitti", source, tmp_path / "middle", *options)
     assert result.exit_code == 0, result.output
     assert "3 frames converted" in result.output
@@ -64,8 +64,12 @@ def test_failed_frames_are_listed_and_the_exit_code_is_1(source, tmp_path):
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (("--res", "0.2", "--grids", "none"), 2, "grid options are for --grids scans"),
-        (("--labels", "poss"), 2, "labels: expected one of carla, kitti"),
+        (
+            ("--res", "0.2", "--grids", "none"),
+            2,
+            "--grids: expected scans, because options of the grid are given, found none",
+        ),
+        (("--classes", "poss"), 2, "--classes: expected one of carla, semantickitti"),
         (("--sequences", "05"), 1, "expected the sequences 05, found only 00"),
         (("--preset", "coarse", "--res", "0.2"), 2, "expected one of --res, --size and --preset"),
     ],

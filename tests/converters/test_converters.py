@@ -74,7 +74,7 @@ def test_a_third_partys_converter_is_found_and_used(installed, tmp_path):
 
 
 def test_a_converter_that_does_not_load_is_named(installed):
-    with pytest.raises(DependencyError, match=r"converter broken \(lab_converter:Nothing\) does not load"):
+    with pytest.raises(DependencyError, match=r"converter broken \(lab_converter:Nothing\): cannot be loaded"):
         load_converter("broken")
     with pytest.raises(DependencyError, match=r"expected a class that inherits carlasc.converting.Converter"):
         load_converter("wrong")

@@ -28,7 +28,7 @@ def written(tmp_path, field="points"):
 
 def test_a_calibration_without_tr_is_refused_and_force_takes_the_poses_as_they_are(tmp_path, folder):
     (folder / "calib.txt").write_text("P0: " + " ".join("0" * 12) + "\n")
-    with pytest.raises(FormatError, match=r"calib.txt: expected Tr.*found only P0.*--poses kiss-icp.*--force"):
+    with pytest.raises(FormatError, match=r"calib.txt: expected Tr.*found only P0.*`poses=\"kiss-icp\"`.*`force=True`"):
         run(tmp_path)
     assert not (tmp_path / "out").exists()
     run(tmp_path, force=True)
@@ -85,7 +85,7 @@ def test_unknown_classes_are_named_with_their_count_and_unlabelled_only_if_allow
     result = run(tmp_path)
     assert result.failures[0].frame == 2
     assert "found 77 (7 times), 65535 (1 times)" in result.failures[0].message
-    assert "--allow-unknown" in result.failures[0].message
+    assert "`allow_unknown=True`" in result.failures[0].message
     assert not run(tmp_path, allow_unknown=True).failures
     converted = carlasc.open(tmp_path / "out").sequences()[SEQUENCE].read("labels", 2)
     assert converted[:8].tolist() == [0] * 8
@@ -94,7 +94,7 @@ def test_unknown_classes_are_named_with_their_count_and_unlabelled_only_if_allow
 
 def test_own_classes_are_checked_too(tmp_path, folder):
     write_labels(folder, 0, np.full(60, 200, np.uint32))
-    result = run(tmp_path, labels="kitti")
+    result = run(tmp_path, classes="semantickitti")
     assert "200 (60 times)" in result.failures[0].message
 
 
@@ -157,16 +157,22 @@ def test_a_second_run_goes_on_where_the_first_stopped(tmp_path, folder):
 def test_a_second_run_of_other_settings_stops(tmp_path, folder):
     run(tmp_path)
     with pytest.raises(ConflictError, match=r"carlasc.json: expected the axes right"):
-        run(tmp_path, frame="kitti")
+        run(tmp_path, axes="right")
     with pytest.raises(ConflictError, match="expected the axes left and the classes semantickitti"):
-        run(tmp_path, labels="kitti")
+        run(tmp_path, classes="semantickitti")
 
 
 def test_arguments_that_make_no_sense_are_named(tmp_path, folder):
-    for name, value in (("labels", "poss"), ("frame", "left"), ("grids", "all"), ("poses", "gps"), ("flow", "icp")):
+    for name, value in (
+        ("classes", "semanticposs"),
+        ("axes", "up"),
+        ("grids", "all"),
+        ("poses", "gps"),
+        ("flow", "icp"),
+    ):
         with pytest.raises(ArgumentError, match=f"{name}: expected one of"):
             run(tmp_path, **{name: value})
-    with pytest.raises(ArgumentError, match=r"converter 'kiti': expected one of .*kitti"):
+    with pytest.raises(ArgumentError, match=r"name: expected one of .*kitti.*, found 'kiti'"):
         convert("kiti", tmp_path / "in", tmp_path / "out")
 
 
@@ -195,8 +201,8 @@ def test_camera_poses_without_their_calibration_are_refused(simulated, tmp_path)
     copytree(simulated[0], copy)
     (copy / "sequences" / "00" / "calib.txt").write_text(
         "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n"
-    )  # somebody's way round a missing file
-    with pytest.raises(FormatError, match=r"they look like camera-frame poses.*inv\(Tr\) @ P @ Tr.*--force"):
+    )  # what somebody may write when the file is missing
+    with pytest.raises(FormatError, match=r"they look like camera-frame poses.*inv\(Tr\) @ P @ Tr.*`force=True`"):
         run(tmp_path)
     assert not (tmp_path / "out").exists()
     assert run(tmp_path, force=True).made == 24

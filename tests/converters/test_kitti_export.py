@@ -29,7 +29,9 @@ def frame_files(folder, name, suffix):
 @pytest.fixture(scope="module")
 def there_and_back(simulated, tmp_path_factory):
     middle, back = tmp_path_factory.mktemp("middle"), tmp_path_factory.mktemp("back")
-    convert("kitti", simulated[0], middle, labels="kitti", frame="kitti", grids="voxels", flow="none", workers=1)
+    convert(
+        "kitti", simulated[0], middle, classes="semantickitti", axes="right", grids="voxels", flow="none", workers=1
+    )
     result = export("kitti", middle, back, workers=1)
     assert (result.made, result.failures, result.sequences) == (24, (), {SEQUENCE: "sequences/00"})
     return simulated[1].folder, back / "sequences" / "00"
@@ -57,7 +59,7 @@ def test_poses_come_back(there_and_back):
 
 
 def test_the_mirrored_frame_comes_back_too(simulated, tmp_path):
-    convert("kitti", simulated[0], tmp_path / "middle", labels="kitti", grids="voxels", flow="none", workers=1)
+    convert("kitti", simulated[0], tmp_path / "middle", classes="semantickitti", grids="voxels", flow="none", workers=1)
     export("kitti", tmp_path / "middle", tmp_path / "back", workers=1)
     before, after = simulated[1].folder, tmp_path / "back" / "sequences" / "00"
     assert frame_files(before, "velodyne", ".bin") == frame_files(after, "velodyne", ".bin")
@@ -181,7 +183,7 @@ def test_what_cannot_be_exported_is_named(tmp_path):
         export("kitti", tmp_path / "in", tmp_path / "in" / "out", workers=1)
     with pytest.raises(MissingDataError, match="expected the sequences Town99"):
         export("kitti", tmp_path / "in", tmp_path / "out", sequences=["Town99"], workers=1)
-    with pytest.raises(MissingDataError, match="expected fine, found small"):
+    with pytest.raises(MissingDataError, match="expected the grid fine, found small"):
         export("kitti", tmp_path / "in", tmp_path / "out", grid="fine", workers=1)
     with pytest.raises(ArgumentError, match="expected a data set that can be written"):
         export("poss", tmp_path / "in", tmp_path / "out", workers=1)
@@ -190,7 +192,7 @@ def test_what_cannot_be_exported_is_named(tmp_path):
 def test_tiny_round_trip_of_several_sequences(tmp_path):
     for number in ("00", "08"):
         write_tiny_kitti(tmp_path / "in", number, voxels=True)
-    options = {"labels": "kitti", "frame": "kitti", "grids": "voxels", "flow": "none", "workers": 2}
+    options = {"classes": "semantickitti", "axes": "right", "grids": "voxels", "flow": "none", "workers": 2}
     convert("kitti", tmp_path / "in", tmp_path / "middle", **options)
     export("kitti", tmp_path / "middle", tmp_path / "out", workers=2)
     for number in ("00", "08"):

@@ -51,7 +51,7 @@ def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
         np.column_stack([points, np.zeros(300)]).astype("<f4").tofile(folder / "velodyne" / f"{frame:06d}.bin")
         write_labels(folder, frame, np.full(300, 252 | 9 << 16))
     write_poses(folder / "poses.txt", np.stack(poses))
-    convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", frame="kitti", force=True, workers=1)
+    convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", axes="right", force=True, workers=1)
     sequence = carlasc.open(tmp_path / "out").sequences()[SEQUENCE]
     for frame in (8, 15, 22):
         car_in_sensor = (invert(poses[frame]) @ world_T_car[frame])[:3, :3]

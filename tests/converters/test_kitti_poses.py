@@ -25,7 +25,7 @@ def test_kiss_icp_drifts_less_than_1_percent_over_100_m_of_a_drive_from_rest(tmp
     )
     (truth.folder / "poses.txt").unlink()
     seen = []
-    options = {"grids": "none", "flow": "none", "frame": "kitti", "workers": 1}
+    options = {"grids": "none", "flow": "none", "axes": "right", "workers": 1}
     convert("kitti", tmp_path / "in", tmp_path / "out", progress=lambda *step: seen.append(step), **options)
     folder = tmp_path / "out" / SEQUENCE
     poses = layout.decode_poses((folder / "poses.txt").read_bytes(), "poses")

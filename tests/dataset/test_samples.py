@@ -13,7 +13,7 @@ from helpers.plain_loader import PlainLoader
 import carlasc.storage
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI
-from carlasc.dataset.samples import FIELDS, Dataset
+from carlasc.dataset import FIELDS, Dataset
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import FolderSource, layout
 from carlasc.storage.files import to_json
@@ -158,7 +158,7 @@ def test_grids_come_from_a_second_root_by_split_and_sequence(tmp_path, world):
     fine = SMALL.with_size((32, 32, 8))
     write_drive(tmp_path / "Train" / "Town01_Light" / "cartesian", [], grid_frames=[1, 3, 4], spec=fine, seed=7)
     write_drive(tmp_path / "Val" / "Town01_Light" / "cartesian", [], grid_frames=[0], spec=fine, seed=8)
-    dataset = Dataset(world, ["Town01_Light"], history=2, grids_root=tmp_path, remap=None)
+    dataset = Dataset(world, ["Town01_Light"], history=2, grids_source=tmp_path, remap=None)
     assert dataset.spec == fine and dataset.classes == CARLA
     assert [dataset[i]["frame"] for i in range(len(dataset))] == [1, 3, 4]
     truth = FolderSource(tmp_path).sequences()["Train/Town01_Light/cartesian"].read("evaluation/labels", 3)
@@ -170,7 +170,7 @@ def test_cylindrical_grids_of_a_second_root_take_scans_and_poses_from_cartesian(
     for split, name in (("Train", "Town01_Light"), ("Train", "Town02_Light"), ("Val", "Town07_Light")):
         folder = tmp_path / split / name / "cylindrical"
         write_drive(folder, [], grid_frames=[2, 3] if split == "Train" else [2], spec=SMALL_CYLINDRICAL)
-    dataset = Dataset(world, history=2, coordinates="cylindrical", grids_root=tmp_path)
+    dataset = Dataset(world, history=2, coordinates="cylindrical", grids_source=tmp_path)
     assert len(dataset) == 5 and dataset.spec == SMALL_CYLINDRICAL
     assert {sequence.coordinates for sequence in dataset.sequences} == {"cartesian"}
     same = Dataset(world, history=2, grid=SMALL_CYLINDRICAL, fields=("occupancy",))
@@ -189,10 +189,10 @@ def test_cylindrical_grids_beside_cartesian_ones_take_their_own_scans_if_there_a
 
 
 def test_two_roots_that_are_one_sequence_each_go_together(golden_capture):
-    fine = Dataset(golden_capture / "cartesian", history=3, grids_root=golden_capture / "cartesian_fine")
+    fine = Dataset(golden_capture / "cartesian", history=3, grids_source=golden_capture / "cartesian_fine")
     assert fine.spec == GridSpec.published("cartesian_fine") and len(fine) == 3
     cylindrical = Dataset(
-        golden_capture / "cartesian", coordinates="cylindrical", grids_root=golden_capture / "cylindrical"
+        golden_capture / "cartesian", coordinates="cylindrical", grids_source=golden_capture / "cylindrical"
     )
     assert cylindrical.spec == GridSpec.published("cylindrical")
     assert cylindrical[2]["occupancy"].any()
@@ -372,7 +372,7 @@ def test_constructing_prints_nothing_and_loads_neither_torch_nor_numba(world):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"split": "training"}, "split 'training': expected Train, Val, Test in any case, or a list"),
+        ({"split": "training"}, "split: expected Train, Val, Test in any case, or a list .*, found 'training'"),
         ({"fields": ("occupancy", "label")}, "fields: expected any of occupancy, .*, found 'label'"),
         ({"fields": ()}, "fields: expected at least one"),
         ({"history": 0}, "history: expected a number of scans of 1 or more, found 0"),
@@ -380,7 +380,10 @@ def test_constructing_prints_nothing_and_loads_neither_torch_nor_numba(world):
         ({"coordinates": "polar"}, "coordinates: expected cartesian or cylindrical, found 'polar'"),
         ({"remap": "carlasc12"}, "remap: expected one of carlasc11.*found 'carlasc12'"),
         ({"remap": "carlasc12", "fields": ("points",)}, "remap: expected one of carlasc11.*found 'carlasc12'"),
-        ({"remap": "semantickitti19"}, "expected labels of the class table semantickitti .*, found carla"),
+        (
+            {"remap": "semantickitti19"},
+            "remap: expected a remap of .* class table carla, found semantickitti19, which maps semantickitti",
+        ),
         ({"remap": {}}, "remap: expected ids"),
         ({"remap": [[1]]}, "remap: expected a name, a mapping or a table of ids"),
     ],
@@ -412,9 +415,9 @@ def test_missing_or_short_or_broken_poses_are_named(tmp_path):
     expect(FormatError, "poses.txt: expected a line for each of 4 frames", tmp_path, history=2)
     assert len(Dataset(tmp_path)) == 4  # one scan needs no pose
     (folder / "poses.txt").write_text("\n".join([*lines[:2], " ".join(["nan"] * 12), lines[3]]) + "\n")
-    expect(FormatError, "poses.txt: expected rigid transforms, found none in line 3", tmp_path, history=2)
+    expect(FormatError, "poses.txt, line 3: expected a rigid transform, found .nan", tmp_path, history=2)
     (folder / "poses.txt").write_text("\n".join([*lines[:3], " ".join(["0"] * 12)]) + "\n")
-    expect(FormatError, "poses.txt: expected rigid transforms, found none in line 4", tmp_path, history=2)
+    expect(FormatError, "poses.txt, line 4: expected a rigid transform, found .0.0", tmp_path, history=2)
     (folder / "poses.txt").unlink()
     expect(MissingDataError, "poses.txt: expected a file, found nothing", tmp_path, history=2)
 
@@ -429,9 +432,9 @@ def test_a_sequence_without_the_grid_is_named(tmp_path):
 def test_a_second_root_without_the_sequence_or_the_coordinates_is_named(tmp_path, world):
     write_drive(tmp_path / "Train" / "Town01_Light" / "cartesian", [], grid_frames=[1], spec=SMALL)
     message = "expected cartesian grids of Train/Town02_Light, found the sequences Train/Town01_Light"
-    expect(MissingDataError, message, world, "train", grids_root=tmp_path)
+    expect(MissingDataError, message, world, "train", grids_source=tmp_path)
     message = "expected cylindrical grids of Train/Town01_Light, found only cartesian"
-    expect(MissingDataError, message, world, ["Town01_Light"], grids_root=tmp_path, coordinates="cylindrical")
+    expect(MissingDataError, message, world, ["Town01_Light"], grids_source=tmp_path, coordinates="cylindrical")
 
 
 def test_an_empty_folder_and_a_level_too_low_are_told_what_to_give(tmp_path, world):
@@ -456,7 +459,7 @@ def test_grids_of_different_geometry_are_not_mixed(tmp_path):
 def test_only_cylindrical_data_are_not_taken_for_cartesian(tmp_path):
     write_drive(tmp_path / "A" / "cylindrical", range(2), spec=SMALL_CYLINDRICAL)
     expect(
-        MissingDataError, "expected cartesian data, found only cylindrical: give coordinates='cylindrical'", tmp_path
+        MissingDataError, "expected cartesian data, found only cylindrical: give `coordinates='cylindrical'`", tmp_path
     )
 
 
@@ -468,7 +471,7 @@ def test_damaged_files_are_named_when_they_are_read(tmp_path):
     (folder / "evaluation" / "000001.label").write_bytes(b"1234")
     expect(FormatError, "000001.label: expected 4096 bytes", tmp_path)
     (folder / "labels" / "000001.label").write_bytes(bytes(8))
-    message = "frame 1: expected as many of each, found 300 points, 2 point_labels"
+    message = "frame 1: expected the same number of each, found 300 points, 2 point_labels"
     expect(FormatError, message, tmp_path, fields=("points", "point_labels"))
 
 

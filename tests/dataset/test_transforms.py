@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from carlasc.core.grids import GridSpec
-from carlasc.dataset.samples import FIELDS, Dataset
+from carlasc.dataset import FIELDS, Dataset
 from carlasc.dataset.stacking import stack_scans
 from carlasc.dataset.transforms import Flip, flip
 from carlasc.errors import ArgumentError
@@ -116,9 +116,9 @@ def test_a_grid_that_is_not_symmetric_is_refused(spec, axis):
         flip({"labels": np.zeros(spec.size)}, axis, spec)
 
 
-@pytest.mark.parametrize("arguments", [{"axes": "z"}, {"probability": 1.5}, {"seed": -1}])
-def test_a_senseless_flip_is_refused(arguments):
-    with pytest.raises(ArgumentError, match="flip"):
+@pytest.mark.parametrize("arguments", [{"directions": "z"}, {"probability": 1.5}, {"seed": -1}])
+def test_a_flip_with_a_wrong_argument_is_refused(arguments):
+    with pytest.raises(ArgumentError, match=f"{next(iter(arguments))}: expected"):
         Flip(GRIDS["cartesian"], **arguments)
 
 

@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
-import torch
 from helpers.drives import write_drive
-from torch.utils.data import DataLoader, DistributedSampler
 
 from carlasc.core.grids import GridSpec
-from carlasc.dataset.samples import FIELDS, RAGGED, Dataset, collate
-from carlasc.dataset.transforms import Flip
+from carlasc.dataset import FIELDS, Dataset, Flip, collate
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
+import torch
+from torch.utils.data import DataLoader, DistributedSampler
+
+RAGGED = ("points", "point_labels", "flow")
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 DENSE = tuple(field for field in FIELDS if field not in RAGGED)

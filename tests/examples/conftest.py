@@ -1,4 +1,4 @@
-"""The examples are scripts and the packages beside them, not an installed package: they are found by their folder."""
+"""The examples are scripts and the packages beside them. They are not installed, so their folder goes on the path."""
 
 from __future__ import annotations
 
@@ -9,8 +9,14 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 sys.path.insert(0, str(EXAMPLES))
-torch = pytest.importorskip("torch", reason="the examples need carlasc[torch]")
-torch.set_num_threads(1)  # the networks are tiny here: threads that wait for each other cost more than they bring
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    """Use one thread: the networks are so small here that threads take longer."""
+    import torch
+
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 
-import benchmark
-import published
 import pytest
 
 from carlasc import open as open_source
 from carlasc.core.tables import CARLASC11
 from carlasc.metrics import ConfusionMatrix, Evaluation
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
+import benchmark
+import published
 
 pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")
 

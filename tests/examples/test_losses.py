@@ -1,6 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
 import torch
 from completion.losses import IGNORE, balance_free, coarsen, completion_loss
 from torch.nn.functional import cross_entropy

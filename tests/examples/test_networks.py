@@ -6,6 +6,9 @@ import json
 
 import numpy as np
 import pytest
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
 import torch
 from lmscnet.model import LMSCNet
 from motionsc.model import MotionSC

@@ -8,16 +8,19 @@ import sys
 
 import numpy as np
 import pytest
-import torch
-from completion.networks import build_network
-from completion.predicting import Model, predict_dataset, predict_scans
-from completion.weights import read_weights, write_weights
 from helpers.completion import SPEC, write_split
 
 from carlasc import Dataset, GridSpec
 from carlasc import open as open_source
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.metrics import evaluate
+
+pytest.importorskip("torch", reason="needs carlasc[torch]")
+
+import torch
+from completion.networks import build_network
+from completion.predicting import Model, predict_dataset, predict_scans
+from completion.weights import read_weights, write_weights
 
 CPU = torch.device("cpu")
 
@@ -114,7 +117,7 @@ def test_weights_that_do_not_fit_name_the_layer_and_both_shapes(tmp_path):
 
     with pytest.raises(
         FormatError,
-        match=r"conv_classes.weight: expected 11 x 128 x 1 x 1 x 1, found 7 x .*: weights of another number of classes",
+        match=r"conv_classes.weight: expected 11 x 128 x 1 x 1 x 1, found 7 x .*: the weights are for another number of classes",
     ):
         load_weights(
             build_network("sscnet", 11, SPEC), read_weights(save(tmp_path / "k.pt", "sscnet", classes=7)), "k.pt"

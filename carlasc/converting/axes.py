@@ -1,0 +1,42 @@
+"""Between right-handed axes (y to the left) and CarlaSC's left-handed ones (y to the right): y changes its sign.
+
+Mirroring is its own inverse, so each function serves both directions.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+
+Axes = Literal["left", "right"]
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+_SIGNS = np.array([1, -1, 1, 1], np.float32)
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def mirror_points(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mirror (N, 3) or (N, 4) points or vectors; a fourth column is kept."""
+    return points * _SIGNS[: points.shape[1]]
+
+
+def mirror_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mirror (..., 4, 4) poses: both the frame that a pose leads from and the one that it leads to."""
+    return _MIRROR @ poses @ _MIRROR
+
+
+def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Mirror a Cartesian (X, Y, Z) grid."""
+    mirrored: NDArray[Any] = grid[:, ::-1]
+    return mirrored
+
+
+def mirror_spec(spec: GridSpec) -> GridSpec:
+    """Return the geometry of a mirrored Cartesian grid: the bounds of y change places and signs."""
+    (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
+    return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
