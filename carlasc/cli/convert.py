@@ -144,8 +144,8 @@ def convert(
     """
     from carlasc.converting import convert as convert_recordings
 
-    merging = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
-    asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, merging))
+    observe = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
+    asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, observe))
     if asked and grids is not Grids.scans:
         raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids.value)
     if preset is None and res is None and size is None:
@@ -162,8 +162,8 @@ def convert(
             axes=axes.value,
             grids=grids.value,
             spec=spec,
-            merging=merging,
-            vote=None if rule is None else rule.value,
+            observe=observe,
+            voting=None if rule is None else Voting(rule.value),
             poses=poses.value,
             flow=flow.value,
             allow_unknown=allow_unknown,

@@ -27,7 +27,8 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.protocol import Metadata, SequenceWriter, Sink
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import SequenceWriter, Sink
 from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
 
 SplitName = Literal["train", "val", "test", "all"]

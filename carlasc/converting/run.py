@@ -7,6 +7,7 @@ import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -33,8 +34,7 @@ from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sink
 
 if TYPE_CHECKING:
-    from carlasc.groundtruth.options import FromScans
-    from carlasc.groundtruth.voting.ballot import VoteRule
+    from carlasc.groundtruth.options import FromScans, Voting
 
 Grids = Literal["scans", "voxels", "none"]
 Flow = Literal["instances", "none"]
@@ -53,8 +53,8 @@ def convert(
     axes: Axes = "left",
     grids: Grids = "scans",
     spec: GridSpec | None = None,
-    merging: FromScans | None = None,
-    vote: VoteRule | None = None,
+    observe: FromScans | None = None,
+    voting: Voting | None = None,
     poses: PoseSource = "auto",
     flow: Flow = "instances",
     allow_unknown: bool = False,
@@ -79,8 +79,8 @@ def convert(
         grids: "scans" makes grids from scans merged over time; "voxels" takes the data set's own voxels, with count 0 where
             they are unknown; "none" writes no grids.
         spec: with "scans": the grid; None takes the published coarse one.
-        merging: with "scans": which scans are merged, and how moving points are treated.
-        vote: with "scans": how votes are counted.
+        observe: with "scans": which scans are merged, and how moving points are treated.
+        voting: with "scans": how votes are counted.
         poses: "file", "kiss-icp" (estimated from the scans), or "auto": the file where it exists, else estimated.
         flow: "instances" estimates the velocity of every moving actor from its points; "none" writes no flow. Without labels no
             flow is written.
@@ -151,7 +151,7 @@ def convert(
             failures += [Failure(plan.recording.location, *problem) for problem in plan.recording.problems()]
             notes += _notes(plan, without_flow)
     grid_paths, more = (
-        _regrid(plans, spec, merging, vote, force, workers, executor, steps, failures) if grids == "scans" else ((), [])
+        _regrid(plans, spec, observe, voting, force, workers, executor, steps, failures) if grids == "scans" else ((), [])
     )
     return ConvertResult(
         tuple(plan.writer.location for plan in plans),
@@ -187,7 +187,7 @@ def _check(name: str, converter: type[Converter], **given: str) -> None:
 
 def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
     if isinstance(sink, FolderSink):
-        check_outside(sink.root, str(source))
+        check_outside(sink.folder, str(source))
     elif grids != "none":
         raise ArgumentError(
             "grids", expected=f"none with {sink.location}", found=grids, advice="convert to a folder, then pack it"
@@ -238,8 +238,8 @@ def _notes(plan: RecordingPlan, without_flow: int) -> list[str]:
 def _regrid(
     plans: Sequence[RecordingPlan],
     spec: GridSpec | None,
-    merging: FromScans | None,
-    vote: VoteRule | None,
+    observe: FromScans | None,
+    voting: Voting | None,
     force: bool,
     workers: int,
     executor: Executor | None,
@@ -265,8 +265,8 @@ def _regrid(
             folder,
             spec or GridSpec.published(),
             folder.parent,
-            observe=replace(merging or FromScans(), force=force),
-            voting=Voting(vote),
+            observe=replace(observe or FromScans(), force=force),
+            voting=voting or Voting(),
             workers=workers,
             executor=executor,
             progress=advance,

@@ -39,7 +39,6 @@ RAGGED = ("points", "point_labels", "flow")  # one row per point of the scan
 _STACKS = frozenset({"occupancy", "density"})
 _OF_GRID = {"labels": "labels", "known": "counts", "counts": "counts"}  # field of a sample -> field of the grid
 _OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow"}  # field of a sample -> field of the scan
-_AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # `frame` in carlasc.json -> handedness
 
 if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
     from torch.utils.data import Dataset as TorchDataset

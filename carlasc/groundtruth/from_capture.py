@@ -17,7 +17,8 @@ from carlasc.groundtruth.inputs import FrameData, FrameInput, Plan, SequenceInpu
 from carlasc.groundtruth.voting.ballot import count_votes
 from carlasc.groundtruth.voting.observations import Observation
 from carlasc.storage import layout
-from carlasc.storage.protocol import Metadata, Source
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import Source
 
 
 @dataclass(frozen=True)
