@@ -14,21 +14,22 @@ from typing import Self
 class CarlascError(Exception):
     """Base of every error that `carlasc` raises on purpose.
 
-    The message is put together from the attributes: `WHERE: PROBLEM: expected EXPECTED, found FOUND: ADVICE`, without the parts that
-    are empty.
+    The message is one line, made of the attributes that are not empty: `WHERE: PROBLEM: expected EXPECTED, found FOUND: ADVICE`.
 
     Attributes:
         where: what it is about: a file, a URL, a field, or the name of an argument.
         problem: what went wrong, where "expected ..., found ..." does not say it.
         expected: what should have been found.
         found: what was found instead.
-        advice: what to do about it. Arguments stand in it as `` `overwrite=True` ``; the command line turns these into its options.
+        advice: what to do about it. It names arguments as `` `overwrite=True` ``, which the command line replaces by its options.
     """
 
     def __init__(
         self, where: object, *, problem: str = "", expected: str = "", found: str = "", advice: str = ""
     ) -> None:
-        super().__init__(where)  # the only positional argument, so that errors pickle: the rest travels in __dict__
+        super().__init__(
+            str(where)
+        )  # the only positional argument, so that errors pickle: the rest travels in __dict__
         self.where, self.problem = str(where), problem
         self.expected, self.found, self.advice = expected, found, advice
 
@@ -40,7 +41,7 @@ class CarlascError(Exception):
         return " ".join(text.splitlines())  # other libraries' messages may have several lines
 
     def within(self, where: object) -> Self:
-        """Return the same error with the place that this place is in before it: `within("a.zip")` of "b" says "a.zip: b"."""
+        """Return a copy that also names what contains the place: `within("a.zip")` of an error at "b" is at "a.zip: b"."""
         error = copy.copy(self)
         error.where = f"{where}: {self.where}"
         return error

@@ -1,7 +1,12 @@
+import pickle
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
 
 import pytest
+from helpers import jobs
 
 from carlasc.errors import (
     ArgumentError,
@@ -10,14 +15,58 @@ from carlasc.errors import (
     DependencyError,
     FormatError,
     MissingDataError,
+    StorageError,
     import_extra,
 )
 
+KINDS = (FormatError, MissingDataError, DependencyError, ArgumentError, ConflictError, StorageError)
 
-def test_every_kind_is_a_carlasc_error():
-    for kind in (FormatError, MissingDataError, DependencyError, ArgumentError, ConflictError):
-        assert issubclass(kind, CarlascError)
-    assert issubclass(ArgumentError, ValueError)
+
+def test_every_kind_is_a_carlasc_error_and_some_are_errors_of_python_too():
+    assert all(issubclass(kind, CarlascError) for kind in KINDS)
+    assert {kind for kind in KINDS if issubclass(kind, ValueError)} == {FormatError, ArgumentError}
+    assert {kind for kind in KINDS if issubclass(kind, ImportError)} == {DependencyError}
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({}, "a.bin"),
+        ({"problem": "cannot be read"}, "a.bin: cannot be read"),
+        ({"expected": "4 bytes", "found": "3"}, "a.bin: expected 4 bytes, found 3"),
+        ({"found": "3"}, "a.bin: found 3"),
+        ({"expected": "4 bytes", "advice": "copy it again"}, "a.bin: expected 4 bytes: copy it again"),
+        (
+            {"problem": "is damaged", "expected": "4 bytes", "found": "3", "advice": "copy it again"},
+            "a.bin: is damaged: expected 4 bytes, found 3: copy it again",
+        ),
+        ({"problem": "one\ntwo\r\nthree", "advice": "four\n"}, "a.bin: one two three: four"),
+    ],
+)
+def test_the_message_is_one_line_made_of_the_parts(parts, message):
+    error = FormatError(Path("a.bin"), **parts)
+    assert str(error) == message
+    assert error.where == "a.bin"
+
+
+def test_errors_come_back_whole_from_another_process():
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        for kind in KINDS:
+            error = kind(Path("a"), problem="b", expected="c", found="d", advice="e")
+            found = pool.submit(jobs.raise_error, error).exception()
+            assert type(found) is kind
+            assert str(found) == str(error) == "a: b: expected c, found d: e"
+            assert (found.where, found.problem, found.expected, found.found, found.advice) == tuple("abcde")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_error_within_a_place_names_both_and_leaves_the_first_as_it_is(kind):
+    error = kind("b", expected="c", found="d", advice="e")
+    outer = error.within("a.zip").within("c")
+    assert type(outer) is kind
+    assert str(outer) == "c: a.zip: b: expected c, found d: e"
+    assert str(error) == "b: expected c, found d: e"
+    assert str(pickle.loads(pickle.dumps(outer))) == str(outer)
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install():

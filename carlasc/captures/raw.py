@@ -168,7 +168,8 @@ class Capture:
                     found=f"{len(arrays[name])}",
                 )
         velocities = arrays.pop("velocities")
-        return Recording(Scan(**arrays), self.read_pose(sensor, frame), velocities)
+        scan = Scan(arrays["points"], labels=arrays["labels"], instances=arrays["instances"])
+        return Recording(scan, self.read_pose(sensor, frame), velocities)
 
     def read_pose(self, sensor: int, frame: int) -> Transform:
         """Return (4, 4) float64 world_T_sensor.

@@ -143,6 +143,7 @@ def convert(
     Run it again to continue where it stopped: frames that exist are skipped.
     """
     from carlasc.converting import convert as convert_recordings
+    from carlasc.groundtruth import Voting
 
     observe = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, observe))

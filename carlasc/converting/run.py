@@ -151,7 +151,9 @@ def convert(
             failures += [Failure(plan.recording.location, *problem) for problem in plan.recording.problems()]
             notes += _notes(plan, without_flow)
     grid_paths, more = (
-        _regrid(plans, spec, observe, voting, force, workers, executor, steps, failures) if grids == "scans" else ((), [])
+        _regrid(plans, spec, observe, voting, force, workers, executor, steps, failures)
+        if grids == "scans"
+        else ((), [])
     )
     return ConvertResult(
         tuple(plan.writer.location for plan in plans),

@@ -53,7 +53,7 @@ def invert(dst_T_src: Transform) -> Transform:
 
 
 def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Express world poses (..., 4, 4) in the frame `first`: `inv(first) @ pose` (FORMAT: poses.txt)."""
+    """Express world poses (..., 4, 4) in the frame `first`: `inv(first) @ pose`, as in poses.txt."""
     return np.linalg.inv(first) @ poses
 
 

@@ -18,7 +18,7 @@ from carlasc.errors import ArgumentError, FormatError
 Coordinates = Literal["cartesian", "cylindrical"]
 Triple = tuple[float, float, float]
 
-_PI32 = float(np.float32(np.pi))  # a hair above pi: an azimuth of exactly pi is inside the published bounds
+_PI32 = float(np.float32(np.pi))  # a little above pi: an azimuth of exactly pi is inside the published bounds
 _SIDE = float(np.float32(25.6))
 _PROPORTION = 128 * 0.234375  # azimuth cells times radial cell of the published cylindrical grid
 
@@ -29,9 +29,9 @@ class GridSpec:
 
     Attributes:
         coordinates: "cartesian" (x, y, z) or "cylindrical" (radius, azimuth, z).
-        size: number of cells an axis.
-        lower: lower bound an axis; metres, radians for azimuth.
-        upper: upper bound an axis.
+        size: number of cells per axis.
+        lower: lower bound per axis; metres, radians for azimuth.
+        upper: upper bound per axis.
 
     Raises:
         ArgumentError: sizes or bounds that make no grid.
@@ -48,15 +48,15 @@ class GridSpec:
         for name, kind in (("size", int), ("lower", float), ("upper", float)):
             values = tuple(kind(v) for v in getattr(self, name))
             if len(values) != 3 or not all(math.isfinite(v) for v in values):
-                raise ArgumentError(f"grid {name}", expected="three finite numbers", found=f"{getattr(self, name)}")
+                raise ArgumentError(f"grid {name}", expected="three finite numbers", found=str(getattr(self, name)))
             object.__setattr__(self, name, values)
         if min(self.size) < 1:
-            raise ArgumentError("grid size", expected="at least one cell an axis", found=f"{self.size}")
+            raise ArgumentError("grid size", expected="at least one cell per axis", found=str(self.size))
         if math.prod(self.size) >= 2**31:
             raise ArgumentError(
                 "grid size",
                 expected="fewer than 2^31 cells",
-                found=f"{' x '.join(map(str, self.size))}",
+                found=" x ".join(map(str, self.size)),
                 advice="take a coarser resolution",
             )
         if any(low >= up for low, up in zip(self.lower, self.upper, strict=True)):
@@ -75,14 +75,14 @@ class GridSpec:
 
     @classmethod
     def published(cls, name: str = "cartesian") -> GridSpec:
-        """Return a grid of the data set: "cartesian", "cartesian_fine" or "cylindrical" (FORMAT section 1)."""
+        """Return a grid of the data set: "cartesian", "cartesian_fine" or "cylindrical"; see `docs/format.md#layout`."""
         presets = {
             "cartesian": cls("cartesian", (128, 128, 8), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
             "cartesian_fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
             "cylindrical": cls("cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)),
         }
         if name not in presets:
-            raise ArgumentError(f"published grid {name!r}: expected one of {', '.join(presets)}")
+            raise ArgumentError("published grid", expected=f"one of {', '.join(presets)}", found=repr(name))
         return presets[name]
 
     @classmethod
@@ -95,7 +95,7 @@ class GridSpec:
         try:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
-                raise FormatError(where, expected="whole numbers in grid_size", found=f"{size}")
+                raise FormatError(where, expected="whole numbers in grid_size", found=str(size))
             lower, upper = tuple(params["min_bound"]), tuple(params["max_bound"])
             return cls(
                 params["coordinates"],
@@ -103,10 +103,12 @@ class GridSpec:
                 cast(Triple, lower),
                 cast(Triple, upper),
             )
+        except FormatError:
+            raise  # a FormatError is a ValueError
         except KeyError as error:
             raise FormatError(where, expected=f"the key {error}", found=f"{', '.join(params) or 'none'}") from error
         except (ArgumentError, TypeError, ValueError, OverflowError) as error:
-            raise FormatError(f"{where}: {error}") from error
+            raise FormatError(where, problem=str(error)) from error
 
     def to_params(self, num_channels: int = 25) -> dict[str, Any]:
         """Return the five published keys of params.json; sizes are written as floats, as there."""
@@ -119,7 +121,7 @@ class GridSpec:
         }
 
     def with_size(self, size: Sequence[int]) -> GridSpec:
-        """Return a grid of `size` cells over exactly these bounds."""
+        """Return a grid of `size` cells with exactly these bounds."""
         return replace(self, size=cast(tuple[int, int, int], tuple(size)))
 
     def with_bounds(self, lower: Sequence[float], upper: Sequence[float]) -> GridSpec:
@@ -131,14 +133,14 @@ class GridSpec:
         )
 
     def with_resolution(self, resolution: float | Sequence[float]) -> GridSpec:
-        """Return a grid of cells of the given size that covers these bounds (DESIGN: the `--res` rule).
+        """Return a grid of cells of the given size that covers these bounds (the rule of `--res`).
 
         With w a bounds' width, the cells are n = w/R where that is within 1e-4 of an integer, else the next integer above. The bounds
         grow to n R: about the centre for x and y, upwards from the lower one for z and the radius. Azimuth keeps its
         bounds. In a cylindrical grid a single R is radial and vertical, and azimuth keeps the published proportion.
 
         Args:
-            resolution: metres, or one value an axis (cylindrical: metres, radians, metres).
+            resolution: metres, or one value per axis (cylindrical: metres, radians, metres).
 
         Raises:
             ArgumentError: a resolution is not a positive number.
@@ -146,7 +148,7 @@ class GridSpec:
         per_axis = [float(v) for v in (resolution if isinstance(resolution, Sequence) else [resolution])]
         if len(per_axis) not in (1, 3) or not all(math.isfinite(r) and r > 0 for r in per_axis):
             raise ArgumentError(
-                "resolution", expected="one or three positive numbers", found=f"{', '.join(map(str, per_axis))}"
+                "resolution", expected="one or three positive numbers", found=", ".join(map(str, per_axis))
             )
         size, lower, upper = list(self.size), list(self.lower), list(self.upper)
         for axis, step in enumerate(per_axis * (3 // len(per_axis))):
@@ -177,9 +179,9 @@ class GridSpec:
 
     @property
     def voxel_size(self) -> NDArray[np.float64]:
-        """(3,) size of a cell an axis: the float32 difference of float32 bounds over the size (FORMAT section 4).
+        """(3,) size of a cell per axis: the float32 difference of the bounds over the size; see `docs/format.md#cells`.
 
-        Bounds that are no float32 numbers keep their exact difference.
+        Bounds that are not float32 numbers keep their exact difference.
         """
         lower, upper = np.array(self.lower), np.array(self.upper)
         rounded = (upper.astype(np.float32) - lower.astype(np.float32)).astype(np.float64)
@@ -217,7 +219,7 @@ class GridSpec:
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
     def index(self, axes: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Find the cell of points given on the grid's axes: half-open, floor, clamp (FORMAT section 4).
+        """Find the cell of points given on the grid's axes: half-open, floor, clip; see `docs/format.md#cells`.
 
         Args:
             axes: (N, 3) as `to_axes` returns.
@@ -268,7 +270,7 @@ class Grid:
     def __post_init__(self) -> None:
         for name, array in (("labels", self.labels), ("counts", self.counts)):
             if array is not None and array.shape != self.spec.size:
-                raise FormatError(f"grid {name}", expected=f"shape {self.spec.size}", found=f"{array.shape}")
+                raise FormatError(f"grid {name}", expected=f"shape {self.spec.size}", found=str(array.shape))
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -53,9 +53,18 @@ class Scan:
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
         """Return the points chosen by a mask or by indices, with all of their fields."""
-        fields: tuple[Any, ...] = (self.labels, self.flow, self.instances, self.remission)
-        others = {name: array[keep] for name, array in self.others.items()}
-        return Scan(self.points[keep], *(None if values is None else values[keep] for values in fields), others)
+
+        def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if values is None else values[keep]
+
+        return Scan(
+            self.points[keep],
+            chosen(self.labels),
+            chosen(self.flow),
+            chosen(self.instances),
+            chosen(self.remission),
+            {name: values[keep] for name, values in self.others.items()},
+        )
 
 
 def check_finite(points: NDArray[np.floating], name: str) -> None:

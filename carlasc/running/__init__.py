@@ -1,4 +1,4 @@
-"""One function over many things, side by side: in processes of its own, or in an executor of the caller's."""
+"""Calling one function with many items in parallel: in processes of our own, or in an executor of the caller."""
 
 from carlasc.running.processes import count_workers, run_all
 

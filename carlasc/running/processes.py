@@ -1,4 +1,4 @@
-"""One function over many things, side by side: in processes of its own, or in any `concurrent.futures.Executor`."""
+"""Calling one function with many items in parallel: in processes of our own, or in any `concurrent.futures.Executor`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 
 _TERMINATED = 128 + signal.SIGTERM
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-_GRACE_S = 3.0  # how long a worker may take to remove its half-written file
+_GRACE_S = 3.0  # time given to a worker to remove the file that it was writing
 
 
 def run_all(
@@ -29,21 +29,22 @@ def run_all(
     workers: int | None = None,
     executor: Executor | None = None,
 ) -> Generator[Result, None, None]:
-    """Yield `function(item)` of every item, in the items' order; only so many are under way that memory stays flat.
+    """Yield `function(item)` for every item, in the order of the items.
 
-    Without an executor the work is done in processes of its own, each with one thread, or, for one worker, here. When the
-    generator is closed or interrupted those stop at once, and each removes the file it was writing. Processes import the
+    At most twice as many items as workers are in progress at a time, so that memory use does not grow with the number of items.
+    Without an executor, the work is done in new processes with one thread each or, with one worker, in this process. When the
+    generator is closed or interrupted, these processes stop at once, and each removes the file that it was writing. They import the
     caller's main module again: a script must guard its work with `if __name__ == "__main__":`.
 
     Args:
         function: a top-level function; it and the items are pickled.
-        items: what to do.
-        workers: how many work side by side, all cores if None. With an executor: how many its workers are.
+        items: the arguments of the calls.
+        workers: number of processes, all cores if None. With an executor: the number of its workers.
         executor: does the work instead; it is left open.
 
     Raises:
-        ArgumentError: no positive number of workers.
-        CarlascError: a worker died.
+        ArgumentError: `workers` is not positive.
+        CarlascError: a worker process died.
     """
     workers = count_workers(workers)
     if executor is not None:
@@ -56,15 +57,16 @@ def run_all(
 
 
 def count_workers(workers: int | None) -> int:
-    """Return the number of workers that is asked for: as many as this process may use cores if None.
+    """Return `workers`, or the number of cores that this process may use if it is None.
 
     Raises:
-        ArgumentError: no positive number.
+        ArgumentError: `workers` is not positive.
     """
     if workers is None:
+        # macOS does not tell which cores a process may use.
         return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     if workers < 1:
-        raise ArgumentError("workers", expected="at least 1", found=f"{workers}")
+        raise ArgumentError("workers", expected="at least 1", found=str(workers))
     return workers
 
 
@@ -81,8 +83,9 @@ def _submit_all(
             yield pending.popleft().result()
     except BrokenExecutor as error:
         raise CarlascError(
-            "a worker process died: out of memory (try fewer workers or a coarser grid), killed from outside, or started from a script without"
-            ' `if __name__ == "__main__":`'
+            "a worker process died",
+            problem='it ran out of memory, was killed, or was started by a script without `if __name__ == "__main__":`',
+            advice="try fewer `workers` or a coarser grid",
         ) from error
     finally:
         for future in pending:
@@ -91,7 +94,7 @@ def _submit_all(
 
 @contextmanager
 def _own_processes(workers: int) -> Iterator[Executor]:
-    """Processes that end with the block: at once where it fails or is interrupted."""
+    """Yield an executor whose processes end with the block, at once if the block fails or is interrupted."""
     pool = _Processes(workers, mp_context=get_context("spawn"), initializer=_prepare_worker)
     try:
         yield pool
@@ -102,14 +105,17 @@ def _own_processes(workers: int) -> Iterator[Executor]:
 
 
 class _Processes(ProcessPoolExecutor):
-    """A pool whose processes are born deaf to Ctrl-C, with one thread each, and can be stopped in the middle of a task."""
+    """A pool whose processes ignore Ctrl-C, use one thread each, and can be stopped in the middle of a task.
+
+    Ctrl-C reaches all processes of a terminal; only the main process handles it, and stops the others.
+    """
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        with _birth():  # a pool starts its processes as tasks come in
+        with _inherited_by_workers():  # a pool starts its processes when tasks are submitted
             return super().submit(fn, *args, **kwargs)
 
     def stop(self) -> None:
-        """End the processes now. Each may remove the file that it was writing."""
+        """End the processes now; each is given time to remove the file that it was writing."""
         processes = list((self._processes or {}).values())
         self.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -121,8 +127,8 @@ class _Processes(ProcessPoolExecutor):
 
 
 @contextmanager
-def _birth() -> Iterator[None]:
-    """What a process inherits that is started in the block: Ctrl-C blocked, libraries with one thread."""
+def _inherited_by_workers() -> Iterator[None]:
+    """Within the block, block Ctrl-C and limit libraries to one thread: processes that are started in it inherit both."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -138,15 +144,15 @@ def _birth() -> Iterator[None]:
 
 
 def _prepare_worker() -> None:
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, _exit_worker)
 
 
-def _leave(*_: object) -> None:
+def _exit_worker(*_: object) -> None:
     raise SystemExit(_TERMINATED)
 
 
 class _Task:
-    """A function that, asked to leave, cleans up after itself and ends the process instead of taking the next task."""
+    """A function whose process ends on SIGTERM once the function has cleaned up, instead of taking the next task."""
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
         self.function = function

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never meets half of one."""
+"""Writing files so that a reader never sees one that is half written."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from carlasc.errors import FormatError, StorageError
 
 
 def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], object]) -> None:
-    """Write a file beside its place and rename it over: it is there whole or not at all, Ctrl-C and full disks included.
+    """Write a file under a temporary name in its folder, then rename it: it exists whole or not at all, also after Ctrl-C or on a full disk.
 
     Args:
-        path: where it goes; parent folders are made.
+        path: the file; missing parent folders are created.
         content: the bytes, or a function that writes them to an open file.
 
     Raises:
         StorageError: the disk is full or the folder cannot be written to; nothing is left behind.
     """
-    # Named before it is made: whenever a signal ends this, there is a name to remove.
+    # The name is fixed before the file exists: whenever a signal ends this, the name to remove is known.
     temporary = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}.{os.urandom(4).hex()}{_PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,12 +39,12 @@ def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], 
     except OSError as error:
         raise _storage_error(path, error) from error
     finally:
-        with suppress(OSError):  # gone where all went well; no folder where there is a file in its way
+        with suppress(OSError):  # it does not exist after success, nor does its folder where a file is in the way
             temporary.unlink()
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a text file; it is made where it is not there, with its folders.
+    """Add a line to a text file, which is created, with its folders, if it does not exist.
 
     Raises:
         StorageError: the disk is full or the folder cannot be written to.
@@ -58,9 +58,9 @@ def append_line(path: Path, line: str) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove what writers that were killed left half-written in a folder and the folders in it.
+    """Remove the temporary files that killed writers left in a folder and in the folders in it.
 
-    A temporary file is stale when the process that wrote it, on this machine, is gone, or when it is a day old.
+    A temporary file is stale if the process on this machine that wrote it has ended, or if it is a day old.
     """
     for part in (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}")):
         match = re.search(rf"\.{re.escape(_HOST)}-([0-9]+)\.[^.]+{re.escape(_PART)}$", part.name)
@@ -84,12 +84,14 @@ def _is_alive(process: int) -> bool:
 def _storage_error(path: Path, error: OSError) -> StorageError:
     advice = {errno.ENOSPC: "free some space and run again", errno.EACCES: "choose a folder that you may write to"}
     return StorageError(
-        f"{path}: cannot be written: {error.strerror or error}: {advice.get(error.errno or 0, 'check the path')}"
+        path,
+        problem=f"cannot be written: {error.strerror or error}",
+        advice=advice.get(error.errno or 0, "check the path"),
     )
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file atomically, one line, as the published params.json is."""
+    """Write a JSON file atomically, as one line, like the published params.json."""
     write_atomic(path, to_json(value))
 
 
@@ -107,9 +109,9 @@ def parse_json(data: bytes, where: str) -> dict[str, Any]:
     try:
         value = json.loads(data)
     except (ValueError, UnicodeDecodeError) as error:
-        raise FormatError(where, expected="JSON", found="something else", advice=f"{error}") from error
+        raise FormatError(where, expected="JSON", found="something else", advice=str(error)) from error
     if not isinstance(value, dict):
-        raise FormatError(where, expected="a JSON object", found=f"{type(value).__name__}")
+        raise FormatError(where, expected="a JSON object", found=type(value).__name__)
     return value
 
 

@@ -166,10 +166,12 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     where = f"{writer.location}/{layout.METADATA}"
     there = Metadata() if data is None else Metadata.from_json(data, where)
     if data is not None and (there.axes, there.classes) != (metadata.axes, metadata.classes):
+        other = " with other ids, names or roles" if there.classes.name == metadata.classes.name else ""
+        other = "" if there.classes == metadata.classes else other
         raise ConflictError(
             where,
             expected=f"the axes {metadata.axes} and the classes {metadata.classes.name}",
-            found=f"{there.axes} and {'others called ' if there.classes.name == metadata.classes.name and there.classes != metadata.classes else ''}{there.classes.name}",
+            found=f"{there.axes} and {there.classes.name}{other}",
             advice="choose another `out`",
         )
     return metadata.to_json() if data is None and metadata != Metadata() else None

@@ -121,7 +121,7 @@ class SourceContract:
     def test_an_absent_field_has_no_frames_and_reading_it_is_an_error(self, source: Source) -> None:
         sequence = source.sequences()[SCANS]
         assert len(sequence.frames("flow")) == 0
-        with pytest.raises(MissingDataError, match="flow.*labels.*points"):
+        with pytest.raises(MissingDataError, match=r"flow.*labels.*points"):
             sequence.read("flow", 0)
 
     def test_an_absent_frame_is_an_error(self, source: Source) -> None:

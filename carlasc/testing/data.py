@@ -55,7 +55,7 @@ def lines(count: int) -> tuple[bytes, bytes]:
     """Return the bytes of poses.txt and times.txt of a straight drive."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = np.arange(count) * 0.7
-    return layout.encode_poses(poses), layout.encode_times(np.arange(count) * layout.FRAME_PERIOD_S)
+    return layout.encode_poses(poses), layout.encode_times(np.arange(count, dtype=np.float64) * layout.FRAME_PERIOD_S)
 
 
 def write_dataset(root: Path, seed: int = 0) -> Path:

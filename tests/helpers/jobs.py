@@ -25,6 +25,10 @@ def fail_at_three(number: int) -> int:
     return number
 
 
+def raise_error(error: Exception) -> None:
+    raise error
+
+
 def environment(name: str) -> str | None:
     return os.environ.get(name)
 
