@@ -1,4 +1,4 @@
-"""A first look: everything from a simulated capture to pictures of its ground truth, in one go."""
+"""The demonstration: a simulated capture, its ground truth, and pictures of it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,13 @@ if TYPE_CHECKING:
     from carlasc.viewing import Scene
 
 Progress = Callable[[int, int], None]
+"""Takes (done, total)."""
+
 Step = Callable[[str], AbstractContextManager[Progress]]
+"""Takes the name of a step, and returns a context manager that gives its progress callback."""
 
 SEQUENCE = Path("Train", "Demo_Heavy")
+"""The simulated sequence, relative to the folder of the demonstration."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,12 @@ class DemoResult:
     """What the demonstration made.
 
     Attributes:
-        sequence: folder of the simulated sequence: its raw capture and its ground truth.
+        sequence: folder of the simulated sequence, with its raw capture and its ground truth.
         grids: folders of the grids.
-        pictures: pictures of them.
-        validation: what reading everything back found.
-        statistics: its classes.
-        elapsed_s: how long it all took, seconds.
+        pictures: files of the pictures.
+        validation: result of validating everything.
+        statistics: class statistics.
+        elapsed_s: duration, seconds.
     """
 
     sequence: Path
@@ -48,48 +52,47 @@ class DemoResult:
 def demonstrate(
     out: str | os.PathLike[str],
     *,
-    frames: int = 4,
+    count: int = 4,
     sensors: int = 20,
     seed: int = 0,
     workers: int | None = None,
     step: Step | None = None,
 ) -> DemoResult:
-    """Simulate a short capture, make its ground truth in three grids, read it back, draw it.
+    """Simulate a short drive, make its ground truth in three grids, validate it, count its classes, and draw it.
 
-    A second run goes on where a first one stopped.
+    A second run with the same arguments makes only what is missing, and draws the pictures again.
 
     Args:
         out: folder to write to.
-        frames: how many frames to simulate.
-        sensors: how many LiDARs.
-        seed: of the town.
-        workers: processes side by side; all cores if None.
-        step: called with the name of each step; returns a context manager that takes its progress.
+        count: number of frames.
+        sensors: number of LiDARs.
+        seed: seed of the simulated town.
+        workers: number of processes. None: one per core.
+        step: called with the name of each step. Returns a context manager that gives the step's progress callback.
 
     Returns:
         What was made.
 
     Raises:
-        ConflictError: the folder holds something else.
-        DependencyError: the simulate and render extras are missing.
+        ArgumentError: an argument is out of its range.
+        ConflictError: `out` holds something else.
+        DependencyError: a package of the extras `simulate` or `render` is missing. Nothing is written.
     """
-    from carlasc.captures.town import simulate
+    from carlasc.captures import simulate
     from carlasc.groundtruth import regrid
     from carlasc.inspection.statistics import stats
     from carlasc.inspection.validation import validate
     from carlasc.viewing import render
 
-    start, out, step = time.perf_counter(), Path(out), step or _silently
+    start, out, step = time.perf_counter(), Path(out), step or _without_progress
     sequence = out / SEQUENCE
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not sequence.is_dir())):
         raise ConflictError(
-            out, expected="an empty folder or an earlier demo", found="something else", advice="give another name"
+            out, expected="an empty folder or an earlier demo", found="something else", advice="choose another folder"
         )
 
     with step("simulate a town") as progress:
-        simulate(
-            sequence, frames=frames, sensors=sensors, seed=seed, traffic="heavy", workers=workers, progress=progress
-        )
+        simulate(sequence, count=count, sensors=sensors, seed=seed, traffic="heavy", workers=workers, progress=progress)
     grids = []
     for name, spec in _demo_grids().items():
         with step(f"ground truth, {name}") as progress:
@@ -103,7 +106,7 @@ def demonstrate(
         statistics = stats(out, progress=progress)
     pictures = []
     with step("draw") as progress:
-        jobs = _pictures(out, grids, frames - 1)
+        jobs = _list_pictures(out, grids, count - 1)
         for number, (path, scene, what, view) in enumerate(jobs, 1):
             render(scene, path, what=what, view=view, overwrite=True)
             pictures.append(path)
@@ -120,7 +123,7 @@ def _demo_grids() -> dict[str, GridSpec]:
     }
 
 
-def _pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, str]]:
+def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, str]]:
     """Return file, scene, contents and view of each picture."""
     from carlasc.viewing import Scene
 
@@ -135,5 +138,5 @@ def _pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scen
 
 
 @contextmanager
-def _silently(_: str) -> Iterator[Progress]:
+def _without_progress(_: str) -> Iterator[Progress]:
     yield lambda done, total: None

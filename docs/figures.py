@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive
 from carlasc.core.geometry import relative_to
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, REMAPS

@@ -1,4 +1,4 @@
-"""`carlasc demo`: a first look."""
+"""`carlasc demo`."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from carlasc.cli.validate import print_result
 
 def demo(
     out: Annotated[Path, typer.Argument(help="Folder to write to.")] = Path("carlasc-demo"),
-    frames: Annotated[int, typer.Option(help="Frames to simulate.", min=1)] = 4,
-    sensors: Annotated[int, typer.Option(help="LiDARs in the town.", min=1)] = 20,
-    seed: Annotated[int, typer.Option(help="Another town.", min=0)] = 0,
+    count: Annotated[int, typer.Option(help="Number of frames.", min=1)] = 4,
+    sensors: Annotated[int, typer.Option(help="Number of LiDARs.", min=1)] = 20,
+    seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
     workers: Workers = None,
 ) -> None:
-    """Simulate a town, make its ground truth in three grids, check it, draw it: everything in a minute or two."""
+    """Simulate a drive, make its ground truth in three grids, check it and draw it. This takes a minute or two."""
     from carlasc.demo import demonstrate
 
-    result = demonstrate(out, frames=frames, sensors=sensors, seed=seed, workers=workers, step=_announced)
+    result = demonstrate(out, count=count, sensors=sensors, seed=seed, workers=workers, step=_show_step)
     print_statistics(result.statistics)
     print_result(result.validation)
     typer.echo(f"\ndone in {result.elapsed_s:.0f} s")
@@ -34,15 +34,15 @@ def demo(
     for picture in result.pictures:
         typer.echo(f"picture  {picture}")
     typer.echo(
-        f"next     carlasc regrid {result.sequence} --res 0.4    or    carlasc render {result.sequence} --frames 0:{frames} -o drive.mp4"
+        f"next     carlasc regrid {result.sequence} --res 0.4    or    carlasc render {result.sequence} --frames 0:{count} -o drive.mp4"
     )
     if not result.validation.ok:
         raise typer.Exit(FAILED)
 
 
 @contextmanager
-def _announced(name: str) -> Iterator[Callable[[int, int], None]]:
-    """Say what is being done; a bar shows how far it is, where there is a terminal."""
+def _show_step(name: str) -> Iterator[Callable[[int, int], None]]:
+    """Print the name of a step, and show its progress where there is a terminal."""
     typer.echo(f"{name} ...")
     with progress_bar(name, unit="steps") as progress:
         yield progress

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive
 from carlasc.converting import convert
 from carlasc.core.tables import CARLA
 

@@ -17,7 +17,7 @@ from PIL import Image
 
 import carlasc
 from carlasc import Grid, GridSpec
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive
 from carlasc.converting import convert
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA

@@ -14,8 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from carlasc import Grid, GridSpec
-from carlasc.captures.raw import Recording
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive, Recording
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes

@@ -18,7 +18,7 @@ from PIL import Image
 
 import carlasc
 from carlasc import Grid, GridSpec
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive
 from carlasc.core.geometry import invert, relative_to
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, Voting, count_votes, regrid

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carlasc import GridSpec, regrid, simulate
+from carlasc.captures import Lidar, TrafficLevel
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Town:
     name: str
     split: str
     seed: int
-    traffic: str
+    traffic: TrafficLevel
     first_frame: int = 0
 
     @property
@@ -60,10 +61,10 @@ def build_towns(
         folder = out / town.path
         simulate(
             folder,
-            frames=frames,
+            count=frames,
             first_frame=town.first_frame,
             sensors=sensors,
-            points=points,
+            lidar=Lidar(points=points),
             seed=town.seed,
             traffic=town.traffic,
             bev=False,

@@ -156,8 +156,8 @@ SPOILT = {  # folder -> (array that is written over it, what the error says)
     ),
     "infinite": ("velodyne0", np.full((300, 3), np.inf, np.float32), "expected finite coordinates, found .*inf.*"),
     "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 on 300 of 300"),
-    "short labels": ("labels0", np.zeros(299, np.uint32), "expected 300 values, one a point .*, found 299"),
-    "long instances": ("instances0", np.zeros(301, np.uint32), "expected 300 values, one a point .*, found 301"),
+    "short labels": ("labels0", np.zeros(299, np.uint32), "expected 300 values, one per point .*, found 299"),
+    "long instances": ("instances0", np.zeros(301, np.uint32), "expected 300 values, one per point .*, found 301"),
     "signed labels": ("labels0", np.zeros(300, np.int32), "expected uint32 values, found int32"),
     "NaN velocity": ("velocities0", np.full((1, 4), np.nan), "expected finite"),
     "scaled pose": ("pose0", 2 * np.eye(4), "expected a rigid transform"),
@@ -181,8 +181,11 @@ def test_a_spoilt_file_is_named_with_what_was_expected_and_found(tmp_path, spoil
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data[:-5], r"expected 3728 bytes \(300 x 3 float32\), found 3723: cut short"),
-        (lambda data: data + b"more", r"expected 3728 bytes .*, found 3732: cut short, or something was added"),
+        (lambda data: data[:-5], r"expected 3728 bytes \(300 x 3 float32\), found 3723: the file is cut short"),
+        (
+            lambda data: data + b"more",
+            r"expected 3728 bytes .*, found 3732: the file is cut short, or something was added",
+        ),
         (lambda data: data[:60], "expected a .npy array, found something else"),
         (lambda data: b"", "expected a .npy array, found something else"),
         (lambda data: b"x" * 4000, "expected a .npy array, found something else"),

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from helpers.kitti import SMALL_LIDAR, KittiTruth, write_kitti
 
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive
 
 
 @pytest.fixture(scope="session")

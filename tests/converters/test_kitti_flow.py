@@ -5,7 +5,7 @@ import pytest
 from helpers.kitti import write_kitti
 
 import carlasc
-from carlasc.captures.town import Drive
+from carlasc.captures import Drive
 from carlasc.converting import convert
 
 SEQUENCE = "Train/KITTI_00/cartesian"

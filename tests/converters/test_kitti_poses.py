@@ -8,8 +8,7 @@ from helpers.kitti import write_kitti
 from helpers.tiny_kitti import write_tiny_kitti
 
 import carlasc
-from carlasc.captures.town import Drive
-from carlasc.captures.town.lidar import Lidar
+from carlasc.captures import Drive, Lidar
 from carlasc.converting import convert
 from carlasc.storage import layout
 

@@ -205,7 +205,7 @@ class World:
 
     def _deliver(self, measured):
         for callback, data in measured:
-            if not self.server.deaf:
+            if not self.server.silent:
                 time.sleep(0.0002)
                 callback(data)
 
@@ -216,14 +216,14 @@ class StandIn:
     Attributes:
         fail_at: (what, how often it succeeds first, error): makes `tick` or `spawn` fail.
         places: number of spawn points.
-        deaf: sensors deliver nothing.
+        silent: sensors deliver nothing.
         stubborn: vehicles cannot be destroyed.
         drift: metres a tick by which physics differ.
     """
 
     def __init__(self, version="0.9.13"):
         self.version, self.places, self.fail_at = version, 20, None
-        self.deaf, self.stubborn, self.drift = False, False, 0.0
+        self.silent, self.stubborn, self.drift = False, False, 0.0
         self.ticks, self._ids, self.complaints, self.managers = 0, 200, [], {}
         self.navigation = random.Random(0)
         self._calls = {"tick": 0, "spawn": 0}

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.town import Drive
-from carlasc.captures.town.lidar import Lidar
+from carlasc.captures import Drive, Lidar
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import REMAPS
 

@@ -11,6 +11,7 @@ from helpers.screens import virtual_screen
 from helpers.viewing import write_page
 
 from carlasc import regrid, simulate
+from carlasc.captures import Lidar
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town") / "Train" / "Demo_Heavy"
-    simulate(folder, frames=2, sensors=6, traffic="heavy", points=60_000, bev=False, workers=1)
+    simulate(folder, count=2, sensors=6, traffic="heavy", lidar=Lidar(points=60_000), bev=False, workers=1)
     regrid(folder, GridSpec.published(), workers=1)
     return folder / "cartesian"
 

@@ -1,5 +1,1 @@
-"""Raw captures from a running CARLA server."""
-
-from carlasc.captures.carla.run import RecordResult, record
-
-__all__ = ["RecordResult", "record"]
+"""The client of a CARLA server that records raw captures."""

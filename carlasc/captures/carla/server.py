@@ -1,7 +1,7 @@
-"""A CARLA server, as much of it as recording needs: the only place that speaks to the `carla` package.
+"""The connection to a CARLA server. Only this module calls the `carla` package.
 
-Everything that is changed on the server is undone when the `with` block ends, however it ends: actors are destroyed, the youngest first, and
-settings are restored.
+When the `with` block of a connection ends, also with an error, all changes on the server are undone: actors are destroyed in the
+reverse order of their creation, and settings are restored.
 """
 
 from __future__ import annotations
@@ -19,26 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, import_extra
+from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 
-DETECTION = np.dtype(  # a semantic LiDAR record (FORMAT section 2)
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cos", "<f4"), ("actor", "<u4"), ("tag", "<u4")]
-)
+DETECTION = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cos", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
+"""One return of CARLA's semantic LiDAR: position, cosine of the angle of incidence, id of the actor, class id."""
 
 
 class ServerError(CarlascError):
-    """The server did not answer, or not as expected."""
+    """A CARLA server did not answer, or did not answer as expected."""
 
 
 @dataclass(frozen=True)
 class SemanticSweep:
-    """What a semantic LiDAR measured in one tick.
+    """The measurement of a semantic LiDAR in one tick.
 
     Attributes:
-        detections: (N,) of `DETECTION`, in the sensor's frame (x forward, y right, z up).
-        world_T_sensor: (4, 4) float64.
-        elapsed_s: the simulation's seconds.
+        detections: (N,) of type `DETECTION`, in the sensor's frame (x forward, y right, z up).
+        world_T_sensor: (4, 4) float64 pose.
+        elapsed_s: the simulation's time, seconds.
     """
 
     detections: NDArray[np.void]
@@ -47,56 +46,65 @@ class SemanticSweep:
 
 
 class Server:
-    """A connection. Use it in a `with` block: at its end the server is as it was."""
+    """A connection to a CARLA server, used in a `with` block. At its end the server is as it was before.
+
+    Attributes:
+        carla: module of the client.
+        where: what errors call the server: its host and port.
+        timeout_s: longest time that it may take to answer, seconds.
+        version: its version.
+        initial_actors: ids of the actors of the town before any was spawned, in ascending order.
+    """
 
     def __init__(self, host: str, port: int, timeout_s: float, carla: Any = None) -> None:
         """Connect.
 
         Args:
-            host: where the server runs.
+            host: host of the server.
             port: its RPC port.
-            timeout_s: how long an answer may take, seconds.
-            carla: the client's module; None imports the official package.
+            timeout_s: longest time that it may take to answer, seconds.
+            carla: module of the client. None: the package `carla`.
 
         Raises:
             DependencyError: the `carla` package is not installed.
-            ServerError: no server answers.
+            ServerError: no server answers, or its version cannot be read.
         """
         self.carla = carla if carla is not None else import_extra("carla", "carla")
-        self.where, self.timeout_s = f"{host}:{port}", timeout_s
-        self._stack = ExitStack()
+        self.where, self.timeout_s = f"CARLA at {host}:{port}", timeout_s
+        self._cleanup = ExitStack()
         self._client = self.carla.Client(host, port)
         self._client.set_timeout(timeout_s)
-        with self._asking("its version"):
+        with self._waiting_for("its version"):
             self.version = str(self._client.get_server_version())
+        self.initial_actors: tuple[int, ...] = ()
         self._world: Any = None
-        self._failures: list[str] = []  # of the clean-up
+        self._cleanup_errors: list[str] = []
 
     @property
     def version_numbers(self) -> tuple[int, ...]:
-        """The server's version: (0, 9, 15).
+        """The server's version as numbers, such as (0, 9, 15).
 
         Raises:
-            ServerError: it has none.
+            ServerError: the version is not of this form.
         """
         match = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", self.version)
         if match is None:
-            raise ServerError(f"CARLA at {self.where}: expected a version such as 0.9.15, found {self.version!r}")
+            raise ServerError(self.where, expected="a version such as 0.9.15", found=repr(self.version))
         return tuple(int(part or 0) for part in match.groups())
 
     def load_town(self, town: str) -> None:
-        """Load a town anew, and step it by ourselves, 0.1 s a tick, until the block ends.
+        """Reload a town in synchronous mode, with 0.1 s per tick, until the block ends.
 
         Raises:
             ArgumentError: the server has no such town.
             ServerError: it does not answer.
         """
-        with self._asking(f"the town {town}"):
+        with self._waiting_for(f"the town {town}"):
             towns = sorted({str(name).rsplit("/", 1)[-1] for name in self._client.get_available_maps()})
             if town not in towns:
-                raise ArgumentError(f"town {town!r}: expected one that the server has: {', '.join(towns)}")
+                raise ArgumentError("town", expected=f"one of the server's towns: {', '.join(towns)}", found=repr(town))
             before = self._client.get_world().get_settings()
-            self._stack.callback(
+            self._cleanup.callback(
                 self._restore, before.synchronous_mode, before.fixed_delta_seconds, before.no_rendering_mode
             )
             self._world = self._client.load_world(town)
@@ -104,69 +112,79 @@ class Server:
             settings.synchronous_mode, settings.fixed_delta_seconds = True, FRAME_PERIOD_S
             settings.no_rendering_mode = False
             self._world.apply_settings(settings)
-            self.ids_before = sorted(int(actor.id) for actor in self._world.get_actors())
+            self.initial_actors = tuple(sorted(int(actor.id) for actor in self._world.get_actors()))
 
-    def steer_traffic(self, port: int, seed: int) -> None:
-        """Let the traffic manager drive in step with us, the same way every time."""
-        with self._asking("its traffic manager"):
+    def set_up_traffic(self, port: int, seed: int) -> None:
+        """Put the traffic manager in synchronous mode, and seed it and the pedestrians."""
+        with self._waiting_for("its traffic manager"):
             manager = self._client.get_trafficmanager(port)
-            self._stack.callback(self._attempt, lambda: manager.set_synchronous_mode(False))
+            self._cleanup.callback(self._attempt, lambda: manager.set_synchronous_mode(False))
             manager.set_synchronous_mode(True)
             manager.set_random_device_seed(seed)
             self._world.set_pedestrians_seed(seed)
 
     def blueprints(self, pattern: str) -> list[Any]:
-        """Return the blueprints of a pattern such as "vehicle.*", by name."""
+        """Return the blueprints that match a pattern such as "vehicle.*", sorted by name."""
         return sorted(self._world.get_blueprint_library().filter(pattern), key=lambda blueprint: str(blueprint.id))
 
     def spawn_points(self) -> list[Any]:
-        """Return the places where vehicles may start."""
+        """Return the transforms at which vehicles may be spawned."""
         return list(self._world.get_map().get_spawn_points())
 
-    def walkable_place(self) -> Any | None:
-        """Return a random place on a pavement, None where none was found."""
+    def random_sidewalk_location(self) -> Any | None:
+        """Return a random location for a pedestrian, or None where the server found none."""
         return self._world.get_random_location_from_navigation()
 
     def transform(self, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0), pitch_deg: float = 0.0) -> Any:
-        """Return CARLA's transform of a place, level but for its pitch."""
+        """Return CARLA's transform of a position in metres, with a pitch only."""
         carla = self.carla
         return carla.Transform(carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=0.0, roll=0.0))
 
-    def at(self, location: Any) -> Any:
-        """Return CARLA's transform of a location."""
+    def transform_at(self, location: Any) -> Any:
+        """Return CARLA's transform of a location, without rotation."""
         return self.carla.Transform(location)
 
-    def spawn(self, blueprint: Any, transform: Any, parent: Any = None, undo: str | None = None) -> Any | None:
-        """Spawn an actor that is destroyed when the block ends; None where there is no room for it.
+    def spawn(
+        self, blueprint: Any, transform: Any, parent: Any = None, before_destroy: str | None = None
+    ) -> Any | None:
+        """Spawn an actor, which is destroyed when the block ends.
 
         Args:
-            blueprint: what.
-            transform: where; from the parent where there is one.
-            parent: what it is fixed to.
-            undo: name of the method to call before it is destroyed ("stop").
+            blueprint: kind of actor.
+            transform: its pose: in the parent's frame, or in the world's where it has no parent.
+            parent: actor that it is attached to.
+            before_destroy: name of the method to call before it is destroyed, such as "stop".
+
+        Returns:
+            The actor, or None where there is no room for it.
         """
-        with self._asking(f"a {blueprint.id}"):
+        with self._waiting_for(f"a {blueprint.id}"):
             actor = self._world.try_spawn_actor(blueprint, transform, attach_to=parent)
         if actor is not None:
-            self._stack.callback(self._destroy, actor, undo)
+            self._cleanup.callback(self._destroy, actor, before_destroy)
         return actor
 
     def listen(self, sensor: Any) -> queue.Queue[Any]:
-        """Return the queue that a sensor's measurements come in."""
+        """Return the queue that receives a sensor's measurements."""
         arrived: queue.Queue[Any] = queue.Queue()
         sensor.listen(arrived.put)
         return arrived
 
     def tick(self) -> int:
-        """Go on by 0.1 s; returns the server's number of the frame."""
-        with self._asking("the next tick"):
+        """Advance the simulation by 0.1 s. Return the server's number of the tick."""
+        with self._waiting_for("the next tick"):
             return int(self._world.tick(self.timeout_s))
 
     def measurement(self, arrived: queue.Queue[Any], tick: int, sensor: str) -> Any:
         """Return what a sensor measured in a tick.
 
+        Args:
+            arrived: queue of the sensor's measurements.
+            tick: the server's number of the tick.
+            sensor: what errors call the sensor.
+
         Raises:
-            ServerError: it does not arrive.
+            ServerError: the measurement does not arrive in time, or a later one arrives instead.
         """
         deadline = time.monotonic() + self.timeout_s
         while True:
@@ -174,23 +192,31 @@ class Server:
                 data = arrived.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
                 raise ServerError(
-                    f"CARLA at {self.where}: expected {sensor} to measure within {self.timeout_s:g} s, found nothing: raise --timeout, or lower --points"
+                    self.where,
+                    expected=f"a measurement of {sensor} within {self.timeout_s:g} s",
+                    found="none",
+                    advice="raise `timeout_s`, or lower `points`",
                 ) from None
             if data.frame == tick:
                 return data
             if data.frame > tick:
                 raise ServerError(
-                    f"CARLA at {self.where}: expected {sensor}'s frame {tick}, found {data.frame}: does another client tick this server?"
+                    self.where,
+                    expected=f"tick {tick} of {sensor}",
+                    found=str(data.frame),
+                    advice="check that no other client ticks this server",
                 )
 
     def velocities(self, actors: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Return (K, 3) world velocities of actors, m/s, as of the last tick; zero for one that is gone."""
+        """Return (K, 3) velocities of actors after the last tick, m/s, world frame; zero for actors that no longer exist."""
         snapshot = self._world.get_snapshot()
-        found = [snapshot.find(int(actor)) for actor in actors]
-        rows = [
-            (v.x, v.y, v.z) if (v := None if a is None else a.get_velocity()) is not None else (0.0,) * 3 for a in found
-        ]
-        return np.array(rows, np.float64).reshape(-1, 3)
+        velocities = np.zeros((len(actors), 3))
+        for row, actor in enumerate(actors):
+            found = snapshot.find(int(actor))
+            if found is not None:
+                velocity = found.get_velocity()
+                velocities[row] = velocity.x, velocity.y, velocity.z
+        return velocities
 
     def __enter__(self) -> Self:
         return self
@@ -198,15 +224,16 @@ class Server:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.close()
-        if self._failures and error is None:
-            raise ServerError(f"CARLA at {self.where}: could not be cleaned up: {self._failures[0]}: restart it")
+        self._cleanup.close()
+        if self._cleanup_errors and error is None:
+            raise ServerError(
+                self.where, problem=f"could not be cleaned up: {self._cleanup_errors[0]}", advice="restart it"
+            )
 
-    def _destroy(self, actor: Any, undo: str | None) -> None:
-        """Undo one actor; the others follow whatever happens."""
+    def _destroy(self, actor: Any, before: str | None) -> None:
         if actor.is_alive:
-            if undo is not None:
-                self._attempt(getattr(actor, undo))
+            if before is not None:
+                self._attempt(getattr(actor, before))
             self._attempt(actor.destroy)
 
     def _restore(self, synchronous: bool, delta_s: float | None, no_rendering: bool) -> None:
@@ -220,18 +247,23 @@ class Server:
         self._attempt(restore)
 
     def _attempt(self, action: Callable[[], object]) -> None:
+        """Do one step of the clean-up. An error is noted, and the other steps follow."""
         try:
             action()
-        except RuntimeError as error:  # the client's only kind: gone already, or no answer
-            self._failures.append(str(error))
+        except RuntimeError as error:  # the only error that the client raises: the actor no longer exists, or no answer
+            self._cleanup_errors.append(str(error))
 
     @contextmanager
-    def _asking(self, what: str) -> Iterator[None]:
+    def _waiting_for(self, what: str) -> Iterator[None]:
+        """Raise ServerError where the client reports an error in the block."""
         try:
             yield
         except RuntimeError as error:
             raise ServerError(
-                f"CARLA at {self.where}: expected {what} within {self.timeout_s:g} s, found: {error}: is it running? See --host, --port, --timeout"
+                self.where,
+                expected=f"{what} within {self.timeout_s:g} s",
+                found=str(error),
+                advice="check that the server runs, and `host`, `port` and `timeout_s`",
             ) from error
 
 
@@ -239,15 +271,15 @@ def decode_sweep(measurement: Any) -> SemanticSweep:
     """Read a `carla.SemanticLidarMeasurement`.
 
     Raises:
-        MissingDataError: its bytes are no whole records.
+        FormatError: its number of bytes is not a multiple of a detection's.
     """
     data = bytes(measurement.raw_data)
     if len(data) % DETECTION.itemsize:
-        raise MissingDataError(
+        raise FormatError(
             "semantic LiDAR",
             expected=f"a multiple of {DETECTION.itemsize} bytes",
-            found=f"{len(data)}",
-            advice="is the server of another version?",
+            found=str(len(data)),
+            advice="check that client and server have the same version",
         )
     pose = np.array(measurement.transform.get_matrix(), np.float64)
     return SemanticSweep(np.frombuffer(data, DETECTION), pose, float(measurement.timestamp))

@@ -1,4 +1,4 @@
-"""Buildings: walls with windows and ledges that stand out of them, and roofs."""
+"""Buildings: walls with window frames, ledges and balconies, and roofs."""
 
 from __future__ import annotations
 
@@ -10,26 +10,38 @@ from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
 
 BUILDING = CARLA.id_of("Building")
-FOUNDATION_M = 1.0  # how deep walls go below the ground, which is not level
+FOUNDATION_M = 1.0  # depth of the walls below the ground, which is not level
 
 
-def building(rng: np.random.Generator, footprint: Rectangle, height_m: float, pitched: bool) -> tuple[Mesh, Transform]:
-    """Return a building's mesh in its own frame (x along the street, y away from it) and world_T_building."""
+def make_building(
+    rng: np.random.Generator, footprint: Rectangle, height_m: float, pitched: bool
+) -> tuple[Mesh, Transform]:
+    """Make a building.
+
+    Args:
+        rng: source of the random numbers.
+        footprint: its ground plan.
+        height_m: height of its walls.
+        pitched: whether its roof is pitched; it is flat otherwise.
+
+    Returns:
+        The mesh in the building's frame (x along the street, y away from the street), and world_T_building.
+    """
     width, depth = footprint.size
     storey = float(rng.uniform(2.9, 3.5))
     builder = MeshBuilder()
     builder.boxes(BUILDING, (0, 0, -FOUNDATION_M), (width, depth, height_m + FOUNDATION_M))
-    _ground_floor(builder, rng, width, depth)
-    _facades(builder, rng, width, depth, height_m, storey)
+    _add_entrance(builder, rng, width, depth)
+    _add_facades(builder, rng, width, depth, height_m, storey)
     if pitched:
-        _pitched_roof(builder, rng, width, depth, height_m)
+        _add_pitched_roof(builder, rng, width, depth, height_m)
     else:
-        _flat_roof(builder, rng, width, depth, height_m)
+        _add_flat_roof(builder, rng, width, depth, height_m)
     return builder.build(), translation((*footprint.centre, 0.0)) @ rotation_z(footprint.yaw_rad)
 
 
-def _ground_floor(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float) -> None:
-    """A door with steps and a porch roof, on the street's side (y < 0)."""
+def _add_entrance(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float) -> None:
+    """Add a door with steps and a porch roof on the side of the street (y < 0)."""
     x = float(rng.uniform(-0.3, 0.3)) * width
     builder.boxes(BUILDING, (x, -depth / 2 - 0.35, -0.5), (2.0, 0.7, 0.5 + 0.3))
     builder.boxes(BUILDING, (x, -depth / 2 - 0.45, 2.6), (2.4, 0.9, 0.12))
@@ -37,10 +49,10 @@ def _ground_floor(builder: MeshBuilder, rng: np.random.Generator, width: float, 
         builder.boxes(BUILDING, (x + side * 0.7, -depth / 2 - 0.08, 0.3), (0.2, 0.16, 2.3))
 
 
-def _facades(
+def _add_facades(
     builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float, storey: float
 ) -> None:
-    """Window frames and sills on all four sides, a ledge a storey, pillars at the corners, some balconies."""
+    """Add window frames and sills on all four sides, a ledge per storey, pillars at the corners, and some balconies."""
     pitch = float(rng.uniform(2.2, 3.6))
     floors = np.arange(int(height // storey)) * storey
     balconies = rng.random() < 0.35
@@ -75,7 +87,7 @@ def _facades(
     builder.boxes(BUILDING, corners - (0, 0, FOUNDATION_M), (0.5, 0.5, height + FOUNDATION_M))
 
 
-def _flat_roof(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float) -> None:
+def _add_flat_roof(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float) -> None:
     for y in (-1, 1):
         builder.boxes(BUILDING, (0, y * (depth / 2), height - 0.1), (width + 0.5, 0.45, 0.75))
     for x in (-1, 1):
@@ -85,7 +97,9 @@ def _flat_roof(builder: MeshBuilder, rng: np.random.Generator, width: float, dep
         builder.boxes(BUILDING, (*place, height), rng.uniform((1.0, 1.0, 0.8), (2.5, 2.5, 2.0)))
 
 
-def _pitched_roof(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float) -> None:
+def _add_pitched_roof(
+    builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float
+) -> None:
     eaves, rise = 0.45, depth / 2 * float(rng.uniform(0.5, 0.9))
     roof = np.array([(-width / 2 - eaves, height - 0.15), (width / 2 + eaves, height - 0.15)])
     x = np.array([roof[0, 0], roof[1, 0], roof[1, 0], roof[0, 0], roof[0, 0], roof[1, 0]])

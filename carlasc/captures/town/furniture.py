@@ -1,4 +1,4 @@
-"""Street furniture. Each piece stands at the origin; x runs along the street, and y points away from it."""
+"""Street furniture, each piece in its own frame: origin on the ground, x along the street, y away from the street."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ FENCE, OTHER, POLE, WALL = (CARLA.id_of(name) for name in ("Fence", "Other", "Po
 TRAFFIC_SIGN, TRAFFIC_LIGHT = CARLA.id_of("TrafficSign"), CARLA.id_of("TrafficLight")
 GUARD_RAIL, STATIC, DYNAMIC = (CARLA.id_of(name) for name in ("GuardRail", "Static", "Dynamic"))
 BRIDGE, RAIL_TRACK, GROUND = CARLA.id_of("Bridge"), CARLA.id_of("RailTrack"), CARLA.id_of("Ground")
-POST_DEPTH_M = 0.3  # how deep posts go into the ground, which is not level
+POST_DEPTH_M = 0.3  # depth of posts below the ground, which is not level
 
 
 def street_lamp() -> Mesh:
-    """Return a lamp post whose arm reaches over the street."""
+    """Return a street lamp whose arm extends over the street."""
     builder = MeshBuilder()
     builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.15, 1.0 + POST_DEPTH_M, 10, top=0.8)
     builder.cylinder(POLE, (0, 0, 0.7), 0.1, 6.6, 8, top=0.6)
@@ -40,7 +40,7 @@ def bollard() -> Mesh:
 
 
 def sign(rng: np.random.Generator) -> Mesh:
-    """Return a traffic sign that faces those who drive along +x."""
+    """Return a traffic sign that faces traffic along +x."""
     builder = MeshBuilder()
     height = float(rng.uniform(2.0, 2.4))
     builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.045, height + 0.7 + POST_DEPTH_M, 7)
@@ -54,17 +54,12 @@ def sign(rng: np.random.Generator) -> Mesh:
     return builder.build()
 
 
-def gantry_sign() -> Mesh:
-    """Return a large direction sign on two posts."""
-    builder = MeshBuilder()
-    for y in (-0.9, 0.9):
-        builder.cylinder(POLE, (0, y, -POST_DEPTH_M), 0.07, 3.4 + POST_DEPTH_M, 8)
-    builder.boxes(TRAFFIC_SIGN, (-0.1, 0, 2.0), (0.05, 2.4, 1.3))
-    return builder.build()
-
-
 def traffic_light(reach_m: float) -> Mesh:
-    """Return a traffic light for those who drive along +x: one on the post, one on an arm over the lane."""
+    """Return traffic lights that face traffic along +x: one on the post, and one on an arm over the lane.
+
+    Args:
+        reach_m: length of the arm.
+    """
     builder = MeshBuilder()
     builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.11, 5.9 + POST_DEPTH_M, 8, top=0.8)
     builder.rod(POLE, (0, 0, 5.6), (0, -reach_m, 5.8), 0.06)
@@ -85,7 +80,7 @@ def bench() -> Mesh:
     return builder.build()
 
 
-def bin_() -> Mesh:
+def litter_bin() -> Mesh:
     """Return a litter bin."""
     builder = MeshBuilder()
     builder.cylinder(STATIC, (0, 0, 0), 0.27, 0.95, 10, top=1.1)
@@ -108,19 +103,19 @@ def hydrant() -> Mesh:
 
 
 def trash(rng: np.random.Generator) -> Mesh:
-    """Return a heap of trash bags and boxes: movable things, CARLA's Dynamic."""
+    """Return a heap of trash bags and boxes, of CARLA's class Dynamic."""
     builder = MeshBuilder()
     for _ in range(int(rng.integers(2, 5))):
-        place, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.3, 0.65, 3)
+        position, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.3, 0.65, 3)
         if rng.random() < 0.5:
-            builder.cylinder(DYNAMIC, (*place, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5)
+            builder.cylinder(DYNAMIC, (*position, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5)
         else:
-            builder.boxes(DYNAMIC, (*place, 0), size, float(rng.uniform(0, np.pi)))
+            builder.boxes(DYNAMIC, (*position, 0), size, float(rng.uniform(0, np.pi)))
     return builder.build()
 
 
 def barrier() -> Mesh:
-    """Return a street barrier with a chair's worth of clutter: Dynamic."""
+    """Return a movable street barrier, of CARLA's class Dynamic."""
     builder = MeshBuilder()
     builder.boxes(DYNAMIC, (0, 0, 0.35), (1.3, 0.06, 0.6))
     for x in (-0.5, 0.5):
@@ -129,7 +124,7 @@ def barrier() -> Mesh:
 
 
 def kiosk() -> Mesh:
-    """Return a news stand: CARLA has no class for it but Other."""
+    """Return a kiosk, of CARLA's class Other."""
     builder = MeshBuilder()
     builder.boxes(OTHER, (0, 0, -0.2), (2.4, 1.8, 2.6))
     builder.boxes(OTHER, (0, -0.3, 2.4), (3.0, 2.6, 0.12))
@@ -137,7 +132,7 @@ def kiosk() -> Mesh:
 
 
 def bus_shelter() -> Mesh:
-    """Return a bus shelter, open to the street."""
+    """Return a bus shelter that is open towards the street."""
     builder = MeshBuilder()
     builder.boxes(STATIC, (0, 0.55, 0), (3.6, 0.06, 2.3))
     for x in (-1.8, 1.8):
@@ -148,7 +143,7 @@ def bus_shelter() -> Mesh:
 
 
 def fence(length_m: float, height_m: float = 1.3) -> Mesh:
-    """Return a fence along x, centred: posts, rails, and slats that a LiDAR partly sees through."""
+    """Return a fence along x with its middle at the origin: posts, rails, and slats with gaps that some rays pass."""
     builder = MeshBuilder()
     posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.2), 1) + 1)
     builder.boxes(
@@ -162,7 +157,7 @@ def fence(length_m: float, height_m: float = 1.3) -> Mesh:
 
 
 def wall(length_m: float, height_m: float) -> Mesh:
-    """Return a free-standing wall along x, centred, with a coping and pillars."""
+    """Return a free-standing wall along x with its middle at the origin, with a coping and pillars."""
     builder = MeshBuilder()
     builder.boxes(WALL, (0, 0, -0.5), (length_m, 0.24, height_m + 0.5))
     builder.boxes(WALL, (0, 0, height_m), (length_m + 0.1, 0.34, 0.09))
@@ -172,7 +167,7 @@ def wall(length_m: float, height_m: float) -> Mesh:
 
 
 def guard_rail(length_m: float) -> Mesh:
-    """Return a crash barrier along x, centred, its beam towards the street."""
+    """Return a guard rail along x with its middle at the origin. Its beam is on the side of the street."""
     builder = MeshBuilder()
     posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.0), 1) + 1)
     builder.boxes(
@@ -184,7 +179,7 @@ def guard_rail(length_m: float) -> Mesh:
 
 
 def footbridge(span_m: float) -> Mesh:
-    """Return a footbridge along y across a street, its middle at the origin, with stairs at both ends."""
+    """Return a footbridge across a street, along y, with its middle at the origin and stairs at both ends."""
     builder = MeshBuilder()
     half, deck = span_m / 2, 5.3
     builder.boxes(BRIDGE, (0, 0, deck), (2.4, span_m, 0.35))
@@ -195,13 +190,13 @@ def footbridge(span_m: float) -> Mesh:
             builder.boxes(BRIDGE, (x, side * (half - 0.4), -0.3), (0.45, 0.45, deck + 0.3))
         steps = np.arange(16)
         rise = deck * (1 - (steps + 1) / 17)
-        place = np.column_stack([1.4 + 0.3 * steps, np.full(16, side * (half - 0.7)), rise])
-        builder.boxes(BRIDGE, place, (0.32, 1.3, 0.34))
+        position = np.column_stack([1.4 + 0.3 * steps, np.full(16, side * (half - 0.7)), rise])
+        builder.boxes(BRIDGE, position, (0.32, 1.3, 0.34))
     return builder.build()
 
 
 def rail_track(length_m: float) -> Mesh:
-    """Return a railway track along x: ballast is Ground, sleepers and rails RailTrack."""
+    """Return a railway track along x. The ballast is of the class Ground, sleepers and rails of RailTrack."""
     builder = MeshBuilder()
     builder.boxes(GROUND, (0, 0, -0.6), (length_m, 3.6, 0.78))
     sleepers = np.arange(-length_m / 2, length_m / 2, 0.65)

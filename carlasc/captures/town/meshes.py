@@ -1,4 +1,4 @@
-"""Triangle meshes with a class on every triangle, and the few solids that a town is put together from."""
+"""Triangle meshes with a class per triangle, and the buildings that the town consists of."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class Mesh:
     Attributes:
         vertices: (V, 3) float64, metres.
         faces: (F, 3) int32, rows of `vertices`.
-        labels: (F,) uint8, class of each triangle.
+        labels: (F,) uint8, class id of each triangle.
     """
 
     vertices: Vertices
     faces: Faces
     labels: NDArray[np.uint8]
 
-    def moved(self, dst_T_src: Transform) -> Mesh:
+    def transformed(self, dst_T_src: Transform) -> Mesh:
         """Return the mesh in the frame `dst`."""
         return Mesh(transform_points(dst_T_src, self.vertices), self.faces, self.labels)
 
     def select(self, keep: NDArray[np.bool_]) -> Mesh:
-        """Return the mesh of some triangles, chosen by a mask (F,), without the vertices that no other uses."""
+        """Return the mesh of the triangles that a mask (F,) selects, without the vertices that none of them uses."""
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), np.bool_)
         used[faces] = True
@@ -49,7 +49,7 @@ class Mesh:
 
 
 class MeshBuilder:
-    """Collects solids into one mesh."""
+    """Collects buildings in one mesh."""
 
     def __init__(self) -> None:
         self._vertices: list[Vertices] = []
@@ -58,13 +58,19 @@ class MeshBuilder:
         self._count = 0
 
     def build(self) -> Mesh:
-        """Return everything added so far as one mesh."""
+        """Return the mesh of everything that was added."""
         if not self._faces:
             return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.uint8))
         return Mesh(np.concatenate(self._vertices), np.concatenate(self._faces), np.concatenate(self._labels))
 
     def add(self, label: int, vertices: ArrayLike, faces: ArrayLike) -> None:
-        """Add triangles of one class: vertices (V, 3), faces (F, 3)."""
+        """Add triangles of one class.
+
+        Args:
+            label: class id.
+            vertices: (V, 3) metres.
+            faces: (F, 3) rows of `vertices`.
+        """
         corners, rows = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
         self._vertices.append(corners)
         self._faces.append(rows + np.int32(self._count))
@@ -72,7 +78,7 @@ class MeshBuilder:
         self._count += len(corners)
 
     def add_mesh(self, mesh: Mesh, dst_T_src: Transform) -> None:
-        """Add a mesh with its own classes, moved to the builder's frame."""
+        """Add a mesh with the classes that it has, moved from its frame `src` to the builder's frame `dst`."""
         self._vertices.append(transform_points(dst_T_src, mesh.vertices))
         self._faces.append(mesh.faces + np.int32(self._count))
         self._labels.append(mesh.labels)
@@ -82,46 +88,63 @@ class MeshBuilder:
         """Add upright boxes.
 
         Args:
-            label: class.
-            base: (3,) or (N, 3), the middle of the underside.
-            size: (3,) or (N, 3), extent along the box's own x, y and z.
-            yaw_rad: () or (N,), how the boxes are turned.
+            label: class id.
+            base: (3,) or (N, 3) centres of the lower faces, metres.
+            size: (3,) or (N, 3) lengths along each box's own x, y and z, metres.
+            yaw_rad: () or (N,) rotations about z.
         """
         base, size = np.atleast_2d(np.asarray(base, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
         count = max(len(base), len(size))
         corners, faces = _unit_box()
         local = corners * np.broadcast_to(size, (count, 3))[:, None, :]
-        moved = _turned(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,))) + base[:, None, :]
+        moved = _rotate_z(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,))) + base[:, None, :]
         offsets = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
         self.add(label, moved.reshape(-1, 3), (faces + offsets).reshape(-1, 3))
 
-    def decals(self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0) -> None:
-        """Add level rectangles: paint on a road.
+    def level_rectangles(self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0) -> None:
+        """Add horizontal rectangles, such as road markings.
 
         Args:
-            label: class.
-            centre: (3,) or (N, 3).
-            size: (2,) or (N, 2), extent along the rectangle's own x and y.
-            yaw_rad: how they are turned.
+            label: class id.
+            centre: (3,) or (N, 3) metres.
+            size: (2,) or (N, 2) lengths along each rectangle's own x and y, metres.
+            yaw_rad: rotation about z.
         """
         centre, size = np.atleast_2d(np.asarray(centre, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
-        local = corners * lifted(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
-        moved = _turned(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
+        local = corners * at_height(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
+        moved = _rotate_z(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
         first = np.arange(len(centre), dtype=np.int32)[:, None, None] * np.int32(4)
         self.add(label, moved.reshape(-1, 3), (np.array([[0, 1, 2], [0, 2, 3]]) + first).reshape(-1, 3))
 
     def cylinder(
         self, label: int, base: ArrayLike, radius: float, height: float, sections: int = 8, top: float = 1.0
     ) -> None:
-        """Add an upright cylinder on `base` (3,); its upper radius is `top` times the lower one."""
+        """Add an upright cylinder, or a truncated cone.
+
+        Args:
+            label: class id.
+            base: (3,) centre of the lower face, metres.
+            radius: radius of the lower face, metres.
+            height: metres.
+            sections: number of flat faces around it.
+            top: radius of the upper face, relative to the lower one.
+        """
         vertices, faces = _unit_cylinder(sections)
         taper = 1.0 + (top - 1.0) * vertices[:, 2:]
         scaled = np.hstack([vertices[:, :2] * radius * taper, vertices[:, 2:] * height])
         self.add(label, scaled + np.asarray(base, np.float64), faces)
 
     def rod(self, label: int, start: ArrayLike, end: ArrayLike, radius: float, sections: int = 6) -> None:
-        """Add a round rod from `start` to `end`, (3,) each."""
+        """Add a cylinder in any direction.
+
+        Args:
+            label: class id.
+            start: (3,) centre of one end, metres.
+            end: (3,) centre of the other end.
+            radius: metres.
+            sections: number of flat faces around it.
+        """
         start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
         length = float(np.linalg.norm(end - start))
         along = (end - start) / length
@@ -132,7 +155,7 @@ class MeshBuilder:
         self.add(label, (vertices * (radius, radius, length)) @ axes.T + start, faces)
 
     def ribbon(self, label: int, left: ArrayLike, right: ArrayLike) -> None:
-        """Add the strip between two polylines of equally many points, (P, 3) each."""
+        """Add the strip between two polylines, (P, 3) each, metres."""
         left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
         first = np.arange(len(left) - 1)
         a, b, c, d = first, first + 1, first + len(left), first + len(left) + 1
@@ -143,10 +166,10 @@ class MeshBuilder:
         """Add the solid between two copies of a convex outline.
 
         Args:
-            label: class.
-            outline: (P, 2) corners, x and z.
-            near: () or (P,), y of each corner on one side.
-            far: () or (P,), y on the other.
+            label: class id.
+            outline: (P, 2) corners, x and z, metres.
+            near: () or (P,) y of each corner of one copy.
+            far: () or (P,) y of each corner of the other copy.
         """
         outline = np.asarray(outline, np.float64)
         count = len(outline)
@@ -166,46 +189,54 @@ class MeshBuilder:
         self.add(label, np.concatenate(sides), np.concatenate([walls, cap, cap + count]))
 
 
-def closed(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a loop's points (P, k) with the first one repeated at the end."""
+def concatenate(meshes: list[Mesh]) -> Mesh:
+    """Return the mesh of all triangles of several meshes of one frame."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + np.int32(offset) for mesh, offset in zip(meshes, offsets[:-1], strict=True)]
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate(faces),
+        np.concatenate([mesh.labels for mesh in meshes]),
+    )
+
+
+def close_loop(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (P, k) points of a loop with the first point repeated at the end."""
     return np.concatenate([points, points[:1]])
 
 
-def lifted(points: NDArray[np.float64], height: ArrayLike) -> NDArray[np.float64]:
-    """Return points (P, 2) of the plane at a height, () or (P,), as (P, 3)."""
+def at_height(points: NDArray[np.float64], height: ArrayLike) -> NDArray[np.float64]:
+    """Return (P, 3) points from their x and y, (P, 2), and their z, () or (P,)."""
     return np.column_stack([points, np.broadcast_to(np.asarray(height, np.float64), (len(points),))])
 
 
-def ellipsoid(subdivisions: int = 1) -> tuple[Vertices, NDArray[np.int64]]:
-    """Return vertices and faces of a unit icosphere."""
-    return _icosphere(subdivisions)
+@cache
+def unit_sphere(subdivisions: int = 1) -> tuple[Vertices, NDArray[np.int64]]:
+    """Return vertices and faces of an icosphere of radius 1."""
+    sphere = _trimesh_creation().icosphere(subdivisions=subdivisions)
+    return np.asarray(sphere.vertices), np.asarray(sphere.faces)
 
 
-def _turned(points: NDArray[np.float64], yaw_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn points (N, P, 3) about z, x towards y, by (N,) angles."""
+def _rotate_z(points: NDArray[np.float64], yaw_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotate points (N, P, 3) about z, x towards y, by (N,) angles."""
     cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
 
 
-def _creation() -> Any:
+def _trimesh_creation() -> Any:
     return import_extra("trimesh.creation", "simulate")
 
 
 @cache
 def _unit_box() -> tuple[Vertices, NDArray[np.int64]]:
-    """Corners and faces of a box of 1 m whose underside is at z = 0."""
-    box = _creation().box(extents=(1, 1, 1))
+    """Return corners and faces of a cube of 1 m whose lower face is at z = 0."""
+    box = _trimesh_creation().box(extents=(1, 1, 1))
     return np.asarray(box.vertices) + (0, 0, 0.5), np.asarray(box.faces)
 
 
 @cache
 def _unit_cylinder(sections: int) -> tuple[Vertices, NDArray[np.int64]]:
-    cylinder = _creation().cylinder(radius=1.0, height=1.0, sections=sections)
+    """Return vertices and faces of a cylinder of radius and height 1 m whose lower face is at z = 0."""
+    cylinder = _trimesh_creation().cylinder(radius=1.0, height=1.0, sections=sections)
     return np.asarray(cylinder.vertices) + (0, 0, 0.5), np.asarray(cylinder.faces)
-
-
-@cache
-def _icosphere(subdivisions: int) -> tuple[Vertices, NDArray[np.int64]]:
-    sphere = _creation().icosphere(subdivisions=subdivisions)
-    return np.asarray(sphere.vertices), np.asarray(sphere.faces)

@@ -1,4 +1,4 @@
-"""Which land is taken: footprints as turned rectangles, and whether two of them overlap."""
+"""Footprints as rotated rectangles, and which land they occupy."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A turned rectangle in the plane.
+    """A rotated rectangle in the plane.
 
     Attributes:
         centre: (2,) metres.
-        size: (2,) extent along its own x and y.
-        yaw_rad: how it is turned, x towards y.
+        size: (2,) lengths along its own x and y, metres.
+        yaw_rad: rotation, x towards y.
     """
 
     centre: Points
@@ -27,16 +27,16 @@ class Rectangle:
 
     @cached_property
     def axes(self) -> Points:
-        """(2, 2) unit vectors of its own x and y, a row each."""
+        """(2, 2) unit vectors of its own x and y, one per row."""
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[cos, sin], [-sin, cos]])
 
     def local(self, points: Points) -> Points:
-        """Return points (..., 2) in its own axes, from its centre."""
+        """Return points (..., 2) on its own axes, relative to its centre."""
         return (points - self.centre) @ self.axes.T
 
     def contains(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
-        """Return which points (..., 2) are inside, or within a margin outside."""
+        """Return which points (..., 2) are inside it, or outside by no more than a margin."""
         inside: NDArray[np.bool_] = np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m
         return np.asarray(inside.all(axis=-1))
 
@@ -47,7 +47,7 @@ class Rectangle:
         return self.centre + (signs * self.size) @ self.axes
 
     def overlaps(self, other: Rectangle, margin_m: float = 0.0) -> bool:
-        """Whether two rectangles are nearer than a margin: no axis of either separates them."""
+        """Whether two rectangles are closer to each other than a margin: no axis of either separates them."""
         reach = (float(np.hypot(*self.size)) + float(np.hypot(*other.size))) / 2 + margin_m
         if float(np.hypot(*(self.centre - other.centre))) > reach:
             return False
@@ -59,24 +59,24 @@ class Rectangle:
 
 @dataclass
 class Land:
-    """A block's ground: where things may still be put.
+    """The land of a block, and which parts of it are occupied.
 
     Attributes:
-        boundary: (K, 2) loop around it, inside on the right.
-        taken: what stands there.
+        boundary: (K, 2) loop around it, metres. The inside is on the right.
+        occupied: footprints of what has been built.
     """
 
     boundary: Points
-    taken: list[Rectangle] = field(default_factory=list)
+    occupied: list[Rectangle] = field(default_factory=list)
 
     def inside(self, points: Points, margin_m: float = 0.0) -> bool:
-        """Whether all points (N, 2) are inside the loop, at least a margin away from it."""
+        """Whether all points (N, 2) are inside the boundary, and at least a margin away from it."""
         start, along = self.boundary, np.roll(self.boundary, -1, axis=0) - self.boundary
         offsets = points[:, None, :] - start
         share = (offsets * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12)
         nearest = start + np.clip(share, 0, 1)[..., None] * along
         far_enough = np.linalg.norm(points[:, None, :] - nearest, axis=-1).min(axis=1) >= margin_m
-        # A ray along +x crosses the loop an odd number of times.
+        # From a point inside, a ray along +x crosses the boundary an odd number of times.
         above = self.boundary[:, 1] > points[:, 1:]
         crossed = above != np.roll(above, -1, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -84,12 +84,21 @@ class Land:
         odd = (crossed & (x > points[:, :1])).sum(axis=1) % 2 == 1
         return bool((odd & far_enough).all())
 
-    def claim(self, rectangle: Rectangle, margin_m: float = 0.3, edge_m: float = 0.0) -> bool:
-        """Take a rectangle if it is inside and free; say whether it was."""
+    def reserve(self, rectangle: Rectangle, margin_m: float = 0.3, edge_m: float = 0.0) -> bool:
+        """Occupy a rectangle if it is inside the boundary and free.
+
+        Args:
+            rectangle: the footprint.
+            margin_m: smallest distance to other footprints.
+            edge_m: smallest distance to the boundary.
+
+        Returns:
+            Whether the rectangle was free.
+        """
         corners = rectangle.corners
         if not self.inside(np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2]), edge_m):
             return False
-        if any(rectangle.overlaps(other, margin_m) for other in self.taken):
+        if any(rectangle.overlaps(other, margin_m) for other in self.occupied):
             return False
-        self.taken.append(rectangle)
+        self.occupied.append(rectangle)
         return True

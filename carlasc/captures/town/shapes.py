@@ -1,6 +1,6 @@
-"""Shapes of the things that move: vehicles and pedestrians.
+"""Shapes of the actors: vehicles and pedestrians.
 
-An actor's frame: x forward, y right, z up, origin on the ground below its middle.
+The frame of an actor: x forward, y right, z up, origin on the ground below its middle.
 """
 
 from __future__ import annotations
@@ -10,27 +10,27 @@ from functools import cache
 
 import numpy as np
 
-from carlasc.captures.town.meshes import Mesh, MeshBuilder, ellipsoid
+from carlasc.captures.town.meshes import Mesh, MeshBuilder, unit_sphere
 from carlasc.core.tables import CARLA
 
 VEHICLE = CARLA.id_of("Vehicle")
 PEDESTRIAN = CARLA.id_of("Pedestrian")
-GAIT_PHASES = 8  # shapes a step's cycle is cut into
+GAIT_PHASES = 8  # number of poses in the cycle of two steps
 
 
 @dataclass(frozen=True)
 class VehicleKind:
-    """A make of vehicle, described by its side view.
+    """A kind of vehicle, described by its side view.
 
     Attributes:
-        name: what it is.
-        length_m: bumper to bumper.
+        name: name of the kind.
+        length_m: from bumper to bumper.
         width_m: without mirrors.
-        body: (x, z) corners of the body's side view, convex, x from 0 (rear) to 1 (front), z in metres.
-        cabin: the same for what stands on the body, narrower at the top; empty for none.
-        wheels: (x, radius) of each axle, x as above, metres.
-        share: how often it is met, relative to others.
-        cabin_taper: how much narrower each side of the cabin is at its top, metres.
+        body: (x, z) corners of the body's side view, convex; x from 0 (rear) to 1 (front), z in metres.
+        cabin: the same for the cabin or box on the body, which is narrower at its top.
+        wheels: (x, radius) of the wheels of each axle; x from 0 to 1, radius in metres.
+        share: frequency relative to the other kinds.
+        cabin_taper: how much narrower the cabin is at its top than at its base, metres per side.
     """
 
     name: str
@@ -53,7 +53,7 @@ _SEDAN_BODY = (
     (0.12, 0.95),
     (0.01, 0.85),
 )
-KINDS = (
+VEHICLE_KINDS = (
     VehicleKind(
         "sedan",
         4.6,
@@ -121,12 +121,12 @@ KINDS = (
         0.08,
     ),
 )
-EGO_KIND = KINDS[0]
+EGO_KIND = VEHICLE_KINDS[0]
 
 
 @cache
 def vehicle_mesh(kind: VehicleKind) -> Mesh:
-    """Return a vehicle's mesh in its own frame."""
+    """Return the mesh of a vehicle in its own frame."""
     builder = MeshBuilder()
     half = kind.width_m / 2
     stretch = np.array([kind.length_m, 1.0])
@@ -137,7 +137,7 @@ def vehicle_mesh(kind: VehicleKind) -> Mesh:
     low, high = cabin[:, 1].min(), cabin[:, 1].max()
     sides = half - 0.04 - kind.cabin_taper * (cabin[:, 1] - low) / (high - low)
     builder.prism(VEHICLE, cabin, -sides, sides)
-    if kind.name == "truck":  # the driver's cab stands apart from the box
+    if kind.name == "truck":  # the cab is separate from the box
         cab = np.array(((0.76, 0.98), (1.0, 0.98), (0.995, 1.7), (0.95, 2.6), (0.77, 2.65))) * stretch - middle
         builder.prism(VEHICLE, cab, -half + 0.1, half - 0.1)
     for x, radius in kind.wheels:
@@ -151,8 +151,8 @@ def vehicle_mesh(kind: VehicleKind) -> Mesh:
 
 
 @cache
-def two_wheeler_mesh(rider: bool) -> Mesh:
-    """Return a bicycle with its rider: CARLA calls both Vehicle."""
+def bicycle_mesh() -> Mesh:
+    """Return a bicycle with its rider. Both are of the class Vehicle, as in CARLA."""
     builder = MeshBuilder()
     for x in (-0.5, 0.5):
         builder.rod(VEHICLE, (x, -0.03, 0.34), (x, 0.03, 0.34), 0.34, sections=12)
@@ -160,23 +160,22 @@ def two_wheeler_mesh(rider: bool) -> Mesh:
     builder.rod(VEHICLE, (0.5, 0, 0.34), (0.38, 0, 1.0), 0.03)
     builder.rod(VEHICLE, (0.0, 0, 0.75), (0.4, 0, 0.85), 0.03)
     builder.rod(VEHICLE, (0.38, -0.28, 1.0), (0.38, 0.28, 1.0), 0.025)
-    if rider:
-        for side in (-1.0, 1.0):
-            builder.rod(VEHICLE, (-0.15, side * 0.12, 0.9), (0.15, side * 0.14, 0.62), 0.09)
-            builder.rod(VEHICLE, (0.15, side * 0.14, 0.62), (0.02, side * 0.12, 0.25), 0.06)
-            builder.rod(VEHICLE, (0.05, side * 0.2, 1.38), (0.36, side * 0.24, 1.05), 0.05)
-        builder.rod(VEHICLE, (-0.18, 0, 0.88), (0.06, 0, 1.42), 0.18, sections=8)
-        _ball(builder, VEHICLE, (0.14, 0, 1.63), (0.12, 0.1, 0.14))
+    for side in (-1.0, 1.0):
+        builder.rod(VEHICLE, (-0.15, side * 0.12, 0.9), (0.15, side * 0.14, 0.62), 0.09)
+        builder.rod(VEHICLE, (0.15, side * 0.14, 0.62), (0.02, side * 0.12, 0.25), 0.06)
+        builder.rod(VEHICLE, (0.05, side * 0.2, 1.38), (0.36, side * 0.24, 1.05), 0.05)
+    builder.rod(VEHICLE, (-0.18, 0, 0.88), (0.06, 0, 1.42), 0.18, sections=8)
+    _add_ellipsoid(builder, VEHICLE, (0.14, 0, 1.63), (0.12, 0.1, 0.14))
     return builder.build()
 
 
 @cache
 def pedestrian_mesh(height_m: float, phase: int) -> Mesh:
-    """Return a person's mesh.
+    """Return the mesh of a pedestrian in its own frame.
 
     Args:
-        height_m: how tall.
-        phase: point in the cycle of steps, 0..GAIT_PHASES-1; -1 stands still.
+        height_m: height.
+        phase: phase of the gait, 0..GAIT_PHASES-1; -1 for a standing pedestrian.
     """
     builder = MeshBuilder()
     scale = height_m / 1.75
@@ -192,13 +191,13 @@ def pedestrian_mesh(height_m: float, phase: int) -> Mesh:
         builder.rod(PEDESTRIAN, shoulder, hand, 0.05)
     torso = np.array(((-0.11, 0.85), (0.11, 0.85), (0.13, 1.2), (0.09, 1.48), (-0.1, 1.48), (-0.13, 1.2)))
     builder.prism(PEDESTRIAN, torso, (-0.16, -0.16, -0.19, -0.2, -0.2, -0.19), (0.16, 0.16, 0.19, 0.2, 0.2, 0.19))
-    _ball(builder, PEDESTRIAN, (0.01, 0, 1.62), (0.1, 0.08, 0.13))
+    _add_ellipsoid(builder, PEDESTRIAN, (0.01, 0, 1.62), (0.1, 0.08, 0.13))
     mesh = builder.build()
     return Mesh(mesh.vertices * scale, mesh.faces, mesh.labels)
 
 
-def _ball(
+def _add_ellipsoid(
     builder: MeshBuilder, label: int, centre: tuple[float, float, float], radii: tuple[float, float, float]
 ) -> None:
-    vertices, faces = ellipsoid(1)
+    vertices, faces = unit_sphere(1)
     builder.add(label, vertices * radii + centre, faces)

@@ -1,7 +1,7 @@
-"""The street network: where streets run, the blocks between them, and the lanes that vehicles follow.
+"""The street network: streets, the blocks between them, and the lanes that vehicles follow.
 
-Everything lies in the town's plane: x and y in metres, the left-handed frame of CarlaSC. For a direction d = (dx, dy) the
-vector (-dy, dx) points to the *right*, so blocks are traced with their inside on the right, and vehicles keep right.
+All coordinates are x and y of the world frame, in metres. The frame is left-handed, as in CarlaSC: for a direction d = (dx, dy),
+the vector (-dy, dx) points to the *right*. The outline of a block has its inside on the right, and vehicles drive on the right.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 Points = NDArray[np.float64]
 
 LANE_WIDTH_M = 3.5
-HALF_ROAD_M = LANE_WIDTH_M  # two lanes, one each way
+HALF_ROAD_M = LANE_WIDTH_M  # a road has two lanes, one per direction
 SIDEWALK_M = 2.6
 CORNER_RADIUS_M = 6.0  # of the kerb at a crossing
-STOP_BACK_M = 4.5  # from the end of the kerb's corner to the stop line; the crosswalk lies between
+STOP_BACK_M = 4.5  # from the end of the kerb's corner to the stop line; the crosswalk is between them
 BAY_M = 2.2  # depth of a parking bay
 PATH_STEP_M = 0.5
 
 
 @dataclass(frozen=True)
 class Outline:
-    """The edge of a block. At offset `o` from the streets' centre lines it runs through `anchor + o * normal`.
+    """The edge of a block at any offset from the centre lines of its streets: `anchor + offset * normal`.
 
     Attributes:
         anchor: (K, 2) metres.
@@ -36,29 +36,29 @@ class Outline:
     normal: Points
 
     def at(self, offset_m: float) -> Points:
-        """Return the (K, 2) loop at an offset from the centre line; valid up to the corners' radius."""
+        """Return the (K, 2) loop at an offset from the centre lines. Larger offsets than the corners' radius are not valid."""
         return self.anchor + offset_m * self.normal
 
 
 @dataclass(frozen=True)
 class Side:
-    """One street along a block, walked with the block on the right.
+    """The side of a block along one street, with the block on the right.
 
     Attributes:
-        start: (2,) where the street's straight part starts, on its centre line.
-        direction: (2,) unit vector.
+        start: (2,) start of the street's straight part, on its centre line.
+        direction: (2,) unit vector along the street.
         length_m: length of the straight part.
-        bay: whether there is a parking bay.
+        has_bay: whether the street has a parking bay on this side.
     """
 
     start: Points
     direction: Points
     length_m: float
-    bay: bool
+    has_bay: bool
 
     @property
     def normal(self) -> Points:
-        """(2,) unit vector to the right: into the block."""
+        """(2,) unit vector to the right, into the block."""
         return right_of(self.direction)
 
     @property
@@ -67,22 +67,22 @@ class Side:
         return float(np.arctan2(self.direction[1], self.direction[0]))
 
     def point(self, along_m: float, offset_m: float) -> Points:
-        """Return the (2,) point so far along the street and to the right of its centre line."""
+        """Return the (2,) point at a distance along the street and an offset to the right of its centre line."""
         return self.start + along_m * self.direction + offset_m * self.normal
 
     def kerb_offset(self, along_m: float) -> float:
-        """Return how far the kerb is from the centre line there."""
+        """Return the distance of the kerb from the centre line, metres."""
         ramp = min(along_m, self.length_m - along_m) / 3.0
-        return HALF_ROAD_M + (BAY_M * float(np.clip(ramp, 0, 1)) if self.bay else 0.0)
+        return HALF_ROAD_M + (BAY_M * float(np.clip(ramp, 0, 1)) if self.has_bay else 0.0)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Land between streets (or all around them: the outside).
+    """The land between streets, or the land around the town.
 
     Attributes:
         outline: its edge.
-        sides: its streets.
+        sides: its sides, one per street.
         outside: whether it is the land around the town.
     """
 
@@ -90,22 +90,17 @@ class Block:
     sides: tuple[Side, ...]
     outside: bool
 
-    @property
-    def centre(self) -> Points:
-        """(2,) mean of its corners."""
-        return self.outline.at(HALF_ROAD_M + SIDEWALK_M).mean(axis=0)
-
 
 @dataclass(frozen=True)
 class Lane:
-    """A way for vehicles: a street's lane between two crossings, or a turn across a crossing.
+    """A lane of a street between two crossings, or a turn: a lane across a crossing.
 
     Attributes:
-        path: (P, 2) metres, points about PATH_STEP_M apart.
-        start: crossing it comes from (a lane), or lies on (a turn).
-        end: crossing it leads to, or lies on.
-        turn: whether it lies on a crossing.
-        exits: lanes that follow on, by index.
+        path: (P, 2) centre line, metres, points about PATH_STEP_M apart.
+        start: index of the crossing where a street's lane starts, or that a turn crosses.
+        end: index of the crossing where a street's lane ends, or that a turn crosses.
+        turn: whether it is a turn.
+        exits: indices of the lanes that follow.
     """
 
     path: Points
@@ -126,14 +121,14 @@ class Lane:
         return float(self.stations[-1])
 
     def point(self, along_m: float | NDArray[np.float64]) -> Points:
-        """Return the point (2,), or points (N, 2), so far along the path."""
+        """Return the point (2,), or the points (N, 2), at a distance from the start."""
         x = np.interp(along_m, self.stations, self.path[:, 0])
         y = np.interp(along_m, self.stations, self.path[:, 1])
         return np.stack([x, y], axis=-1)
 
     @cached_property
     def turning_rad(self) -> float:
-        """How much the heading changes from start to end, without sign."""
+        """Absolute change of the heading from start to end."""
         first, last = self.path[1] - self.path[0], self.path[-1] - self.path[-2]
         cosine = first @ last / (np.linalg.norm(first) * np.linalg.norm(last))
         return float(np.arccos(np.clip(cosine, -1, 1)))
@@ -141,13 +136,13 @@ class Lane:
 
 @dataclass(frozen=True)
 class Streets:
-    """The network.
+    """The street network.
 
     Attributes:
-        nodes: (N, 2) crossings, metres.
-        edges: (E, 2) streets, pairs of crossings.
-        blocks: land between the streets; the outside last.
-        lanes: lanes and turns.
+        nodes: (N, 2) positions of the crossings, metres.
+        edges: (E, 2) indices of the two crossings of each street.
+        blocks: the blocks. The last one is the land around the town.
+        lanes: the lanes of all streets, then the turns.
     """
 
     nodes: Points
@@ -156,23 +151,23 @@ class Streets:
     lanes: tuple[Lane, ...]
 
     def degree(self, node: int) -> int:
-        """Return how many streets meet at a crossing."""
+        """Return the number of streets that meet at a crossing."""
         return int((self.edges == node).sum())
 
 
 def right_of(direction: Points) -> Points:
-    """Return (..., 2) vectors turned a quarter to the right (x towards y)."""
+    """Return (..., 2) vectors rotated by 90 degrees to the right (x towards y)."""
     return np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
 
 
-def lay_out(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> Streets:
-    """Draw a town's streets: a grid with uneven spacing, bent out of square, some streets left out."""
+def draw_streets(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> Streets:
+    """Draw the streets of a town: a grid with random spacing and crossings, and without some of its streets."""
     nodes, edges = _draw_grid(rng, rows, columns)
     loops = _trace_faces(nodes, edges)
-    mouths = _mouths(nodes, loops)
-    blocks = [_block(rng, nodes, loop, mouths) for loop in loops]
+    stop_distances = _stop_distances(nodes, loops)
+    blocks = [_make_block(rng, nodes, loop, stop_distances) for loop in loops]
     blocks.sort(key=lambda block: block.outside)
-    return Streets(nodes, edges, tuple(blocks), _lanes(nodes, edges, mouths))
+    return Streets(nodes, edges, tuple(blocks), _make_lanes(nodes, edges, stop_distances))
 
 
 def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Points, NDArray[np.int64]]:
@@ -186,8 +181,10 @@ def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Point
     inner = [(int(a), int(b)) for a, b in across if rows - 1 > a // columns > 0]
     dropped: set[tuple[int, int]] = set()
     touched: set[int] = set()
-    for pick in rng.permutation(len(inner)):  # a street left out leaves two T-crossings and one longer block
-        a, b = inner[pick]
+    for index_of_street in rng.permutation(
+        len(inner)
+    ):  # leaving out a street makes two T-junctions and one longer block
+        a, b = inner[index_of_street]
         around = {a, b, a + columns, b + columns, a - columns, b - columns}
         inside = a % columns > 0 and b % columns < columns - 1
         if inside and not touched & around and len(dropped) < (rows * columns) // 8:
@@ -198,7 +195,7 @@ def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Point
 
 
 def _trace_faces(nodes: Points, edges: NDArray[np.int64]) -> list[list[int]]:
-    """Return the loops of nodes around each face, the face on the right."""
+    """Return the loop of nodes around each face of the network. The face is on the right."""
     neighbours: dict[int, list[int]] = {node: [] for node in range(len(nodes))}
     for a, b in edges.tolist():
         neighbours[a].append(b)
@@ -223,30 +220,32 @@ def _trace_faces(nodes: Points, edges: NDArray[np.int64]) -> list[list[int]]:
 
 
 def _corner(nodes: Points, before: int, node: int, after: int) -> tuple[Points, Points, float]:
-    """Return the directions into and out of a corner, and by how much it turns to the right (radians)."""
+    """Return the directions into and out of a corner, and its turn to the right in radians."""
     arriving, leaving = nodes[node] - nodes[before], nodes[after] - nodes[node]
     arriving, leaving = arriving / np.linalg.norm(arriving), leaving / np.linalg.norm(leaving)
     turn = np.arctan2(arriving[0] * leaving[1] - arriving[1] * leaving[0], arriving @ leaving)
     return arriving, leaving, float(turn)
 
 
-def _mouths(nodes: Points, loops: list[list[int]]) -> dict[tuple[int, int], float]:
-    """Return, for a crossing and a street's other end, how far from the crossing the stop line is."""
-    mouths: dict[tuple[int, int], float] = {}
+def _stop_distances(nodes: Points, loops: list[list[int]]) -> dict[tuple[int, int], float]:
+    """Return the distance of the stop line from a crossing, metres, by (crossing, other end of the street)."""
+    stop_distances: dict[tuple[int, int], float] = {}
     for loop in loops:
         for before, node, after in _corners_of(loop):
             turn = _corner(nodes, before, node, after)[2]
             tangent = (HALF_ROAD_M + CORNER_RADIUS_M) * np.tan(max(turn, 0.0) / 2)
             for other in (before, after):
-                mouths[node, other] = max(mouths.get((node, other), 4.0), float(tangent) + STOP_BACK_M)
-    return mouths
+                stop_distances[node, other] = max(stop_distances.get((node, other), 4.0), float(tangent) + STOP_BACK_M)
+    return stop_distances
 
 
 def _corners_of(loop: list[int]) -> list[tuple[int, int, int]]:
     return [(loop[i - 1], loop[i], loop[(i + 1) % len(loop)]) for i in range(len(loop))]
 
 
-def _block(rng: np.random.Generator, nodes: Points, loop: list[int], mouths: dict[tuple[int, int], float]) -> Block:
+def _make_block(
+    rng: np.random.Generator, nodes: Points, loop: list[int], stop_distances: dict[tuple[int, int], float]
+) -> Block:
     corners = nodes[loop]
     following = np.roll(corners, -1, axis=0)
     outside = float((corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum()) < 0
@@ -256,37 +255,39 @@ def _block(rng: np.random.Generator, nodes: Points, loop: list[int], mouths: dic
         anchor, normal = _rounded_corner(nodes[node], arriving, leaving, turn)
         anchors.append(anchor)
         normals.append(normal)
-        near, far = mouths[node, after], mouths[after, node]
+        near, far = stop_distances[node, after], stop_distances[after, node]
         length = float(np.linalg.norm(nodes[after] - nodes[node])) - near - far
         side = Side(nodes[node] + near * leaving, leaving, length, bool(not outside and rng.random() < 0.45))
         sides.append(side)
         stations = np.array([0.0, 3.0, length - 3.0, length])
-        depth = np.array([0.0, BAY_M, BAY_M, 0.0]) * side.bay
+        depth = np.array([0.0, BAY_M, BAY_M, 0.0]) * side.has_bay
         anchors.append(side.start + stations[:, None] * leaving + depth[:, None] * side.normal)
         normals.append(np.tile(side.normal, (4, 1)))
     return Block(Outline(np.concatenate(anchors), np.concatenate(normals)), tuple(sides), outside)
 
 
 def _rounded_corner(node: Points, arriving: Points, leaving: Points, turn: float) -> tuple[Points, Points]:
-    """Return anchors and normals of an outline around a corner."""
+    """Return anchors and normals of a block's outline at a corner."""
     count = max(2, int(np.ceil(abs(turn) / 0.16)) + 1)
     heading = np.arctan2(arriving[1], arriving[0]) + np.linspace(0, turn, count)
     normal = right_of(np.stack([np.cos(heading), np.sin(heading)], axis=1))
-    if turn <= 0:  # the block goes round the crossing
+    if turn <= 0:  # the corner of the block is not convex: the outline is an arc around the crossing
         return np.tile(node, (count, 1)), normal
     bisector = right_of(arriving) + right_of(leaving)
     centre = node + (HALF_ROAD_M + CORNER_RADIUS_M) * bisector / (1 + arriving @ leaving)
     return centre - (HALF_ROAD_M + CORNER_RADIUS_M) * normal, normal
 
 
-def _lanes(nodes: Points, edges: NDArray[np.int64], mouths: dict[tuple[int, int], float]) -> tuple[Lane, ...]:
+def _make_lanes(
+    nodes: Points, edges: NDArray[np.int64], stop_distances: dict[tuple[int, int], float]
+) -> tuple[Lane, ...]:
     lanes: list[Lane] = []
     for a, b in edges.tolist():
         for start, end in ((a, b), (b, a)):
             direction = (nodes[end] - nodes[start]) / np.linalg.norm(nodes[end] - nodes[start])
             offset = LANE_WIDTH_M / 2 * right_of(direction)
-            first = nodes[start] + mouths[start, end] * direction + offset
-            last = nodes[end] - mouths[end, start] * direction + offset
+            first = nodes[start] + stop_distances[start, end] * direction + offset
+            last = nodes[end] - stop_distances[end, start] * direction + offset
             lanes.append(Lane(_straight(first, last), start, end, turn=False))
     streets = list(lanes)
     for index, lane in enumerate(streets):
@@ -305,7 +306,7 @@ def _straight(first: Points, last: Points) -> Points:
 
 
 def _curve(before: Points, after: Points) -> Points:
-    """Return the turn from the end of one lane to the start of another: a cubic Bezier curve, near a circle's arc."""
+    """Return the path of a turn from the end of one lane to the start of another: a cubic Bezier curve, close to an arc."""
     first, last = before[-1], after[0]
     leaving = (before[-1] - before[-2]) / np.linalg.norm(before[-1] - before[-2])
     arriving = (after[1] - after[0]) / np.linalg.norm(after[1] - after[0])

@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from carlasc.captures.town.drive import Drive
-from carlasc.captures.town.lidar import Lidar
+from carlasc.captures import Drive, Lidar
 
 
 @pytest.fixture(scope="session")

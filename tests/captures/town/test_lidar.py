@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.captures.town.lidar import Lidar, RayScene
+from carlasc.captures import Lidar
 from carlasc.captures.town.meshes import MeshBuilder
+from carlasc.captures.town.rays import RayScene
 from carlasc.errors import ArgumentError
 
 
@@ -48,10 +49,11 @@ def test_nothing_is_seen_beyond_the_range() -> None:
     [
         ({"channels": 0}, "channels"),
         ({"points": 3}, "points"),
-        ({"range_m": 0.0}, "range"),
-        ({"range_m": float("nan")}, "range"),
-        ({"noise_m": -0.1}, "noise"),
-        ({"upper_deg": -30.0}, "elevations"),
+        ({"range_m": 0.0}, "range_m"),
+        ({"range_m": 1000.0}, "range_m"),
+        ({"range_m": float("nan")}, "range_m"),
+        ({"noise_m": -0.1}, "noise_m"),
+        ({"upper_deg": -30.0}, "upper_deg"),
     ],
 )
 def test_a_senseless_lidar_is_refused(settings: dict[str, float], word: str) -> None:

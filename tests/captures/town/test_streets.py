@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.captures.town.streets import HALF_ROAD_M, LANE_WIDTH_M, SIDEWALK_M, Streets, lay_out, right_of
+from carlasc.captures.town.streets import HALF_ROAD_M, LANE_WIDTH_M, SIDEWALK_M, Streets, draw_streets, right_of
 
 
 @pytest.fixture(scope="module", params=range(4))
 def streets(request: pytest.FixtureRequest) -> Streets:
-    return lay_out(np.random.default_rng(request.param))
+    return draw_streets(np.random.default_rng(request.param))
 
 
 def area(loop: np.ndarray) -> float:

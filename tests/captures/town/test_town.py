@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.captures.town.drive import Drive
+from carlasc.captures import Drive
 from carlasc.captures.town.plots import Land, Rectangle
 from carlasc.captures.town.town import build_town
 from carlasc.core.tables import CARLA
@@ -49,7 +49,7 @@ def test_road_is_level_markings_lie_just_above_and_sidewalks_are_raised(drive: D
 
 def test_no_building_stands_on_a_lane(drive: Drive) -> None:
     lanes = np.concatenate([lane.path for lane in drive.town.streets.lanes])
-    for footprint, _ in drive.town.solids:
+    for footprint, _ in drive.town.buildings:
         assert not footprint.contains(lanes, margin_m=1.5).any()
 
 
@@ -65,8 +65,8 @@ def test_rectangles_overlap_as_their_areas_do() -> None:
 def test_land_is_given_once_and_only_inside_its_boundary() -> None:
     notched = np.array([[0, 0], [10, 0], [10, 10], [6, 10], [6, 5], [4, 5], [4, 10], [0, 10]], float)
     land = Land(notched)
-    assert not land.claim(Rectangle(np.array([5.0, 8.0]), (1.0, 1.0), 0.0))  # in the notch
-    assert not land.claim(Rectangle(np.array([0.0, 5.0]), (1.0, 1.0), 0.0))  # across the edge
-    assert land.claim(Rectangle(np.array([2.0, 2.0]), (2.0, 2.0), 0.3))
-    assert not land.claim(Rectangle(np.array([2.5, 2.5]), (2.0, 2.0), 0.0))
-    assert land.claim(Rectangle(np.array([7.5, 2.5]), (2.0, 2.0), 0.0))
+    assert not land.reserve(Rectangle(np.array([5.0, 8.0]), (1.0, 1.0), 0.0))  # in the notch
+    assert not land.reserve(Rectangle(np.array([0.0, 5.0]), (1.0, 1.0), 0.0))  # across the edge
+    assert land.reserve(Rectangle(np.array([2.0, 2.0]), (2.0, 2.0), 0.3))
+    assert not land.reserve(Rectangle(np.array([2.5, 2.5]), (2.0, 2.0), 0.0))
+    assert land.reserve(Rectangle(np.array([7.5, 2.5]), (2.0, 2.0), 0.0))

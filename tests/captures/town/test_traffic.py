@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.captures.raw import TRAFFIC
-from carlasc.captures.town.actors import EGO_ID, Actor
-from carlasc.captures.town.drive import Drive
+from carlasc.captures import Actor, Drive
+from carlasc.captures.settings import TRAFFIC
+from carlasc.captures.town.actors import EGO_ID
 from carlasc.captures.town.plots import Rectangle
 from carlasc.captures.town.shapes import VEHICLE
 from carlasc.core.geometry import invert, transform_points

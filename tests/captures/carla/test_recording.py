@@ -12,10 +12,9 @@ pytest.importorskip("carla", reason="the carla package is not installed: pip ins
 import carla
 from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, StandIn
 
-from carlasc.captures.carla import record
-from carlasc.captures.carla.sensors import LidarModel
-from carlasc.captures.carla.server import DETECTION, Server, ServerError, decode_sweep
-from carlasc.captures.raw import Capture, sensor_offsets
+from carlasc.captures import Capture, Lidar, ServerError, record
+from carlasc.captures.carla.server import DETECTION, Server, decode_sweep
+from carlasc.captures.lidar import sensor_offsets
 from carlasc.cli import app
 from carlasc.core.geometry import transform_points
 from carlasc.errors import ArgumentError, CarlascError, ConflictError
@@ -24,7 +23,7 @@ ROAD, VEHICLE, WALKER = 7, 10, 4
 
 
 def call(out, server, **options):
-    chosen = {"frames": 3, "sensors": 4, "town": "Town01", "traffic": "light", "timeout_s": 5.0, "bev": False} | options
+    chosen = {"count": 3, "sensors": 4, "town": "Town01", "traffic": "light", "timeout_s": 5.0, "bev": False} | options
     return record(out, carla=server, **chosen)
 
 
@@ -63,7 +62,7 @@ def test_classes_are_ours_whatever_the_servers_version(tmp_path):
 
 def test_sensors_are_placed_as_the_format_says(tmp_path):
     server = StandIn()
-    call(tmp_path, server, sensors=20, frames=1)
+    call(tmp_path, server, sensors=20, count=1)
     capture = Capture(tmp_path)
     poses = np.stack([capture.read_pose(sensor, 0) for sensor in range(20)])
     (ego,) = [a for a in server.worlds[-1].actors if a.attributes.get("role_name") == "hero"]
@@ -113,8 +112,8 @@ def test_the_ego_vehicle_is_not_seen_and_others_are_where_they_are(tmp_path):
 
 
 def test_points_have_noise_of_at_most_two_centimetres(tmp_path):
-    call(tmp_path / "plain", StandIn(), lidar=LidarModel(noise_m=0.0), frames=1)
-    call(tmp_path / "noisy", StandIn(), frames=1)
+    call(tmp_path / "plain", StandIn(), lidar=Lidar(noise_m=0.0), count=1)
+    call(tmp_path / "noisy", StandIn(), count=1)
     plain, noisy = (Capture(tmp_path / name).read(0, 0).scan.points for name in ("plain", "noisy"))
     error = np.abs(plain - noisy)
     assert 0.015 < error.max() <= 0.0201
@@ -154,7 +153,7 @@ def test_an_actor_keeps_its_number_through_the_sequence_and_in_a_second_run(tmp_
 def test_the_picture_from_above_has_the_published_size(tmp_path):
     from PIL import Image
 
-    call(tmp_path, StandIn(), bev=True, frames=1, sensors=1)
+    call(tmp_path, StandIn(), bev=True, count=1, sensors=1)
     picture = Image.open(io.BytesIO(Capture(tmp_path).read_bev(0)))
     assert picture.size == (1920, 1080)
     assert np.abs(np.asarray(picture)[5, 5].astype(int) - (10, 120, 250)).max() < 8
@@ -196,15 +195,15 @@ def test_what_cannot_be_undone_is_told(tmp_path):
 
 
 def test_an_interrupted_recording_goes_on(tmp_path):
-    whole = call(tmp_path / "whole", StandIn(), frames=5)
+    whole = call(tmp_path / "whole", StandIn(), count=5)
     server = StandIn()
     server.fail_at = ("tick", 4, KeyboardInterrupt())  # the first tick is the pedestrians'
     with pytest.raises(KeyboardInterrupt):
-        call(tmp_path / "cut", server, frames=5)
+        call(tmp_path / "cut", server, count=5)
     assert Capture(tmp_path / "cut").frames.tolist() == [0, 1, 2]
     (tmp_path / "cut" / "raw" / "labels2" / "1.npy").unlink()  # and a frame in the middle is not whole
     kept = (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns
-    result = call(tmp_path / "cut", StandIn(), frames=5)
+    result = call(tmp_path / "cut", StandIn(), count=5)
     assert (result.written, whole.written) == (3, 5)
     assert (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns == kept
     for frame in range(5):
@@ -214,26 +213,26 @@ def test_an_interrupted_recording_goes_on(tmp_path):
                 one.world_T_sensor, other.world_T_sensor
             )
     idle = StandIn()
-    assert call(tmp_path / "cut", idle, frames=5).written == 0
+    assert call(tmp_path / "cut", idle, count=5).written == 0
     assert idle.ticks == 0  # nothing to do: the town is not even loaded
 
 
 def test_a_replay_that_leaves_the_drive_is_not_mixed_with_it(tmp_path):
-    call(tmp_path, StandIn(), frames=2)
+    call(tmp_path, StandIn(), count=2)
     server = StandIn()
     server.drift = 0.5
     with pytest.raises(ConflictError, match="frame 0: expected the replay to follow"):
-        call(tmp_path, server, frames=4)
+        call(tmp_path, server, count=4)
     assert Capture(tmp_path).frames.tolist() == [0, 1]
     all_is_undone(server)
 
 
 def test_other_settings_do_not_mix(tmp_path):
-    call(tmp_path, StandIn(), frames=1)
+    call(tmp_path, StandIn(), count=1)
     with pytest.raises(ConflictError, match="seed"):
-        call(tmp_path, StandIn(), frames=1, seed=1)
+        call(tmp_path, StandIn(), count=1, seed=1)
     with pytest.raises(ConflictError, match="server_version"):
-        call(tmp_path, StandIn("0.9.15"), frames=1)
+        call(tmp_path, StandIn("0.9.15"), count=1)
     (tmp_path / "else" / "raw" / "velodyne0").mkdir(parents=True)
     with pytest.raises(ConflictError, match=r"recording\.json"):
         call(tmp_path / "else", StandIn())
@@ -242,7 +241,7 @@ def test_other_settings_do_not_mix(tmp_path):
 def test_a_crowded_town_has_fewer_vehicles_but_always_the_ego_one(tmp_path):
     server = StandIn()
     server.places = 3
-    result = call(tmp_path, server, frames=1)
+    result = call(tmp_path, server, count=1)
     assert result.vehicles == 2
     server = StandIn()
     server.places = 0
@@ -252,8 +251,8 @@ def test_a_crowded_town_has_fewer_vehicles_but_always_the_ego_one(tmp_path):
 
 def test_sensors_that_stay_silent_are_named(tmp_path):
     server = StandIn()
-    server.deaf = True
-    with pytest.raises(ServerError, match="LiDAR 0 to measure within"):
+    server.silent = True
+    with pytest.raises(ServerError, match="expected a measurement of LiDAR 0 within"):
         call(tmp_path, server, timeout_s=0.2)
     all_is_undone(server)
 
@@ -264,7 +263,7 @@ def test_a_town_that_is_not_there_is_named_with_those_that_are(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("options", [{"frames": 0}, {"sensors": 0}, {"seed": -1}, {"traffic": "none"}])
+@pytest.mark.parametrize("options", [{"count": 0}, {"sensors": 0}, {"seed": -1}, {"traffic": "none"}])
 def test_senseless_arguments_are_refused(tmp_path, options):
     with pytest.raises(ArgumentError):
         call(tmp_path, StandIn(), **options)
@@ -295,7 +294,7 @@ def test_versions_are_read(text, numbers):
 
 
 def test_without_a_server_the_command_says_so_in_one_line(tmp_path):
-    result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), "--port", "1", "--timeout", "1", "--frames", "1"])
+    result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), "--port", "1", "--timeout", "1", "--count", "1"])
     assert result.exit_code == 1
     assert "127.0.0.1:1" in result.stderr and "--host" in result.stderr
     assert not (tmp_path / "a").exists()
@@ -305,7 +304,7 @@ def test_the_command_records(tmp_path, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "carla", StandIn())
-    options = ["--frames", "2", "--sensors", "2", "--traffic", "light", "--no-bev", "--json"]
+    options = ["--count", "2", "--sensors", "2", "--traffic", "light", "--no-bev", "--json"]
     result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), *options])
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["written"] == 2

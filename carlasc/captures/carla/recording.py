@@ -1,0 +1,170 @@
+"""`record`: a drive on a CARLA server, written as a raw capture (see the format page, `docs/format.md#raw-capture`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlasc.captures.carla.sensors import ActorNumbers, SensorRig
+from carlasc.captures.carla.server import Server
+from carlasc.captures.carla.traffic import spawn_actors
+from carlasc.captures.lidar import Lidar, sensor_offsets
+from carlasc.captures.raw import Capture, CaptureWriter, Recording
+from carlasc.captures.settings import TRAFFIC, TrafficLevel, check_at_least, check_traffic
+from carlasc.errors import ConflictError, import_extra
+
+SETTINGS_FILE = "recording.json"
+_REPLAY_TOLERANCE_M = 0.02  # greatest distance of the ego sensor in a replay from where it was recorded
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """What a recording wrote.
+
+    Attributes:
+        out: folder of the sequence, which holds raw/.
+        count: number of the requested frames that exist now.
+        written: number of frames that this run wrote; the others existed.
+        sensors: number of sensors.
+        vehicles: number of vehicles that were spawned, without the ego vehicle.
+        walkers: number of pedestrians that were spawned.
+        server_version: version of CARLA.
+    """
+
+    out: Path
+    count: int
+    written: int
+    sensors: int
+    vehicles: int
+    walkers: int
+    server_version: str
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """The settings of a capture, as recording.json holds them."""
+
+    town: str
+    traffic: TrafficLevel
+    sensors: int
+    seed: int
+    bev: bool
+    server_version: str
+    lidar: Lidar
+
+
+def record(
+    out: str | os.PathLike[str],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 2000,
+    traffic_port: int = 8000,
+    timeout_s: float = 60.0,
+    town: str = "Town01",
+    count: int = 2000,
+    sensors: int = 20,
+    seed: int = 0,
+    traffic: TrafficLevel = "medium",
+    lidar: Lidar | None = None,
+    bev: bool = True,
+    carla: Any = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> RecordResult:
+    """Record a drive on a CARLA server as a raw capture.
+
+    At the end, also after an error or Ctrl-C, the actors that were spawned are destroyed and the server's settings are restored.
+
+    A second run with the same settings replays the drive from its start with the same seed, and writes the frames that are missing. It
+    stops where the replay departs from the recorded drive.
+
+    Args:
+        out: folder of the sequence. Files go to `<out>/raw`.
+        host: host of the server.
+        port: RPC port of the server.
+        traffic_port: port of the traffic manager.
+        timeout_s: longest time that the server may take to answer, seconds.
+        town: map to drive in, such as "Town01" or "Town10HD".
+        count: number of frames, 0.1 s apart.
+        sensors: number of LiDARs. The first is the ego sensor.
+        seed: seed of positions, traffic, the sensors' offsets and the noise.
+        traffic: "light", "medium" or "heavy": 25, 50 or 100 vehicles, and as many pedestrians.
+        lidar: model of the LiDARs. None: the data set's.
+        bev: whether to write bird's-eye pictures.
+        carla: module of the client. None: the package `carla`.
+        progress: called with (frames done, number of frames).
+
+    Returns:
+        What was written.
+
+    Raises:
+        ArgumentError: an argument is out of its range, or the server has no such town.
+        DependencyError: a package of the extra `carla` is missing. Nothing is written.
+        ServerError: the server does not answer.
+        MissingDataError: the town has no room for the ego vehicle, or the server lacks a sensor.
+        ConflictError: `out` holds another capture, or the replay departs from it.
+        StorageError: `out` cannot be written to.
+    """
+    check_at_least(1, count=count, sensors=sensors)
+    check_at_least(0, seed=seed)
+    check_traffic(traffic)
+    if bev:
+        import_extra("PIL.Image", "carla")
+    writer, written = CaptureWriter(out), 0
+    with Server(host, port, timeout_s, carla) as server:
+        settings = _Settings(town, traffic, sensors, seed, bev, server.version, lidar or Lidar())
+        writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc capture")
+        complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev)}
+        missing = set(range(count)) - (complete & writer.timed_frames(sensors))
+        if not missing:
+            return RecordResult(Path(out), count, 0, sensors, 0, 0, server.version)
+
+        rng = np.random.default_rng(seed)
+        offsets = sensor_offsets(sensors, rng)
+        server.load_town(town)
+        server.set_up_traffic(traffic_port, seed)
+        actors = spawn_actors(server, TRAFFIC[traffic], traffic_port, rng)
+        rig = SensorRig(server, actors.ego, offsets, settings.lidar, bev, seed)
+        spawned = (int(actor.id) for actor in (actors.ego, *actors.vehicles, *actors.walkers))
+        numbers = ActorNumbers([*server.initial_actors, *spawned])
+        writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))  # the town is known to exist now
+        for frame in range(max(missing) + 1):
+            recordings, times_s, picture = rig.measure(server.tick(), frame, numbers)
+            if frame in missing:
+                _write_frame(writer, frame, recordings, times_s, picture)
+                written += 1
+            else:
+                _check_replay(writer, frame, recordings[0])
+            if progress is not None:
+                progress(frame + 1, count)
+    return RecordResult(Path(out), count, written, sensors, len(actors.vehicles), len(actors.walkers), server.version)
+
+
+def _write_frame(
+    writer: CaptureWriter, frame: int, recordings: list[Recording], times_s: list[float], picture: bytes | None
+) -> None:
+    """Write a frame. Its times are written last: a frame without times is not complete."""
+    for sensor, recording in enumerate(recordings):
+        writer.write(sensor, frame, recording)
+    if picture is not None:
+        writer.write_bev(frame, picture)
+    for sensor, elapsed_s in enumerate(times_s):
+        writer.write_time(sensor, frame, elapsed_s)
+
+
+def _check_replay(writer: CaptureWriter, frame: int, replayed: Recording) -> None:
+    """Raise ConflictError where the ego sensor is not where it was when the frame was recorded."""
+    recorded = Capture(writer.raw).read_pose(0, frame)
+    distance_m = float(np.linalg.norm(recorded[:3, 3] - replayed.world_T_sensor[:3, 3]))
+    if distance_m > _REPLAY_TOLERANCE_M:
+        raise ConflictError(
+            f"{writer.raw}: frame {frame}",
+            expected="the replay to follow the recorded drive",
+            found=f"the ego sensor {distance_m:.2f} m away from it",
+            advice="the server's physics differ between runs: record to another folder",
+        )

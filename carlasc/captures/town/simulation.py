@@ -1,0 +1,170 @@
+"""`simulate`: a drive through the simulated town, written as a raw capture (see the format page, `docs/format.md#raw-capture`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from carlasc.captures.lidar import Lidar
+from carlasc.captures.raw import CaptureWriter
+from carlasc.captures.settings import TrafficLevel, check_at_least, check_traffic
+from carlasc.captures.town.birdseye import render_birdseye
+from carlasc.captures.town.drive import Drive
+from carlasc.core.tables import CARLA
+from carlasc.errors import import_extra
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage.layout import FRAME_PERIOD_S
+
+SETTINGS_FILE = "simulation.json"
+
+TOWN_VERSION = 1
+"""Goes up whenever the same seed makes another town: frames of both must not be mixed in one capture."""
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """What a simulation wrote.
+
+    Attributes:
+        out: folder of the sequence, which holds raw/.
+        count: number of the requested frames that exist now.
+        written: number of frames that this run wrote; the others existed.
+        sensors: number of sensors.
+        points: number of points that this run wrote.
+        classes: number of these points per class name.
+    """
+
+    out: Path
+    count: int
+    written: int
+    sensors: int
+    points: int
+    classes: dict[str, int]
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """The settings of a capture, as simulation.json holds them."""
+
+    seed: int
+    traffic: TrafficLevel
+    sensors: int
+    bev: bool
+    lidar: Lidar
+    recipe: int = TOWN_VERSION
+
+
+def simulate(
+    out: str | os.PathLike[str],
+    *,
+    count: int = 20,
+    first_frame: int = 0,
+    sensors: int = 20,
+    seed: int = 0,
+    traffic: TrafficLevel = "medium",
+    lidar: Lidar | None = None,
+    bev: bool = True,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> SimulationResult:
+    """Record a drive through a simulated town as a raw capture. The same arguments write the same bytes.
+
+    A second run with the same settings writes the frames that are missing, so it continues an interrupted run or adds frames.
+
+    Args:
+        out: folder of the sequence. Files go to `<out>/raw`.
+        count: number of frames, 0.1 s apart.
+        first_frame: number of the first frame. The drive starts with frame 0, at rest.
+        sensors: number of LiDARs. The first is the ego sensor.
+        seed: seed of the town, its traffic, the sensors' offsets and the noise.
+        traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
+        lidar: model of the LiDARs. None: the data set's.
+        bev: whether to write bird's-eye pictures.
+        workers: number of processes. None: one per core.
+        executor: runs the work instead of processes of its own.
+        progress: called with (frames done, number of frames).
+
+    Returns:
+        What was written.
+
+    Raises:
+        ArgumentError: an argument is out of its range.
+        DependencyError: a package of the extra `simulate` is missing. Nothing is written.
+        ConflictError: `out` holds a capture with other settings, or one that `simulate` did not write.
+        StorageError: `out` cannot be written to.
+        CarlascError: a worker process died.
+    """
+    check_at_least(1, count=count, sensors=sensors)
+    check_at_least(0, first_frame=first_frame, seed=seed)
+    check_traffic(traffic)
+    count_workers(workers)
+    settings = _Settings(seed, traffic, sensors, bev, lidar or Lidar())
+    check_dependencies(bev)
+    writer = CaptureWriter(out)
+    writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc simulate")
+    writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))
+
+    wanted = range(first_frame, first_frame + count)
+    missing = [frame for frame in wanted if not writer.has_frame(frame, sensors, bev)]
+    complete = set(wanted) - set(missing)
+    for frame in sorted(complete - writer.timed_frames(sensors)):  # the run was interrupted before it wrote their times
+        _write_times(writer, sensors, frame)
+    if progress is not None:
+        progress(len(complete), count)
+    points: Counter[str] = Counter()
+    recorded = run_all(partial(_record_frame, writer, settings), missing, workers=workers, executor=executor)
+    for done, (frame, points_of_frame) in enumerate(zip(missing, recorded, strict=True), len(complete) + 1):
+        points.update(points_of_frame)
+        _write_times(writer, sensors, frame)
+        if progress is not None:
+            progress(done, count)
+    classes = {name: points[name] for name in CARLA.names.values() if points[name]}
+    return SimulationResult(Path(out), count, len(missing), sensors, points.total(), classes)
+
+
+def check_dependencies(bev: bool = True) -> None:
+    """Check that the packages exist that a simulation needs.
+
+    Args:
+        bev: whether bird's-eye pictures are drawn.
+
+    Raises:
+        DependencyError: a package of the extra `simulate` is missing.
+    """
+    modules = ("trimesh.creation", "embreex.rtcore_scene", "embreex.mesh_construction")
+    for module in (*modules, "PIL.Image") if bev else modules:
+        import_extra(module, "simulate")
+
+
+def _record_frame(writer: CaptureWriter, settings: _Settings, frame: int) -> dict[str, int]:
+    """Write the recordings of all sensors and the picture of a frame. Return the number of points per class name."""
+    drive = _cached_drive(settings.seed, settings.traffic, settings.lidar)
+    points = np.zeros(CARLA.num_channels, np.int64)
+    for sensor in range(settings.sensors):
+        recording = drive.record(frame, sensor)
+        if recording.scan.labels is not None:
+            points += np.bincount(recording.scan.labels, minlength=len(points))
+        writer.write(sensor, frame, recording)
+    if settings.bev:
+        writer.write_bev(frame, render_birdseye(drive.snapshot(frame)))
+    return {CARLA.names[label]: int(number) for label, number in enumerate(points) if number}
+
+
+@lru_cache(maxsize=1)
+def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> Drive:
+    """Return the drive of this process: the town is built once."""
+    return Drive(seed, traffic, lidar)
+
+
+def _write_times(writer: CaptureWriter, sensors: int, frame: int) -> None:
+    for sensor in range(sensors):
+        writer.write_time(sensor, frame, frame * FRAME_PERIOD_S)
