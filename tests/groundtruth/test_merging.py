@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.frames import FrameRange
-from carlasc.core.geometry import invert, transform_points, translation
+from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.groundtruth import FromScans, Voting
@@ -130,6 +130,39 @@ def test_where_boxes_overlap_the_smaller_one_takes_precedence():
         voxel = SPEC.flat_index(transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3]))
         assert regions[voxel] == number
         assert {1, 2} <= set(regions.tolist())
+
+
+def around(turn, points):
+    """A scan of points that are turned around the sensor by an angle, and the box that stays 4 m away in this direction."""
+    turned = transform_points(rotation_z(turn), np.array(points, float)).astype(np.float32)
+    scan = PreparedScan.of(0, turned, np.ones(len(turned), np.uint16), np.eye(4))
+    return scan.rays_through(rotation_z(-turn), np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])).tolist()
+
+
+@pytest.mark.parametrize("turn", np.linspace(-np.pi, np.pi, 9))
+def test_rays_through_a_box_end_in_it_or_behind_it(turn):
+    ends = [
+        (5, 0, 0),
+        (9, 0.5, 0.5),
+        (3.9, 0, 0),
+        (-9, 0, 0),
+        (9, 2.5, 0),
+        (4.5, 0.99, 0.99),
+        (9, 0, 3),
+        (9, -1.2, -1.2),
+    ]
+    assert sorted(around(turn, ends)) == [0, 1, 5, 7]
+
+
+def test_a_box_around_below_or_beside_the_sensor_is_seen_whole():
+    points = np.array([(5, 0, -2), (-5, 0, -2), (0, 5, -2), (0, -5, -2)], np.float32)
+    scan = PreparedScan.of(0, points, np.ones(4, np.uint16), np.eye(4))
+    below = scan.rays_through(np.eye(4), np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0]))
+    assert sorted(below.tolist()) == [0, 1, 2, 3]
+    beside = scan.rays_through(np.eye(4), np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0]))
+    assert beside.tolist() == [2]
+    corner = scan.rays_through(np.eye(4), np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0]))
+    assert corner.tolist() == [1]
 
 
 class TestFeed:

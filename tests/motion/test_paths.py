@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.actors import PERIOD_S, MovingBox, box_surface, scan_of
 
-from carlasc.motion.paths import estimate_path
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.registration import follow
 
 FRAMES = range(25)
@@ -55,6 +55,52 @@ def test_an_actor_seen_once_or_never_has_no_velocity():
     once = [box_surface((4, 2, 1.5), 100)]
     assert not estimate_path(once, np.zeros(1), rigid=True)[1].any()
     assert estimate_path([np.empty((0, 3))] * 3, np.arange(3.0), rigid=True)[1].tolist() == [[0, 0, 0]] * 3
+
+
+def people(rng, count=80):
+    return [rng.uniform(-0.3, 0.3, (count, 3)) * (1, 1, 3) + (1.4 * time, 0, 1) for time in SECONDS]
+
+
+def test_nine_points_are_too_few_to_follow_and_ten_are_enough():
+    for count, used in ((9, False), (10, True)):
+        sightings = people(np.random.default_rng(1))
+        for frame in range(4):
+            sightings[frame] = sightings[frame][:count] + (4.0, 0, 0)
+        velocity = estimate_path(sightings, SECONDS, rigid=False)[1][4]
+        assert (abs(velocity[0] - 1.4) > 0.8) == used
+
+
+def test_a_velocity_changes_by_no_more_than_six_metres_per_second_squared():
+    sightings = people(np.random.default_rng(2))
+    sightings[-2:] = [points + (3.0, 0, 0) for points in sightings[-2:]]
+    changes = np.linalg.norm(np.diff(estimate_path(sightings, SECONDS, rigid=False)[1], axis=0), axis=1)
+    assert changes.max() == pytest.approx(6.0 * PERIOD_S)
+
+
+def test_a_heading_is_that_of_the_motion_and_is_held_while_an_actor_is_slow():
+    velocities = np.array([[5.0, 0, 0], [0.5, 0.8, 0], [-0.2, 0.9, 0], [0, 5.0, 0], [0, -0.9, 0]])
+    assert np.allclose(headings_of(velocities), np.array([0, 1, 2, 3, 3]) * np.pi / 6)
+    assert np.allclose(headings_of(velocities[1:2]), np.arctan2(0.8, 0.5))
+
+
+class TestStanding:
+    def standing(self, sightings, velocity=(0.0, 0.0, 0.0)):
+        positions = np.outer(SECONDS, velocity) + (10, 0, 0)
+        return is_standing(sightings, positions, np.zeros(len(SECONDS)), SECONDS)
+
+    def test_sightings_at_one_place_are_of_a_standing_actor(self):
+        assert self.standing([box_surface((4, 2, 1.5), 300, seed) for seed in range(25)], (0.5, 0, 0))
+
+    def test_sightings_that_overlap_only_after_their_motion_are_of_a_moving_one(self):
+        moving = [box_surface((4, 2, 1.5), 300, seed) + (8 * time, 0, 0) for seed, time in enumerate(SECONDS)]
+        assert not self.standing(moving, (8.0, 0, 0))
+
+    def test_sightings_that_never_overlap_are_not_of_a_standing_one(self):
+        rng = np.random.default_rng(3)
+        assert not self.standing([rng.uniform(-4, 4, (12, 3)) for _ in SECONDS])
+
+    def test_a_single_sighting_is_of_a_standing_actor(self):
+        assert is_standing([np.zeros((5, 3))], np.zeros((1, 3)), np.zeros(1), np.zeros(1))
 
 
 def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
