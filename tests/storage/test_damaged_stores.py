@@ -235,6 +235,23 @@ def test_chunks_that_are_missing_are_one_clear_error(hdf5_store: Path) -> None:
         carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
 
 
+def test_bytes_that_cannot_be_decoded_name_field_and_frame(hdf5_store: Path) -> None:
+    import google_crc32c
+    import h5py
+
+    with h5py.File(hdf5_store) as file:
+        info = file[LABELS].id.get_chunk_info(1)
+        checksums = file[f"{LABELS}_crc32c"][:]
+    content = bytearray(hdf5_store.read_bytes())
+    content[info.byte_offset : info.byte_offset + 16] = b"\xff" * 16
+    checksums[1] = google_crc32c.value(bytes(content[info.byte_offset : info.byte_offset + info.size]))
+    hdf5_store.write_bytes(content)
+    edit_hdf5(hdf5_store, f"{LABELS}_crc32c", checksums)
+    sequence = carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"]
+    with pytest.raises(FormatError, match="field labels, frame 2: its bytes: cannot be decoded"):
+        sequence.read("labels", 2)
+
+
 def test_a_data_set_without_the_filter_is_one_clear_error(hdf5_store: Path) -> None:
     edit_hdf5(hdf5_store, LABELS, np.zeros(30, np.uint8))
     with pytest.raises(FormatError, match="expected a chunked data set with the Blosc filter"):
