@@ -166,14 +166,14 @@ def hdf5_store(data: Path, tmp_path: Path) -> Path:
     return pack(data / "Train", tmp_path / "x.h5").out
 
 
-def edit_hdf5(store: Path, name: str, values: Any) -> None:
+def edit_hdf5(store: Path, name: str, values: Any, **options: Any) -> None:
     """Replace a data set of one chunk, as another program might."""
     import h5py
 
     with h5py.File(store, "r+") as file:
         attributes = dict(file[name].attrs)
         del file[name]
-        file.create_dataset(name, data=values).attrs.update(attributes)
+        file.create_dataset(name, data=values, **options).attrs.update(attributes)
 
 
 LABELS = "Town01_Light/cartesian/scans/labels/values"
@@ -235,8 +235,26 @@ def test_chunks_that_are_missing_are_one_clear_error(hdf5_store: Path) -> None:
         carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
 
 
-def test_a_data_set_without_the_filter_is_one_clear_error(hdf5_store: Path) -> None:
-    edit_hdf5(hdf5_store, LABELS, np.zeros(30, np.uint8))
+def test_bytes_that_cannot_be_decoded_name_field_and_frame(hdf5_store: Path) -> None:
+    import google_crc32c
+    import h5py
+
+    with h5py.File(hdf5_store) as file:
+        info = file[LABELS].id.get_chunk_info(1)
+        checksums = file[f"{LABELS}_crc32c"][:]
+    content = bytearray(hdf5_store.read_bytes())
+    content[info.byte_offset : info.byte_offset + 16] = b"\xff" * 16
+    checksums[1] = google_crc32c.value(bytes(content[info.byte_offset : info.byte_offset + info.size]))
+    hdf5_store.write_bytes(content)
+    edit_hdf5(hdf5_store, f"{LABELS}_crc32c", checksums)
+    sequence = carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"]
+    with pytest.raises(FormatError, match="field labels, frame 2: its bytes: cannot be decoded"):
+        sequence.read("labels", 2)
+
+
+@pytest.mark.parametrize("options", [{}, {"chunks": (10,)}, {"chunks": (10,), "compression": "gzip"}], ids=str)
+def test_a_data_set_without_the_filter_is_one_clear_error(hdf5_store: Path, options: dict[str, Any]) -> None:
+    edit_hdf5(hdf5_store, LABELS, np.zeros(30, np.uint8), **options)
     with pytest.raises(FormatError, match="expected a chunked data set with the Blosc filter"):
         carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
 

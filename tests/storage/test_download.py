@@ -332,3 +332,140 @@ def test_the_record_beside_a_part_names_the_file_and_its_blocks(site: Site, tmp_
     for index, count in record["got"].items():
         start = int(index) * record["block"]
         assert part[start : start + count] == site.files[VAL][start : start + count]
+
+
+@pytest.mark.parametrize("status", [401, 403, 404, 410])
+def test_a_file_that_is_not_for_us_is_missing_at_the_first_try(site: Site, tmp_path: Path, status: int) -> None:
+    site.status = status
+    with pytest.raises(MissingDataError, match=f"expected a file, found status {status}"):
+        get(site, tmp_path)
+    assert len(site.requests) == 1
+
+
+def test_a_server_that_fails_is_asked_again(site: Site, tmp_path: Path) -> None:
+    def fail_twice(number: int) -> None:
+        site.status = 503 if number in (1, 4) else None
+
+    site.before = fail_twice
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_a_server_that_always_fails_is_given_up(site: Site, tmp_path: Path) -> None:
+    site.status = 503
+    with pytest.raises(CarlascError, match=r"expected data, found none at 6 tries \(status 503"):
+        get(site, tmp_path)
+    assert len(site.requests) == 6
+
+
+def test_weak_etags_are_compared_but_not_sent(site: Site, tmp_path: Path) -> None:
+    site.weak = True
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+    assert len(site.requests) > 5  # in blocks: no range was refused
+
+
+def test_without_etags_a_change_of_size_begins_the_download_again(site: Site, tmp_path: Path) -> None:
+    site.etags = False
+    changed = make_zip(2, {**MEMBERS, "Val/more": 3_000})
+
+    def change(number: int) -> None:
+        if number == 5:
+            site.files[VAL] = changed
+
+    site.before = change
+    assert get(site, tmp_path).read_bytes() == changed
+
+
+def test_a_stream_that_changes_begins_again(site: Site, tmp_path: Path) -> None:
+    site.ranges = False
+    changed = make_zip(2, {**MEMBERS, "Val/more": 3_000})
+
+    def change(number: int) -> None:
+        if number == 2:
+            site.files[VAL] = changed
+
+    site.before = change
+    seen: list[int] = []
+    assert get(site, tmp_path, progress=lambda done, total: seen.append(done)).read_bytes() == changed
+    assert seen[-1] == len(changed)
+
+
+@pytest.mark.parametrize("off", [-1, 1])
+def test_a_length_that_is_not_that_of_the_range_is_not_believed(site: Site, tmp_path: Path, off: int) -> None:
+    site.length_off = off
+    with pytest.raises(CarlascError, match="found a Content-Length of"):
+        get(site, tmp_path)
+    assert "val_cartesian.zip" not in names(tmp_path)
+
+
+def test_progress_goes_back_where_bytes_are_thrown_away(site: Site, tmp_path: Path) -> None:
+    changed = make_zip(1)
+
+    def change(number: int) -> None:
+        if number == 5:
+            site.files[VAL] = changed
+
+    site.before = change
+    seen: list[int] = []
+    get(site, tmp_path, progress=lambda done, total: seen.append(done))
+    assert seen[-1] == len(changed)
+    site.ranges, site.before = False, None
+    site.files[VAL] = make_zip(3)
+    site.drop_after = 100_000
+    with pytest.raises(CarlascError):
+        get(site, tmp_path / "stream", progress=lambda done, total: seen.append(done))
+    assert max(seen) <= len(changed)
+
+
+def test_a_part_of_another_size_than_its_record_is_fetched_again(site: Site, tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        get(site, tmp_path, progress=stop)
+    part = tmp_path / "val_cartesian.zip.part"
+    part.write_bytes(part.read_bytes()[:100])
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_keeping_without_extracting_is_an_argument_error(site: Site, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="keep: expected `extract=True` with it"):
+        get(site, tmp_path, keep=True)
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [({"connections": 0}, "connections"), ({"block_bytes": 0}, "block_bytes"), ({"wait_s": -1}, "wait_s")],
+)
+def test_settings_without_sense_are_argument_errors(values: dict[str, int], name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"{name}: expected"):
+        TransferSettings(**values)
+
+
+def test_a_zip_that_exists_needs_no_space(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    get(site, tmp_path)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) // 2))
+    get(site, tmp_path)
+    with pytest.raises(CarlascError, match="to extract val_cartesian.zip|for the zips and the files"):
+        get(site, tmp_path, extract=True)
+
+
+def test_extracting_checks_the_space_for_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, out = tmp_path / "x.zip", tmp_path / "out"
+    path.write_bytes(make_zip(0, {"a": 100, "b": 200}))
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(extraction.shutil, "disk_usage", lambda _: usage._replace(free=250))
+    with pytest.raises(CarlascError, match=r"free space to extract x\.zip"):
+        extraction.extract_zip(path, out, lambda _: None)
+    assert not out.exists()
+    out.mkdir()
+    with zipfile.ZipFile(path) as archive:
+        (out / "a").write_bytes(archive.read("a"))
+    assert extraction.extract_zip(path, out, lambda _: None) == 2
+
+
+def test_the_result_says_how_long_it_took_and_an_address_may_end_in_a_slash(site: Site, tmp_path: Path) -> None:
+    result = download(tmp_path, split="val", base_url=f"{site.url}/", settings=QUICK)
+    assert result.elapsed_s > 0
+    assert result.archives[0].fetched == result.archives[0].size == len(site.files[VAL])

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.sequences import write_dataset
+from helpers.sequences import params, write_dataset
 
 import carlasc
 from carlasc.errors import FormatError, MissingDataError
@@ -102,3 +105,68 @@ def test_unknown_files_are_listed(tmp_path: Path) -> None:
     (root / WHOLE / "velodyne" / "index.txt").write_text("mine")
     sequence = FolderSource(root).sequences()[WHOLE]
     assert sequence.unknown_files() == ("depth/", "notes.txt", "velodyne/index.txt")
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_sequences_are_found_down_to_four_levels(tmp_path: Path, levels: int) -> None:
+    write_dataset(tmp_path.joinpath(*"ab"[:levels]))
+    if levels == 1:
+        assert len(FolderSource(tmp_path).sequences()) == 3
+    else:
+        with pytest.raises(MissingDataError):
+            FolderSource(tmp_path).sequences()
+
+
+@pytest.mark.parametrize("folder", [".cache", "raw"])
+def test_hidden_folders_and_captures_hold_no_sequences(tmp_path: Path, folder: str) -> None:
+    write_dataset(tmp_path / "data")
+    (tmp_path / "data" / folder / "velodyne").mkdir(parents=True)
+    assert len(FolderSource(tmp_path / "data").sequences()) == 3
+
+
+def test_a_sequence_that_has_only_a_grid_of_another_size_is_found(tmp_path: Path) -> None:
+    writer = FolderSink(tmp_path).sequence(WHOLE)
+    writer.write_document("evaluation_8x4x3/params.json", params((8, 4, 3)))
+    writer.write("evaluation_8x4x3/labels", 0, np.zeros((8, 4, 3), np.uint32))
+    (sequence,) = FolderSource(tmp_path).sequences().values()
+    assert sequence.fields() == {"evaluation_8x4x3/labels"}
+
+
+def test_empty_folders_and_folders_without_params_are_no_fields(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data") / BARE
+    (root / "predictions").mkdir()
+    (root / "depth").mkdir()
+    (root / "depth" / "000000.label").write_bytes(bytes(4))
+    assert FolderSource(root).sequences()[""].fields() == {"points", "labels"}
+
+
+def test_frames_are_sorted_whatever_the_order_of_the_files(tmp_path: Path) -> None:
+    frames = [int(number) for number in np.random.default_rng(0).permutation(200)]
+    writer = FolderSink(tmp_path).sequence(WHOLE)
+    for frame in frames:
+        writer.write("labels", frame, np.zeros(1, np.uint32))
+    assert FolderSource(tmp_path).sequences()[WHOLE].frames("labels").tolist() == sorted(frames)
+
+
+def test_a_grid_is_removed_and_other_files_in_its_folder_stay(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data")
+    (root / WHOLE / "evaluation" / "notes.txt").write_text("mine")
+    FolderSink(root).sequence(WHOLE).remove_grid("evaluation")
+    assert [entry.name for entry in (root / WHOLE / "evaluation").iterdir()] == ["notes.txt"]
+    assert "evaluation_8x4x3/labels" in FolderSource(root).sequences()[WHOLE].fields()
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        FolderSink(root).sequence(WHOLE).remove_grid("../cartesian/velodyne")
+
+
+def test_unfinished_files_of_a_killed_run_are_removed_inside_the_sequence_only(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data")
+    script = "import sys; from carlasc.storage import files; from pathlib import Path; import os; "
+    script += "files.write_atomic(Path(sys.argv[1]), lambda file: os._exit(0))"
+    for folder in (root / WHOLE / "velodyne", tmp_path / "elsewhere"):
+        subprocess.run([sys.executable, "-c", script, str(folder / "000009.bin")], check=True)
+        assert [entry for entry in folder.iterdir() if entry.suffix == ".part"]
+    FolderSink(root).sequence(WHOLE)
+    assert not [entry for entry in (root / WHOLE / "velodyne").iterdir() if entry.suffix == ".part"]
+    with pytest.raises(FormatError, match="leads elsewhere"):
+        FolderSink(root).sequence("../elsewhere")
+    assert list((tmp_path / "elsewhere").iterdir())

@@ -9,7 +9,7 @@ from helpers.sequences import FRAMES
 
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.storage import FolderSource, Sink, Source
+from carlasc.storage import FolderSource, Sink, Source, layout
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packed.tables.writing import ParquetSink
 from carlasc.storage.packing import pack
@@ -125,3 +125,49 @@ def test_a_second_run_keeps_finished_sequences(tmp_path: Path) -> None:
 def test_pcodec_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"\.zarr"):
         ParquetSink(tmp_path / "x.parquet", Options(small=True))
+
+
+def frames_table(store: Path) -> list[dict[str, object]]:
+    return parquet.read_table(store / BARE / "frames.parquet").to_pylist()
+
+
+@pytest.mark.parametrize(
+    ("lines", "times"),
+    [(3, [0.0, 1.0, 2.0]), (4, [1.0, 2.0, 3.0]), (2, None), (0, None)],
+    ids=["a line for each frame", "a line for each number", "too few lines", "none"],
+)
+def test_lines_of_text_files_are_those_of_the_frames(tmp_path: Path, lines: int, times: list[float] | None) -> None:
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+        writer.write_document("times.txt", "".join(f"{line}\n" for line in range(lines)).encode())
+        for frame in (1, 2, 3):
+            writer.write("labels", frame, np.zeros(2, np.uint32))
+    rows = frames_table(tmp_path / "x.parquet")
+    assert [row.get("time_s") for row in rows] == (times or [None] * 3)
+    assert ("time_s" in rows[0]) == (times is not None)
+
+
+def test_statistics_leave_points_out_that_are_not_finite(tmp_path: Path) -> None:
+    points = np.zeros((4, 4), np.float32)
+    points[:, 0] = [3, np.nan, np.inf, 1]
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+        writer.write("points", 0, points)
+        writer.write("points", 1, points[1:2])
+    rows = frames_table(tmp_path / "x.parquet")
+    assert [(row["points"], row["farthest_m"]) for row in rows] == [(4, 3.0), (1, None)]
+
+
+def test_votes_of_another_width_than_the_first_frame_are_refused(tmp_path: Path) -> None:
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+        writer.write("fine/votes", 0, np.zeros(2, layout.VOTES_DTYPE))
+        with pytest.raises(FormatError, match="frame 1: its labels: expected 1 bytes each"):
+            writer.write("fine/votes", 1, np.zeros(2, layout.WIDE_VOTES_DTYPE))
+
+
+def test_a_table_of_another_size_than_the_grid_is_one_clear_error(store: Path) -> None:
+    file = store / WHOLE / "documents.parquet"
+    rows = parquet.read_table(file)
+    data = [row["data"].replace(b"[4.0, 6.0, 2.0]", b"[4.0, 6.0, 3.0]") for row in rows.to_pylist()]
+    changed = rows.set_column(1, "data", [data])
+    parquet.write_table(changed.cast(rows.schema), file)
+    with pytest.raises(FormatError, match="frame 5: expected 72 voxels, found 48"):
+        carlasc.open(store).sequences()[WHOLE].read("evaluation/labels", 5)

@@ -159,6 +159,23 @@ def test_a_missing_shard_is_damage_and_no_zeros(store: Path) -> None:
         carlasc.open(store).sequences()[WHOLE].read("points", 5)
 
 
+def test_a_chunk_that_the_index_does_not_have_is_damage_and_no_zeros(store: Path) -> None:
+    import google_crc32c
+
+    file = shard_of(store, "scans/points/xyz")
+    per_shard = json.loads((store / WHOLE / "scans/points/xyz/zarr.json").read_bytes())["chunk_grid"]["configuration"]
+    chunk = json.loads((store / WHOLE / "scans/points/xyz/zarr.json").read_bytes())["codecs"][0]["configuration"]
+    size = 16 * (per_shard["chunk_shape"][1] // chunk["chunk_shape"][1])
+    data = bytearray(file.read_bytes())
+    data[-4 - size + 32 : -4 - size + 48] = b"\xff" * 16  # of chunk 2, which is frame 5
+    data[-4:] = google_crc32c.value(bytes(data[-4 - size : -4])).to_bytes(4, "little")
+    file.write_bytes(data)
+    sequence = carlasc.open(store).sequences()[WHOLE]
+    with pytest.raises(FormatError, match="field points, frame 5.*expected chunk 2, found none: the store is damaged"):
+        sequence.read("points", 5)
+    assert len(sequence.read("points", 2)) == 777
+
+
 def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
     root = json.loads((store / "zarr.json").read_bytes())
     root["attributes"]["version"] = 2

@@ -209,3 +209,123 @@ def test_a_big_directory_is_opened_without_touching_its_members(tmp_path: Path) 
     archive.write_bytes(data)
     (sequence,) = carlasc.open(archive).sequences().values()
     assert len(sequence.frames("points")) == count
+
+
+def tiny(tmp_path: Path, method: int = zipfile.ZIP_STORED) -> tuple[Path, bytearray, int, int]:
+    """Return a zip of one scan, its bytes, where its directory starts, and where its end record does."""
+    path = write_zip({"velodyne/000000.bin": bytes(range(160))}, tmp_path / "tiny.zip", method)
+    data = bytearray(path.read_bytes())
+    end = data.rindex(b"PK\x05\x06")
+    return path, data, struct.unpack_from("<I", data, end + 16)[0], end
+
+
+def read_scan(path: Path, data: bytes) -> bytes:
+    path.write_bytes(data)
+    return carlasc.open(path).sequences()[""].read("points", 0).tobytes()
+
+
+def test_an_encrypted_member_says_to_unpack(tmp_path: Path) -> None:
+    path, data, start, _ = tiny(tmp_path)
+    data[start + 8] |= 1
+    with pytest.raises(FormatError, match="found an encrypted one: unpack the zip"):
+        read_scan(path, data)
+
+
+def test_a_part_of_several_zips_says_to_join_them(tmp_path: Path) -> None:
+    path, data, _, end = tiny(tmp_path)
+    struct.pack_into("<H", data, end + 4, 1)
+    with pytest.raises(FormatError, match="found a part of several: join them"):
+        read_scan(path, data)
+
+
+@pytest.mark.parametrize("more", [10, 64, 65, 3000])
+def test_a_local_header_may_be_longer_than_the_directory_says(tmp_path: Path, more: int) -> None:
+    path, data, start, end = tiny(tmp_path)
+    struct.pack_into("<I", data, end + 16, start + more)
+    (name,) = struct.unpack_from("<H", data, 26)
+    struct.pack_into("<H", data, 28, more)
+    data[30 + name : 30 + name] = bytes(more)
+    assert read_scan(path, data) == bytes(range(160))
+
+
+@pytest.mark.parametrize("change", [-1, 1])
+def test_a_size_that_is_wrong_in_the_directory_is_damage(tmp_path: Path, change: int) -> None:
+    path, data, start, _ = tiny(tmp_path, zipfile.ZIP_DEFLATED)
+    struct.pack_into("<I", data, start + 24, 160 + change)
+    with pytest.raises(FormatError, match="the zip is damaged"):
+        read_scan(path, data)
+
+
+def widen(data: bytearray, start: int, end: int, extra: bytes) -> bytearray:
+    """Give the one member of a zip a size of 64 bits, in this extra field."""
+    (name,) = struct.unpack_from("<H", data, start + 28)
+    struct.pack_into("<I", data, start + 24, 2**32 - 1)
+    struct.pack_into("<H", data, start + 30, len(extra))
+    struct.pack_into("<I", data, end + 12, end - start + len(extra))
+    place = start + 46 + name
+    return data[:place] + extra + data[place:]
+
+
+@pytest.mark.parametrize(
+    ("extra", "fits"),
+    [
+        (struct.pack("<2HQ", 1, 8, 160), True),
+        (struct.pack("<2HI2HQ", 7, 4, 0, 1, 8, 160), True),  # behind a field of another kind
+        (struct.pack("<2HQ", 1, 8, 2**63), False),
+        (struct.pack("<2HI", 1, 4, 160), False),
+        (struct.pack("<2HI", 1, 8, 160), False),
+        (struct.pack("<2HQ", 2, 8, 160), False),
+        (b"", False),
+    ],
+)
+def test_a_size_of_64_bits_is_read_or_is_one_clear_error(tmp_path: Path, extra: bytes, fits: bool) -> None:
+    path, data, start, end = tiny(tmp_path)
+    if fits:
+        assert read_scan(path, widen(data, start, end, extra)) == bytes(range(160))
+    else:
+        with pytest.raises(FormatError, match="found no 64-bit sizes of member 0"):
+            read_scan(path, widen(data, start, end, extra))
+
+
+@pytest.mark.parametrize("offset", [0, 2**40])
+def test_a_locator_that_points_elsewhere_is_one_clear_error(tmp_path: Path, offset: int) -> None:
+    path, data, _, end = tiny(tmp_path)
+    data[end:end] = struct.pack("<4sLQL", b"PK\x06\x07", 0, offset, 1)
+    with pytest.raises(FormatError, match=r"tiny\.zip: expected a zip's central directory, found .*64-bit end record"):
+        read_scan(path, data)
+
+
+def test_a_member_beyond_the_directory_is_one_clear_error(tmp_path: Path) -> None:
+    path, data, start, _ = tiny(tmp_path)
+    struct.pack_into("<I", data, start + 20, 100_000)
+    with pytest.raises(FormatError, match="found a member beyond the directory"):
+        read_scan(path, data)
+
+
+def test_bytes_behind_the_last_record_of_the_directory_are_one_clear_error(tmp_path: Path) -> None:
+    path, data, start, end = tiny(tmp_path)
+    struct.pack_into("<I", data, end + 12, end - start + 5)
+    data[end:end] = bytes(5)
+    with pytest.raises(FormatError, match="found 1 members in"):
+        read_scan(path, data)
+
+
+def test_a_range_beyond_the_end_of_a_member_is_one_clear_error(tmp_path: Path) -> None:
+    path, _, _, _ = tiny(tmp_path)
+    tree = ZipTree(LocalTree(tmp_path), path.name)
+    assert bytes(tree.read_range("velodyne/000000.bin", -10, -5)) == bytes(range(150, 155))
+    assert bytes(tree.read_range("velodyne/000000.bin", 150, 160)) == bytes(range(150, 160))
+    with pytest.raises(FormatError, match="expected at least 161 bytes, found 160"):
+        tree.read_range("velodyne/000000.bin", 150, 161)
+    with pytest.raises(MissingDataError, match="expected a file, found nothing"):
+        tree.read("velodyne/000001.bin")
+
+
+def test_names_in_utf_8_and_in_the_old_code_page_are_read(tmp_path: Path) -> None:
+    path = write_zip({"Übersicht.txt": b"1"}, tmp_path / "x.zip")
+    assert set(ZipTree(LocalTree(tmp_path), "x.zip").entries()) == {"Übersicht.txt"}
+    data = bytearray(path.read_bytes())
+    start = data.rindex(b"PK\x01\x02")
+    data[start + 9] &= ~8  # without the flag of UTF-8, the name is one of code page 437
+    path.write_bytes(data)
+    assert set(ZipTree(LocalTree(tmp_path), "x.zip").entries()) == {"Übersicht.txt".encode().decode("cp437")}

@@ -8,7 +8,8 @@ from __future__ import annotations
 import mmap
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -91,32 +92,31 @@ class LocalTree(Tree):
 
     def read(self, path: str) -> bytes | memoryview:
         """Map the file into memory: its bytes are read when they are used."""
-        descriptor = self._open(path)
-        try:
+        with self._opened(path) as descriptor:
             if os.fstat(descriptor).st_size == 0:
                 return b""  # an empty file, such as an empty scan, cannot be mapped
             return memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
-        finally:
-            os.close(descriptor)
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Read the range, or map it into memory if it is large."""
-        descriptor = self._open(path)
-        try:
+        with self._opened(path) as descriptor:
             if start < 0:
                 size = os.fstat(descriptor).st_size
                 start, end = max(0, size + start), size + end
             if end - start >= _MAPPED:
                 return _map_range(descriptor, start, end, self.where(path))
             data = os.pread(descriptor, end - start, start)
-        finally:
-            os.close(descriptor)
         return check_length(data, end - start, self.where(path))
 
-    def _open(self, path: str) -> int:
+    @contextmanager
+    def _opened(self, path: str) -> Iterator[int]:
         path = f"{self.location}/{path}" if path else self.location
         try:
-            return os.open(path, os.O_RDONLY)
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                yield descriptor
+            finally:
+                os.close(descriptor)
         except (FileNotFoundError, NotADirectoryError) as error:
             raise MissingDataError(path, expected="a file", found="nothing") from error
         except OSError as error:
