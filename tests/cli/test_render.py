@@ -50,7 +50,7 @@ def test_frames_become_a_film_and_figures_are_json(golden_capture, tmp_path):
         (["--orbit", "-o", "a.png"], 2, "--orbit: expected a film"),
     ],
 )
-def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
+def test_a_mistake_is_one_line_and_the_right_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
     monkeypatch.chdir(tmp_path)
     result = call(golden_capture / "cartesian", *options)
     assert result.exit_code == code

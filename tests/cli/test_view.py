@@ -37,7 +37,7 @@ def test_figures_are_json(golden_capture, tmp_path):
         (["--json"], 2, "--out"),
     ],
 )
-def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
+def test_a_mistake_is_one_line_and_the_right_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
     monkeypatch.chdir(tmp_path)
     result = call(golden_capture / "cartesian", *options)
     assert result.exit_code == code, result.stderr
@@ -45,7 +45,7 @@ def test_a_mistake_is_one_line_and_an_honest_exit_code(golden_capture, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_page_that_is_there_is_only_replaced_when_asked(tmp_path):
+def test_an_existing_page_is_replaced_only_with_overwrite(tmp_path):
     data = write_blocks(tmp_path / "data" / "cartesian", frames=1)
     (tmp_path / "a.html").write_text("mine")
     assert call(data, "-o", tmp_path / "a.html").exit_code == 1

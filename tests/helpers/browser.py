@@ -24,7 +24,7 @@ def start_chromium(profile: Path) -> Any:
     binary = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
     driver = shutil.which("chromedriver")
     if binary is None or driver is None:
-        pytest.skip("chromium or chromedriver is not there: apt-get install chromium-driver")
+        pytest.skip("chromium or chromedriver is not installed: apt-get install chromium-driver")
     options = webdriver.ChromeOptions()
     options.binary_location = binary
     for flag in (*_FLAGS, f"--user-data-dir={profile}"):
@@ -51,7 +51,7 @@ class Page:
         )
 
     def run(self, script: str, *arguments: object) -> Any:
-        """Run an async function's body in the page, wait until what it changed is drawn, and return what it returned."""
+        """Run the body of an async function in the page, wait until the page is drawn again, and return its result."""
         return self.browser.execute_async_script(
             "const [args, done] = [[...arguments].slice(0, -1), arguments[arguments.length - 1]];"
             f"(async () => {{ {script} }})().then("
@@ -60,16 +60,16 @@ class Page:
         )
 
     def click(self, selector: str) -> None:
-        """Click what a CSS selector finds, as a user would, and wait until it is drawn."""
+        """Click the element of a CSS selector, as a user would, and wait until the page is drawn again."""
         self.browser.find_element("css selector", selector).click()
         self.run("")
 
     def text(self, selector: str) -> str:
-        """Return the text that is seen of an element."""
+        """Return the visible text of an element."""
         return str(self.browser.find_element("css selector", selector).text)
 
     def picture(self, name: str | None = None) -> NDArray[np.uint8]:
-        """Return what is seen, (H, W, 3) uint8; kept as test-output/<name>.png."""
+        """Return a screenshot, (H, W, 3) uint8, and keep it as test-output/<name>.png if it has a name."""
         from PIL import Image
 
         png = self.browser.get_screenshot_as_png()
@@ -79,7 +79,7 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def canvas(self, name: str | None = None) -> NDArray[np.uint8]:
-        """Return the part of the picture that is drawn by three.js."""
+        """Return the part of a screenshot that three.js draws."""
         box = self.run(
             "const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, r.y, r.right, r.bottom]"
         )
@@ -87,7 +87,7 @@ class Page:
         return self.picture(name)[y0:y1, x0:x1]
 
     def complaints(self) -> list[str]:
-        """Return what the console was told since the page was opened: warnings and errors."""
+        """Return the warnings and errors in the console since the page was opened."""
         return [
             entry["message"] for entry in self.browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")
         ]

@@ -1,4 +1,4 @@
-"""Reading films back."""
+"""Reading films."""
 
 from __future__ import annotations
 

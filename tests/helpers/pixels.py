@@ -1,4 +1,4 @@
-"""Finding things in pictures, and small grids to picture."""
+"""Finding colours in pictures, and small grids to draw."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ RED, BLUE, WHITE = 4, 10, 0  # Pedestrian and Vehicle: the reddest and the blues
 
 
 def red_pixels(picture):
-    """Return (H, W) bool: clearly red, lit or not."""
+    """Return (H, W) bool: clearly red, in the sun or in the shade."""
     red, green, blue = np.moveaxis(picture.astype(int), -1, 0)
     return (red > 70) & (red > 3 * green) & (red > 2 * blue)
 
 
 def blue_pixels(picture):
-    """Return (H, W) bool: clearly blue, lit or not."""
+    """Return (H, W) bool: clearly blue, in the sun or in the shade."""
     red, green, blue = np.moveaxis(picture.astype(int), -1, 0)
     return (blue > 50) & (blue > 3 * red) & (blue > 3 * green)
 
@@ -28,13 +28,13 @@ def middle_of(mask):
     return columns.mean(), rows.mean()
 
 
-def color_is_there(picture, color, tolerance=3):
-    """Whether a colour stands in a picture."""
+def has_color(picture, color, tolerance=3):
+    """Return whether a colour occurs in a picture."""
     return bool((np.abs(picture.astype(int) - color).max(-1) <= tolerance).any())
 
 
 def grid_with(blocks, spec=None, size_m=1.2):
-    """Return a grid that is free but for cubes of a class: {(x, y, z): class}, metres."""
+    """Return a free grid with cubes of given classes, {(x, y, z) in metres: class}."""
     spec = spec or GridSpec.published("cartesian")
     labels = np.zeros(spec.size, np.uint32)
     offsets = np.linspace(-size_m / 2, size_m / 2, 13)

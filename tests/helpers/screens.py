@@ -1,4 +1,4 @@
-"""A screen that nobody looks at: Xvfb."""
+"""A virtual screen: Xvfb."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 def virtual_screen(size: str = "1400x900x24") -> Iterator[dict[str, str]]:
     """Start Xvfb on a free display; yields the environment that uses it. Skips the test where Xvfb is absent."""
     if shutil.which("Xvfb") is None:
-        pytest.skip("Xvfb is not there: apt-get install xvfb")
+        pytest.skip("Xvfb is not installed: apt-get install xvfb")
     reader, writer = os.pipe()
     server = subprocess.Popen(
         ["Xvfb", "-displayfd", str(writer), "-screen", "0", size, "-nolisten", "tcp"],

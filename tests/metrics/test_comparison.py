@@ -13,7 +13,7 @@ def grid(labels, counts=None):
     return Grid(SPEC, np.array(labels, np.uint8).reshape(SPEC.size), counts)
 
 
-def test_each_kind_of_error_is_told_where_the_truth_is_known():
+def test_each_kind_of_error_is_found_where_the_truth_is_known():
     prediction, truth = grid([7, 7, 0, 7, 0, 7, 0]), grid([7, 10, 7, 0, 0, 7, 7], [1, 1, 1, 1, 1, 0, 0])
     outcomes = compare_grids(prediction, truth)
     assert outcomes.dtype == np.uint8 and outcomes.shape == SPEC.size
@@ -27,7 +27,7 @@ def test_a_truth_without_counts_is_known_everywhere():
     assert outcomes.reshape(-1).tolist() == [0] * 6 + [Outcome.INVENTED]
 
 
-def test_what_the_prediction_knows_plays_no_part():
+def test_counts_of_the_prediction_are_ignored():
     truth, labels = grid([1, 2, 0, 0, 0, 0, 5]), [1, 3, 0, 4, 0, 0, 0]
     np.testing.assert_array_equal(compare_grids(grid(labels), truth), compare_grids(grid(labels, [0] * 7), truth))
 

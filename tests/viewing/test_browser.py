@@ -29,7 +29,7 @@ def test_it_draws_without_a_network(page):
     assert page.run("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
 
 
-def test_left_is_left_ahead_is_ahead_up_is_up(page):
+def test_left_ahead_and_up_are_where_they_should_be(page):
     canvas = page.canvas()
     vehicle = canvas.shape[1] / 2
     red, blue = middle_of(red_pixels(canvas)), middle_of(blue_pixels(canvas))
@@ -117,7 +117,7 @@ def test_layers_are_toggled(page):
     assert red_pixels(points).sum() > 50
 
 
-def test_picking_a_voxel_tells_its_class_votes_and_place(page):
+def test_a_picked_voxel_shows_its_class_votes_and_position(page):
     column, row = middle_of(red_pixels(page.canvas()))
     page.run("carlasc.pick(...args)", float(column), float(row))
     page.picture("page_picked")
@@ -132,7 +132,7 @@ def test_picking_a_voxel_tells_its_class_votes_and_place(page):
 
 
 @pytest.mark.parametrize("mode", ["height", "votes"])
-def test_colours_may_tell_height_or_votes(page, mode):
+def test_colours_can_show_height_or_votes(page, mode):
     before = page.canvas()
     page.run(
         "const s = document.getElementById('color-by'); s.value = args[0]; s.dispatchEvent(new Event('change'))", mode
@@ -142,7 +142,7 @@ def test_colours_may_tell_height_or_votes(page, mode):
     assert page.text("#ramp h2").lower().startswith(mode)
 
 
-def test_prediction_truth_and_errors_stand_side_by_side_and_turn_together(browser, blocks, tmp_path):
+def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browser, blocks, tmp_path):
     prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
     result = write_page(prediction, tmp_path / "scene.html", truth=blocks)
     assert result.panels == ("prediction", "truth", "errors")
@@ -168,7 +168,7 @@ def test_prediction_truth_and_errors_stand_side_by_side_and_turn_together(browse
     assert page.complaints() == []
 
 
-def test_wedges_of_a_cylindrical_grid_lie_where_they_should(browser, tmp_path):
+def test_wedges_of_a_cylindrical_grid_are_at_their_positions(browser, tmp_path):
     spec = GridSpec.published("cylindrical").with_size((64, 64, 4))
     folder = write_blocks(tmp_path / "Town01_Light" / "cylindrical", frames=1, spec=spec)
     page = Page(browser, write_page(folder, tmp_path / "scene.html").out)

@@ -71,7 +71,7 @@ def test_a_scan_comes_back_thinned_to_one_point_a_cell(seed, count, cell):
         assert label in labels[near]
 
 
-def test_what_moves_becomes_an_arrow_a_thing():
+def test_each_moving_actor_becomes_one_arrow():
     points = np.array([[1, 0, 0], [1.2, 0, 0], [20, 0, 0], [30, 0, 0]], np.float32)
     flow = np.array([[5, 0, 0], [5, 0, 0], [0, -2, 0], [0, 0, 0]], np.float32)
     arrows = encode_scan(Scan(points, flow=flow), 0.2)["arrows"].reshape(-1, 6)

@@ -32,7 +32,7 @@ def test_the_package_of_a_missing_library_is_named(monkeypatch, message, package
     assert "\n" not in said
 
 
-def test_a_library_that_is_not_known_is_named_as_it_is():
+def test_an_unknown_library_is_named():
     assert missing_library("libstrange.so.3: cannot open shared object file: No such file") == "libstrange.so.3"
     assert "page.html" in libraries.advice("libstrange.so.3")
     assert missing_library("undefined symbol: foo") is None

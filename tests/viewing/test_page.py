@@ -62,7 +62,7 @@ def test_data_with_y_on_the_left_say_so_in_the_page(tmp_path):
     assert (scene["leftHanded"], scene["hasPoints"], scene["hasFlow"]) == (False, False, False)
 
 
-def test_a_page_asks_the_network_for_nothing(golden_capture, tmp_path):
+def test_a_page_loads_nothing_from_a_network(golden_capture, tmp_path):
     text, _, _ = read_page(write_page(golden_capture / "cartesian", tmp_path / "scene.html", frames=(0, 1)).out)
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=[\"'](?!data:)", text)
     assert "default-src 'none'" in text

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from helpers.browser import OUTPUT, Page
-from helpers.pixels import color_is_there
+from helpers.pixels import has_color
 from helpers.screens import virtual_screen
 from helpers.viewing import write_page
 
@@ -33,7 +33,7 @@ def test_the_page_of_a_street(browser, street, tmp_path):
     page.run("carlasc.panels.setShadows(true)")
     canvas = page.canvas("docs_page")
     for name in ("Road", "Sidewalk", "Vehicle"):  # open, level faces in the sun have the legend's colours
-        assert color_is_there(canvas, CARLA.colors[CARLA.id_of(name)])
+        assert has_color(canvas, CARLA.colors[CARLA.id_of(name)])
     page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.setView('top')")
     above = page.canvas("docs_page_dark")
     assert np.median(above.reshape(-1, 3)[:, 0]) < 140
@@ -59,4 +59,4 @@ def test_the_window_of_a_street(street):
     picture = np.asarray(Image.open(target).convert("RGB"))
     assert picture.shape == (720, 1280, 3)
     for name in ("Road", "Sidewalk", "Vehicle"):
-        assert color_is_there(picture, CARLA.colors[CARLA.id_of(name)])
+        assert has_color(picture, CARLA.colors[CARLA.id_of(name)])

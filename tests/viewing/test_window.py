@@ -93,7 +93,7 @@ def test_keys_step_and_toggle_scan_grid_flow_and_classes(blocks, tmp_path):
     assert state["said"] == ["frame 2", "Pedestrian: hidden", "Pedestrian: shown"]
 
 
-def test_prediction_truth_and_errors_follow_each_other(blocks, tmp_path):
+def test_a_key_switches_between_prediction_truth_and_errors(blocks, tmp_path):
     prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False, frames=1)
     seen, state = drive_window(
         tmp_path, prediction, [("truth", "next_panel", []), ("errors", "next_panel", [])], truth=blocks

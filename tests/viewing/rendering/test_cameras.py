@@ -86,12 +86,12 @@ def test_a_viewpoint_is_read_from_words():
     ["azimuth", "azimuth=x", "zoom=3", "target=1,2", "distance=0", "distance=-1", "fov=0", "fov=180", "elevation=91"]
     + ["azimuth=nan", "distance=inf", "position=1,2,nan"],
 )
-def test_a_senseless_viewpoint_is_refused(text):
+def test_an_impossible_viewpoint_is_refused(text):
     with pytest.raises(ArgumentError, match="viewpoint"):
         Viewpoint.parse(text)
 
 
-def test_a_camera_in_its_own_target_is_refused():
+def test_a_camera_at_its_own_target_is_refused():
     with pytest.raises(ArgumentError, match="away from the position"):
         perspective_camera(BOX, Viewpoint(position=(1, 2, 3), target=(1, 2, 3)), 1.5)
     with pytest.raises(ArgumentError, match="orbit"):

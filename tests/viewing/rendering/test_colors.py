@@ -42,11 +42,11 @@ def least_difference(colors, sight):
 
 
 @pytest.mark.parametrize("sight", SIGHT)
-def test_the_colour_blind_tell_the_eleven_classes_apart(sight):
+def test_colour_blind_readers_can_distinguish_the_eleven_classes(sight):
     assert least_difference(colorblind_palette(CARLASC11)[1:], sight) > 29
 
 
-def test_the_papers_own_colours_need_such_a_palette():
+def test_the_papers_own_colours_are_hard_to_distinguish():
     assert least_difference(CARLASC11.palette[1:], "protanopia") < 10
 
 
@@ -109,3 +109,11 @@ def test_the_legend_of_heights_goes_from_the_lowest_to_the_highest_before_all_cl
     assert [entry.name for entry in entries] == ["-2.0 m", "-1.0 m", "+0.0 m", "+1.0 m", "+2.0 m"]
     assert [entry.color for entry in entries] == [tuple(c) for c in height_colors(np.arange(-2, 3), -2.0, 2.0).tolist()]
     assert merge_legends([ClassColors(CARLA).entries([1]), entries])[:5] == entries
+
+
+def test_shades_of_a_dark_group_are_lighter_and_of_a_light_group_darker():
+    palette = colorblind_palette(CARLA).astype(int)
+    fence, wall, guard_rail = (palette[CARLA.id_of(name)] for name in ("Fence", "Wall", "GuardRail"))
+    assert (fence <= wall).all() and (wall <= guard_rail).all() and fence.sum() < wall.sum()
+    pole, sign, light = (palette[CARLA.id_of(name)] for name in ("Pole", "TrafficSign", "TrafficLight"))
+    assert (pole >= sign).all() and (sign >= light).all() and pole.sum() > sign.sum()

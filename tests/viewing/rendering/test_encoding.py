@@ -42,7 +42,7 @@ def test_a_gif_has_every_picture_at_its_rate_and_runs_on(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, CarlascError])
-def test_what_stops_the_pictures_leaves_nothing_half_written(tmp_path, name, error):
+def test_interrupted_pictures_leave_no_file(tmp_path, name, error):
     before = os.listdir("/tmp")
 
     def broken():
@@ -56,7 +56,7 @@ def test_what_stops_the_pictures_leaves_nothing_half_written(tmp_path, name, err
     assert not {left for left in set(os.listdir("/tmp")) - set(before) if left.startswith("carlasc-")}
 
 
-def test_a_film_that_is_there_is_whole_until_the_next_is(tmp_path):
+def test_an_existing_film_stays_until_the_new_one_is_complete(tmp_path):
     target = tmp_path / "a.mp4"
     write_pictures(target, flat_pictures(3), 10)
     old = target.read_bytes()
@@ -71,7 +71,7 @@ def test_a_film_that_is_there_is_whole_until_the_next_is(tmp_path):
     assert target.read_bytes() == old
 
 
-def test_the_encoders_own_words_are_told_when_it_fails(tmp_path):
+def test_the_message_of_a_failing_encoder_is_reported(tmp_path):
     def odd():  # yuv420p has no odd sizes: the encoder refuses
         yield from flat_pictures(2, (63, 47))
 
@@ -99,6 +99,6 @@ def test_endings_tell_the_format(tmp_path):
 
 
 @pytest.mark.parametrize("fps", [0, -1, 1000, float("nan")])
-def test_a_senseless_rate_is_refused(tmp_path, fps):
+def test_an_impossible_rate_is_refused(tmp_path, fps):
     with pytest.raises(ArgumentError, match="fps"):
         write_pictures(tmp_path / "a.gif", flat_pictures(2), fps)

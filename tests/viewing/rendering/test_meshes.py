@@ -58,7 +58,7 @@ def test_wide_wedges_follow_the_arc_without_lines_across_them():
     assert sorted(upright) == [2, 16]  # two ends, and top and bottom of every piece
 
 
-def test_corners_between_voxels_are_less_open():
+def test_corners_between_voxels_see_less_sky():
     spec = SPECS[0]
     lone, under_a_wall = mesh_of(spec, [(2, 2, 0)]), mesh_of(spec, [(2, 2, 0), (3, 2, 1)])
     assert (lone.openness == 1).all()

@@ -41,14 +41,14 @@ def test_nothing_overlaps_and_nothing_is_clipped(width, height, panels, titled, 
 
 @pytest.mark.parametrize("size", [(640, 360), (1280, 720), (1920, 1080), (720, 1280), (800, 800)])
 @pytest.mark.parametrize("panels", [1, 2, 3, 4])
-def test_every_class_is_named_and_the_pictures_have_most_of_the_page(size, panels):
+def test_every_class_is_named_and_the_panels_have_most_of_the_page(size, panels):
     page = plan_page(size, panels, titled=panels > 1, legend=ALL)
     assert page.entries == ALL
     area = sum(box.width * box.height for box in page.panels)
     assert area > 0.5 * size[0] * size[1]
 
 
-def test_what_finds_no_room_is_counted():
+def test_entries_without_space_are_counted():
     page = plan_page((160, 120), 1, titled=False, legend=MANY)
     assert page.entries[-1].name == f"and {len(MANY) - len(page.entries) + 1} more"
 
@@ -62,7 +62,7 @@ def test_square_pictures_have_their_legend_beside_them_wide_ones_below():
     assert min(box.y for box in wide.entry_boxes) >= wide.panels[0].y + wide.panels[0].height
 
 
-def test_swatches_and_titles_are_drawn_where_they_were_planned():
+def test_swatches_and_titles_are_drawn_at_their_positions():
     legend = [Entry("red", (200, 0, 0)), Entry("blue", (0, 0, 200))]
     page = plan_page((400, 300), 2, titled=True, legend=legend)
     pictures = [np.full((box.height, box.width, 3), 90 + 60 * i, np.uint8) for i, box in enumerate(page.panels)]
@@ -80,6 +80,6 @@ def test_swatches_and_titles_are_drawn_where_they_were_planned():
 
 
 @pytest.mark.parametrize("size", [(10, 10), (0, 500), (-5, 500), (100_000, 500)])
-def test_a_size_that_is_no_picture_is_refused(size):
+def test_an_impossible_size_is_refused(size):
     with pytest.raises(ArgumentError, match="size"):
         plan_page(size, 1, titled=False, legend=[])

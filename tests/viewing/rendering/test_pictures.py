@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.pixels import BLUE, RED, blue_pixels, color_is_there, grid_with, middle_of, red_pixels
+from helpers.pixels import BLUE, RED, blue_pixels, grid_with, has_color, middle_of, red_pixels
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -64,7 +64,7 @@ def test_a_cylindrical_block_lies_at_its_azimuth():
     assert np.hypot(x - 100, y - 100) == pytest.approx(83 / 128 * 100 * 0.98, abs=2)
 
 
-def test_up_is_up_and_what_is_nearer_hides_what_is_behind():
+def test_up_is_up_and_near_voxels_hide_far_ones():
     tower = grid_with({(0, 0, 0.3): RED, (0, 0, -1.2): BLUE}, size_m=1.4)
     picture = render_grid(tower, size=SIZE, legend=False, ego=False)
     assert middle_of(red_pixels(picture))[1] < middle_of(blue_pixels(picture))[1]
@@ -82,7 +82,7 @@ def test_free_and_unknown_voxels_are_not_drawn():
     np.testing.assert_array_equal(render_grid(nothing, size=SIZE), render_grid(free, size=SIZE))
 
 
-def test_an_empty_grid_says_so_above_its_ground():
+def test_the_picture_of_an_empty_grid_says_so():
     spec = PUBLISHED[0]
     empty = Grid(spec, np.zeros(spec.size, np.uint8))
     scene = grid_drawing(empty, ClassColors())
@@ -98,7 +98,7 @@ def test_an_empty_grid_says_so_above_its_ground():
 def test_a_sunlit_top_has_exactly_the_legends_colour():
     grid = grid_with({(0, 0, -0.5): BLUE}, size_m=4.0)
     picture = render_grid(grid, view="bev", size=(400, 400), legend=False, ego=False)
-    assert color_is_there(picture[150:250, 150:250], CARLA.colors[BLUE])
+    assert has_color(picture[150:250, 150:250], CARLA.colors[BLUE])
 
 
 @views
@@ -107,9 +107,9 @@ def test_the_legend_names_the_classes_present_and_no_other(view):
     with_legend, without = (render_grid(grid, view=view, size=(640, 360), legend=shown) for shown in (True, False))
     assert with_legend.shape == without.shape == (360, 640, 3)
     strip = with_legend[-40:] if view == "perspective" else with_legend[:, 400:]
-    assert color_is_there(strip, CARLA.colors[BLUE], 0)
-    assert color_is_there(strip, CARLA.colors[RED], 0)
-    assert not color_is_there(strip, CARLA.colors[CARLA.id_of("Road")], 0)
+    assert has_color(strip, CARLA.colors[BLUE], 0)
+    assert has_color(strip, CARLA.colors[RED], 0)
+    assert not has_color(strip, CARLA.colors[CARLA.id_of("Road")], 0)
 
 
 def test_palettes_change_the_colours_and_nothing_else():
@@ -118,8 +118,8 @@ def test_palettes_change_the_colours_and_nothing_else():
         name: render_grid(grid, view="bev", size=(600, 600), legend=False, ego=False, palette=name)
         for name in ("class", "colorblind", "height")
     }
-    assert color_is_there(pictures["colorblind"], palette.colorblind_palette(CARLA)[BLUE])
-    assert not color_is_there(pictures["height"], CARLA.colors[BLUE])
+    assert has_color(pictures["colorblind"], palette.colorblind_palette(CARLA)[BLUE])
+    assert not has_color(pictures["height"], CARLA.colors[BLUE])
     drawn = [(picture < 200).any(-1) for picture in pictures.values()]
     assert (drawn[0] == drawn[1]).mean() > 0.99
 
@@ -159,7 +159,7 @@ def test_a_scans_points_lie_where_they_are(view):
     assert red[1] < blue[1]
 
 
-def test_points_and_faces_hide_each_other():
+def test_faces_hide_points_behind_them_and_not_those_in_front():
     """The ego vehicle is made of faces: points behind it are hidden, points before it are not."""
     level = Viewpoint(elevation_rad=0.0)
     behind, before = (
@@ -178,7 +178,7 @@ def test_points_without_labels_are_drawn_by_height():
     assert astern.mean() > ahead.mean() + 20  # lower is darker
 
 
-def test_a_scan_without_points_says_so():
+def test_the_picture_of_a_scan_without_points_says_so():
     scan = Scan(np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty((0, 3), np.float32))
     for flow in (False, True):
         assert (render_scan(scan, size=SIZE, flow=flow, ego=False) < 200).any()
@@ -192,7 +192,7 @@ def test_points_that_are_not_finite_are_left_out():
     assert red_pixels(picture).any()
 
 
-def test_an_arrow_leads_from_each_actor_along_its_way_of_a_second():
+def test_each_moving_actor_has_an_arrow_as_long_as_its_movement_in_one_second():
     scan = scan_of(
         ((10, 5, 0), RED, (0, 2, 0), 7), ((11, 5, 0), RED, (0, 2, 0), 7), ((-10, -15, 0), BLUE, (0, 0, 0), 9)
     )
@@ -220,7 +220,7 @@ def test_flow_of_a_scan_without_it_is_refused():
         render_scan(Scan(np.zeros((3, 3), np.float32)), flow=True)
 
 
-def test_errors_are_right_wrong_missed_and_invented_where_the_truth_is_known():
+def test_each_kind_of_error_has_its_colour_where_the_truth_is_known():
     truth = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 10, (-10, 10, -0.5): 10}, size_m=4.0)
     prediction = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 4, (-10, -10, -0.5): 10, (0, 0, -0.5): 4}, size_m=4.0)
     truth.counts[54:74, 54:74] = 0  # the last one of the prediction's is where nobody knows
@@ -230,11 +230,11 @@ def test_errors_are_right_wrong_missed_and_invented_where_the_truth_is_known():
     picture = draw_panels([Panel(scene, "bev")], size=(400, 400), legend=False)
     for (ahead, right), color in quarters.items():
         y, x = 200 - round(ahead * 10 * 392 / 51.2), 200 + round(right * 10 * 392 / 51.2)
-        assert color_is_there(picture[y - 12 : y + 12, x - 12 : x + 12], color), (ahead, right)
+        assert has_color(picture[y - 12 : y + 12, x - 12 : x + 12], color), (ahead, right)
     assert picture[190:210, 190:210].min() > 225  # only the ground
 
 
-def test_a_comparison_stands_side_by_side():
+def test_a_comparison_is_drawn_side_by_side():
     truth, prediction = grid_with({(0, 0, -0.5): BLUE}, size_m=5.0), grid_with({(0, 0, -0.5): RED}, size_m=5.0)
     picture = render_comparison(prediction, truth, size=(800, 300), errors=False, ego=False, legend=False)
     assert middle_of(red_pixels(picture))[0] < 400 < middle_of(blue_pixels(picture))[0]
@@ -247,7 +247,7 @@ def test_a_picture_is_the_same_every_time():
     np.testing.assert_array_equal(render_grid(grid, size=SIZE), render_grid(grid, size=SIZE))
 
 
-def test_a_voxels_edges_are_drawn_where_it_is_large_and_not_where_it_is_tiny():
+def test_edges_of_voxels_are_drawn_only_if_the_voxels_are_large():
     spec = GridSpec.published("cartesian").with_size((8, 8, 1))
     labels = np.zeros(spec.size, np.uint8)
     labels[2:6, 2:6] = CARLA.id_of("Terrain")
@@ -331,7 +331,7 @@ def test_the_errors_have_a_legend_after_the_classes_and_say_when_there_is_nothin
 def test_the_legend_names_the_classes_of_all_panels():
     panels = [Panel(grid_drawing(grid_with({(0, 0, -0.5): label}), ClassColors()), "bev") for label in (RED, BLUE)]
     legend = draw_panels(panels, size=(640, 360))[-40:]
-    assert color_is_there(legend, CARLA.colors[RED], 0) and color_is_there(legend, CARLA.colors[BLUE], 0)
+    assert has_color(legend, CARLA.colors[RED], 0) and has_color(legend, CARLA.colors[BLUE], 0)
 
 
 @pytest.mark.parametrize("left_handed", [True, False])
@@ -352,7 +352,7 @@ def test_walls_hide_a_part_of_the_sky():
         render_grid(grid_with(blocks, size_m=1.6), view="bev", size=(400, 400), legend=False, ego=False)
         for blocks in (ground, ground | wall)
     )
-    assert color_is_there(lone[197:204, 197:204], CARLA.colors[CARLA.id_of("Terrain")])
+    assert has_color(lone[197:204, 197:204], CARLA.colors[CARLA.id_of("Terrain")])
     assert beside[200, 200].sum() < lone[200, 200].sum() - 10
 
 

@@ -77,7 +77,7 @@ def test_without_frames_a_film_has_all_of_them_and_a_picture_the_first(drive, tm
 
 
 @pytest.mark.parametrize("view", ["bev", "perspective"])
-def test_a_camera_that_stands_still_sees_the_block_stand_still_and_the_vehicle_drive(drive, tmp_path, view):
+def test_with_a_still_camera_a_static_block_stays_in_place(drive, tmp_path, view):
     draw(drive, tmp_path / "a.gif", view=view, size=SIZE, still=True, ego=False, legend=False)
     film, places = Image.open(tmp_path / "a.gif"), []
     for number in range(4):
@@ -115,7 +115,7 @@ def test_an_orbit_keeps_its_distance(tmp_path, monkeypatch):
     np.testing.assert_allclose(places, np.broadcast_to(places[0], (8, 2)), atol=1.5)
 
 
-def test_an_orbit_of_one_frame_has_pictures_enough(drive, tmp_path, monkeypatch):
+def test_an_orbit_of_one_frame_has_its_own_number_of_pictures_and_rate(drive, tmp_path, monkeypatch):
     monkeypatch.setattr("carlasc.viewing.rendering.run.ORBIT_PICTURES", 5)
     result = draw(drive, tmp_path / "a.mp4", frames=(1, 2), orbit=True, size=(160, 90))
     meta, frames = read_mp4(result.out)
@@ -124,7 +124,7 @@ def test_an_orbit_of_one_frame_has_pictures_enough(drive, tmp_path, monkeypatch)
         draw(drive, tmp_path / "a.png", orbit=True)
 
 
-def test_scan_grid_and_flow_stand_side_by_side(drive, tmp_path):
+def test_grid_scan_and_flow_are_drawn_side_by_side(drive, tmp_path):
     result = draw(drive, tmp_path / "a.png", what="grid,scan,flow", view="bev", size=(640, 240))
     assert result.what == ("grid", "scan", "flow")
     shown = red_pixels(picture(result.out))
@@ -132,7 +132,7 @@ def test_scan_grid_and_flow_stand_side_by_side(drive, tmp_path):
     assert all(len(found) for found in columns)
 
 
-def test_a_prediction_stands_beside_its_truth_with_its_errors(drive, tmp_path):
+def test_a_prediction_is_drawn_beside_its_truth_and_its_errors(drive, tmp_path):
     prediction = write_sequence(tmp_path / "prediction", block=BLUE)
     result = draw(prediction, tmp_path / "a.png", truth=drive.parents[1], view="bev", size=(640, 360), legend=False)
     assert result.what == ("grid", "truth", "errors")
@@ -142,7 +142,7 @@ def test_a_prediction_stands_beside_its_truth_with_its_errors(drive, tmp_path):
     assert predicted[1] == pytest.approx(true[1], abs=2)
 
 
-def test_a_prediction_in_eleven_classes_meets_a_truth_in_twenty_three(drive, tmp_path):
+def test_a_prediction_in_eleven_classes_is_compared_with_a_truth_in_twenty_three(drive, tmp_path):
     prediction = write_sequence(tmp_path / "p", metadata={"classes": "carlasc11"}, block=CARLASC11.id_of("Pedestrian"))
     options = {"truth": drive, "what": "errors", "view": "bev", "size": SIZE, "ego": False, "legend": False}
     result = draw(prediction, tmp_path / "a.png", **options)
@@ -189,7 +189,7 @@ def test_the_papers_eleven_classes_can_be_shown(drive, tmp_path):
         draw(drive, tmp_path / "b.png", classes="mine")
 
 
-def test_kittis_frame_is_honoured(tmp_path):
+def test_data_with_y_on_the_left_are_drawn_with_left_on_the_left(tmp_path):
     sequence = write_sequence(tmp_path, metadata={"frame": "kitti"})
     draw(sequence, tmp_path / "a.png", view="bev", size=SIZE, ego=False, legend=False)
     assert middle_of(red_pixels(picture(tmp_path / "a.png")))[0] < 160
@@ -215,7 +215,7 @@ def test_a_frames_file_is_that_frame(drive, tmp_path, ending):
     assert red_pixels(picture(result.out)).any()
 
 
-def test_anything_that_holds_sequences_will_do(drive, tmp_path):
+def test_every_kind_of_source_gives_the_same_picture(drive, tmp_path):
     source = FolderSource(drive.parents[2])
     (sequence,) = source.sequences().values()
     paths = [drive, drive.parent, drive.parents[2], drive / "evaluation", source, sequence]
@@ -223,7 +223,7 @@ def test_anything_that_holds_sequences_will_do(drive, tmp_path):
     assert len(set(shown)) == 1
 
 
-def test_of_several_sequences_the_first_is_taken_and_named(tmp_path):
+def test_the_first_of_several_sequences_is_shown_and_noted(tmp_path):
     for name in ("Town01_Light", "Town02_Heavy"):
         write_sequence(tmp_path / "set", f"Train/{name}/cartesian", frames=1, block=RED if "1" in name else BLUE)
     result = draw(tmp_path / "set", tmp_path / "a.png", size=SIZE)
@@ -273,7 +273,9 @@ def test_an_empty_grid_is_noted(tmp_path):
         ({"out": "a.gif", "fps": -3.0}, ArgumentError, "fps"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line_and_leaves_nothing(drive, tmp_path, monkeypatch, options, error, message):
+def test_impossible_arguments_are_refused_in_one_line_and_leave_no_file(
+    drive, tmp_path, monkeypatch, options, error, message
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=message) as caught:
         draw(drive, **options)
@@ -298,7 +300,7 @@ def test_bad_input_names_the_file(drive, tmp_path):
         draw(broken, tmp_path / "a.png")
 
 
-def test_a_truth_of_other_cells_is_refused(drive, tmp_path):
+def test_a_truth_of_another_geometry_is_refused(drive, tmp_path):
     other = write_sequence(tmp_path / "fine", spec=GridSpec.published("cartesian_fine"), frames=1)
     with pytest.raises(ArgumentError, match="256 x 256 x 16"):
         draw(drive, tmp_path / "a.png", truth=other)
@@ -311,7 +313,7 @@ def test_still_needs_poses(tmp_path):
         draw(sequence, tmp_path / "a.gif", still=True, size=SIZE)
 
 
-def test_what_is_there_is_replaced_only_when_told_so(drive, tmp_path):
+def test_an_existing_file_is_replaced_only_with_overwrite(drive, tmp_path):
     out = tmp_path / "a.png"
     out.write_bytes(b"mine")
     with pytest.raises(ConflictError, match="overwrite=True"):
@@ -321,7 +323,7 @@ def test_what_is_there_is_replaced_only_when_told_so(drive, tmp_path):
     assert red_pixels(picture(out)).any()
 
 
-def test_ctrl_c_leaves_nothing(drive, tmp_path):
+def test_ctrl_c_leaves_no_file(drive, tmp_path):
     def stop(done, total):
         if done == 2:
             raise KeyboardInterrupt
@@ -334,7 +336,7 @@ def test_ctrl_c_leaves_nothing(drive, tmp_path):
 @pytest.mark.parametrize(
     ("module", "package"), [("embreex", "embreex"), ("PIL", "PIL"), ("imageio_ffmpeg", "imageio_ffmpeg")]
 )
-def test_a_missing_package_is_named_with_the_extra_that_brings_it(drive, tmp_path, monkeypatch, module, package):
+def test_a_missing_package_is_named_with_its_extra(drive, tmp_path, monkeypatch, module, package):
     for name in [name for name in sys.modules if name.partition(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
@@ -371,3 +373,27 @@ def test_a_picture_shows_the_first_frame_and_every_chooses_others(drive, tmp_pat
     assert first == draw(drive, tmp_path / "b.png", size=SIZE, frames=(0, 1)).out.read_bytes()
     assert first != draw(drive, tmp_path / "c.png", size=SIZE, frames=(3, 4)).out.read_bytes()
     assert draw(drive, tmp_path / "d.gif", size=(160, 90), every=3).frames == (0, 3)
+
+
+def test_missed_voxels_are_those_of_the_truth_and_invented_ones_those_of_the_prediction(drive, tmp_path):
+    writer = FolderSink(tmp_path).sequence("p/Town01_Light/cartesian")
+    writer.write_document(f"evaluation/{layout.PARAMS}", to_json(COARSE.to_params()))
+    writer.write("evaluation/labels", 0, grid_with({(-10, -5, -0.5): RED}, size_m=2.4).labels)
+    options = {"what": "errors", "view": "bev", "size": SIZE, "ego": False, "legend": False}
+    shown = picture(draw(tmp_path / "p", tmp_path / "a.png", truth=drive, **options).out).astype(int)
+    for color, ahead, right in (((16, 90, 190), 10, 5), ((240, 200, 40), -10, -5)):
+        column, row = middle_of(np.abs(shown - color).max(-1) < 10)
+        assert column - 160 == pytest.approx(right * 180 * 0.98 / 51.2, abs=4)
+        assert 90 - row == pytest.approx(ahead * 180 * 0.98 / 51.2, abs=4)
+
+
+def test_an_orbit_shows_the_corners_of_the_grid_from_every_side(tmp_path, monkeypatch):
+    monkeypatch.setattr("carlasc.viewing.rendering.run.ORBIT_PICTURES", 8)
+    writer = FolderSink(tmp_path).sequence("s")
+    writer.write_document(f"evaluation/{layout.PARAMS}", to_json(COARSE.to_params()))
+    writer.write("evaluation/labels", 0, grid_with({(23, 23, -0.5): RED}, size_m=4.0).labels)
+    film = Image.open(draw(tmp_path, tmp_path / "a.gif", orbit=True, size=SIZE, ego=False, legend=False).out)
+    for number in range(8):
+        film.seek(number)
+        red = red_pixels(np.asarray(film.convert("RGB")))
+        assert red.any() and not (red[0] | red[-1]).any() and not (red[:, 0] | red[:, -1]).any()
