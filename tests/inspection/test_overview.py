@@ -1,4 +1,4 @@
-"""What is there: told from listings, whatever is given."""
+"""`info`: what a data set, a split, a sequence, a zip or a capture holds, from listings alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Class histograms: exact, streaming, and honest about what could not be read."""
+"""`stats`: exact class histograms, weights, and the list of files that could not be read."""
 
 from __future__ import annotations
 

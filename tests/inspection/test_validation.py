@@ -1,4 +1,4 @@
-"""The doctor on healthy data, on data with one known fault each, and on what real disks do to data."""
+"""`validate` on sound data, on data with one known fault each, and on files that are damaged as they are in practice."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def transpose_rotations(poses: np.ndarray) -> np.ndarray:
     return changed
 
 
-# Healthy data: no error, no warning.
+# Sound data: no error, no warning.
 
 
 def test_the_golden_sequence_is_sound(golden_capture: Path) -> None:

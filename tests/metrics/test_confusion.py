@@ -144,10 +144,10 @@ def test_counts_given_at_the_start_are_copied_and_compared():
 
 
 def test_free_may_be_any_class():
-    matrix = ConfusionMatrix(3, free=2, counts=np.array([[4, 1, 1], [0, 2, 1], [2, 0, 9]]))
-    geometry = matrix.completeness()  # occupied are 0 and 1: 7 of them right, 9 predicted, 9 true
-    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx((7 / 9, 7 / 9, 7 / 11))
-    assert matrix.mean_iou(with_free=False) == pytest.approx((4 / 8 + 2 / 4) / 2)
+    matrix = ConfusionMatrix(3, free=2, counts=np.array([[4, 1, 3], [0, 2, 1], [2, 0, 9]]))
+    geometry = matrix.completeness()  # occupied are 0 and 1: 7 of them right, 9 predicted, 11 true
+    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx((7 / 9, 7 / 11, 7 / 13))
+    assert matrix.mean_iou(with_free=False) == pytest.approx((4 / 10 + 2 / 4) / 2)
 
 
 def test_metrics_of_arrays_do_not_import_torch():
