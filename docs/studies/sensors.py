@@ -1,7 +1,8 @@
-"""Do more sensors bring the ground truth closer to the truth? `python docs/studies/sensors.py [FOLDER]` prints the table and draws the plot.
+"""Study: does ground truth improve with more sensors? `python docs/studies/sensors.py [FOLDER]` prints the table and draws the plot.
 
-The truth is what 60 other sensors see at the same instant. Accuracy is taken over the voxels that the reference and the grid of one
-sensor both know, so that every row is about the same voxels; coverage is the share of the reference's voxels that a grid knows.
+The reference is the grid of 60 additional sensors at the same instant. Accuracy is computed over the voxels that are known in both the
+reference and the grid of one sensor, so that all rows concern the same voxels. Coverage is the share of the reference's known voxels that
+are known in a grid.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ SPECS = {"0.4 m": GridSpec.published().with_resolution(0.4), "0.2 m": GridSpec.p
 
 
 def vote(recordings: Iterable[Recording], grid_T_world: np.ndarray, spec: GridSpec) -> Grid:
-    """Return the grid that recordings vote for."""
+    """Return the grid of several recordings."""
     observations = (Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in recordings)
     return count_votes(observations, spec).to_grid()
 
 
 def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
-    """Return the score of each resolution and number of sensors in one scene."""
+    """Return the score per resolution and number of sensors in one scene."""
     drive = Drive(seed, "heavy")
     reference = drive.reference_observations(frame, 60)
     recordings = [drive.record(frame, sensor) for sensor in range(max(SENSORS))]
@@ -50,7 +51,7 @@ def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
 
 
 def main(folder: Path) -> None:
-    """Score all scenes; print and plot the means."""
+    """Score all scenes, and print and plot the means."""
     scenes = [score_scene(seed, frame) for seed, frame in SCENES]
     lines = ["| voxels | sensors | accuracy | coverage |", "|---|---:|---:|---:|"]
     curves: dict[str, list[tuple[float, float]]] = {}
@@ -67,7 +68,7 @@ def main(folder: Path) -> None:
 
 
 def draw(curves: dict[str, list[tuple[float, float]]], path: Path) -> None:
-    """Plot accuracy and coverage over the number of sensors."""
+    """Plot accuracy and coverage against the number of sensors."""
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     axes = figure.subplots(1, 2)
     for axis, column, title in ((axes[0], 0, "accuracy"), (axes[1], 1, "coverage")):

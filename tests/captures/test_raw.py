@@ -54,12 +54,12 @@ def test_what_is_written_comes_back(tmp_path_factory, points, actors, seed):
         assert np.array_equal(array, other)
 
 
-def test_an_empty_list_of_actors_is_written_as_the_authors_do(tmp_path):
+def test_an_empty_list_of_actors_is_written_without_columns(tmp_path):
     CaptureWriter(tmp_path).write(0, 1, make_recording(actors=0))
     assert np.load(tmp_path / "raw/velocities0/1.npy").shape == (0,)
 
 
-def test_a_frame_is_there_only_with_all_its_files(tmp_path):
+def test_a_frame_exists_only_with_all_its_files(tmp_path):
     capture = write_capture(tmp_path, frames=1)
     writer = CaptureWriter(tmp_path)
     assert writer.has(1, 100)
@@ -67,7 +67,7 @@ def test_a_frame_is_there_only_with_all_its_files(tmp_path):
     assert not writer.has(1, 100)
 
 
-def test_the_last_line_of_a_times_file_counts(tmp_path):
+def test_the_last_line_of_a_frame_in_a_times_file_is_valid(tmp_path):
     writer = CaptureWriter(tmp_path)
     write_capture(tmp_path, frames=1)
     writer.write_time(0, 100, 77.5)
@@ -79,7 +79,7 @@ def test_the_last_line_of_a_times_file_counts(tmp_path):
         Capture(tmp_path).read_time(100)
 
 
-def test_times_are_written_in_the_words_of_the_golden_capture(tmp_path, golden_capture):
+def test_times_are_written_as_in_the_golden_capture(tmp_path, golden_capture):
     for frame in (100, 101, 102):
         CaptureWriter(tmp_path).write_time(0, frame, frame * 0.1)
     assert (tmp_path / "raw/times0.txt").read_bytes() == (golden_capture / "raw/times0.txt").read_bytes()
@@ -117,7 +117,7 @@ def test_captures_are_found_with_their_paths(tmp_path):
         find_captures(tmp_path / "Val/Town07_Heavy/raw/bev")
 
 
-def test_no_folder_no_sensor_and_no_frame_are_said(tmp_path):
+def test_a_missing_folder_sensor_or_frame_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="nowhere: expected a folder, found nothing"):
         Capture(tmp_path / "nowhere")
     (tmp_path / "raw").mkdir()
@@ -138,14 +138,14 @@ def test_a_missing_file_is_named(tmp_path):
         capture.read(1, 100)
 
 
-def test_a_sensor_that_lost_its_points_is_missed_all_the_same(tmp_path):
+def test_a_sensor_without_points_is_listed_all_the_same(tmp_path):
     capture = write_capture(tmp_path, frames=1)
     _npy(capture, "velodyne1").unlink()
     (capture.raw / "velodyne1").rmdir()
     assert Capture(tmp_path).sensors == (0, 1)
 
 
-SPOILT = {  # folder -> (array that is written over it, what the error says)
+INVALID = {  # folder -> (array that is written over it, what the error says)
     "wrong type": ("velodyne0", np.zeros((300, 3)), "expected float32 values, found float64"),
     "wrong shape": ("velodyne0", np.zeros((300, 4), np.float32), "expected an array of N x 3 values, found 300 x 4"),
     "too flat": ("velodyne0", np.zeros(900, np.float32), "expected an array of N x 3 values, found 900"),
@@ -168,9 +168,9 @@ SPOILT = {  # folder -> (array that is written over it, what the error says)
 }
 
 
-@pytest.mark.parametrize("spoilt", SPOILT)
-def test_a_spoilt_file_is_named_with_what_was_expected_and_found(tmp_path, spoilt):
-    folder, array, message = SPOILT[spoilt]
+@pytest.mark.parametrize("invalid", INVALID)
+def test_an_invalid_file_is_named_with_what_was_expected_and_found(tmp_path, invalid):
+    folder, array, message = INVALID[invalid]
     capture = write_capture(tmp_path, frames=1)
     np.save(_npy(capture, folder), array)
     with pytest.raises(FormatError, match=f"{folder}/100.npy: {message}") as caught:
@@ -191,7 +191,7 @@ def test_a_spoilt_file_is_named_with_what_was_expected_and_found(tmp_path, spoil
         (lambda data: b"x" * 4000, "expected a .npy array, found something else"),
     ],
 )
-def test_a_file_of_odd_size_is_named(tmp_path, change, message):
+def test_a_file_of_another_size_is_named(tmp_path, change, message):
     capture = write_capture(tmp_path, frames=1)
     path = _npy(capture, "velodyne0")
     path.write_bytes(change(path.read_bytes()))
@@ -205,7 +205,7 @@ def test_a_recording_without_labels_is_not_written(tmp_path):
         CaptureWriter(tmp_path).write(0, 5, Recording(scan, np.eye(4), np.empty((0, 4))))
 
 
-def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path):
     (tmp_path / "raw").write_text("a file in the way")
     for write in (
         lambda w: w.write(0, 1, make_recording()),
@@ -214,3 +214,43 @@ def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
     ):
         with pytest.raises(StorageError, match=r"raw/.*: cannot be written"):
             write(CaptureWriter(tmp_path))
+
+
+def test_captures_are_found_up_to_three_levels_down_and_not_in_hidden_folders(tmp_path):
+    write_capture(tmp_path / "data/Train/Town01_Light", frames=1)
+    write_capture(tmp_path / "deeper/data/Train/Town01_Light", frames=1)
+    write_capture(tmp_path / ".trash/Town01_Light", frames=1)
+    assert list(find_captures(tmp_path)) == ["data/Train/Town01_Light"]
+
+
+def test_a_frame_exists_with_all_sensors_and_its_picture(tmp_path):
+    write_capture(tmp_path, frames=1)
+    writer = CaptureWriter(tmp_path)
+    assert writer.has_frame(100, sensors=2, bev=True) and not writer.has_frame(100, sensors=3, bev=False)
+    (tmp_path / "raw/bev/100.jpg").unlink()
+    assert writer.has_frame(100, sensors=2, bev=False) and not writer.has_frame(100, sensors=2, bev=True)
+
+
+def test_a_frame_is_timed_when_its_last_sensor_is(tmp_path):
+    writer = CaptureWriter(tmp_path)
+    assert writer.timed_frames(2) == frozenset()
+    writer.write_time(0, 100, 10.0)
+    assert writer.timed_frames(2) == frozenset()
+    writer.write_time(1, 100, 10.0)
+    assert writer.timed_frames(2) == {100}
+
+
+def test_times_of_each_sensor_are_its_own(tmp_path):
+    writer = CaptureWriter(tmp_path)
+    writer.write(0, 1, make_recording())
+    writer.write_time(0, 1, 0.1)
+    writer.write_time(1, 1, 0.3)
+    assert (Capture(tmp_path).read_time(1), Capture(tmp_path).read_time(1, 1)) == (0.1, 0.3)
+    with pytest.raises(MissingDataError, match=r"times2\.txt: expected a file, found nothing"):
+        Capture(tmp_path).read_time(1, 2)
+
+
+def test_a_pose_that_is_not_rigid_is_not_written(tmp_path):
+    recording = make_recording()
+    with pytest.raises(FormatError, match="sensor 0, frame 5: expected a rigid transform"):
+        CaptureWriter(tmp_path).write(0, 5, Recording(recording.scan, 2 * np.eye(4), recording.velocities))

@@ -1,4 +1,4 @@
-"""Actors made of points, with known motion: what a scan of them would hold, without a simulator."""
+"""Scans of box-shaped actors with known motion, made without the simulator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PERIOD_S = 0.1
 
 
 def box_surface(size, count, seed=0):
-    """Return (count, 3) points on the surface of a box that stands on z = 0, actor frame."""
+    """Return (count, 3) points on the surface of a box, actor frame. Its lower face, which has no points, is at z = 0."""
     rng = np.random.default_rng(seed)
     length, width, height = size
     areas = np.array([width * height, width * height, length * height, length * height, length * width])
@@ -24,10 +24,10 @@ def box_surface(size, count, seed=0):
 
 
 class MovingBox:
-    """A box-shaped actor on an arc: constant speed and yaw rate.
+    """A box-shaped actor that moves with a constant yaw rate.
 
     Attributes:
-        speed: m/s along its heading.
+        speed: speed along its heading in m/s, or a function of the time that returns it.
     """
 
     def __init__(self, start, heading=0.0, speed=8.0, yaw_rate=0.0, size=(4.5, 1.9, 1.5), label=10, instance=7):
@@ -51,7 +51,7 @@ class MovingBox:
 
 
 def scan_of(actors, frame, world_T_sensor=None, count=600, view_from=None, noise_m=0.01):
-    """Return the scan of actors at a frame in the sensor's frame; `view_from` leaves only the sides that face that point."""
+    """Return the scan of actors in a frame, sensor frame. With `view_from`, a point, only the sides that face it have points."""
     world_T_sensor = np.eye(4) if world_T_sensor is None else world_T_sensor
     time_s = frame * PERIOD_S
     rng = np.random.default_rng(1000 + frame)

@@ -1,4 +1,4 @@
-"""A road with two blocks on it, in grids and points: what a viewer should draw, and where."""
+"""A road with two blocks on it, as grids and as points, for tests of what a viewer draws."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_blocks(
     shift: float = 0.0,
     points: bool = True,
 ) -> Path:
-    """A road with a red block ahead on the side of +y, which goes on by a metre a frame, and a blue one that stands."""
+    """Write a road with a red block ahead on the side of +y, which moves forward by 1 m per frame, and a blue block that does not move."""
     spec = spec or GridSpec.published().with_size((64, 64, 4))  # few voxels: browsers in tests have no GPU
     writer = FolderSink(folder.parent).sequence(folder.name)
     writer.write_document(layout.params_file(layout.EVALUATION), to_json(spec.to_params()))

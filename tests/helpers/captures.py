@@ -1,4 +1,4 @@
-"""Small captures made on the spot, and folders as dictionaries."""
+"""Small captures of random recordings, and the files of a folder as a dictionary."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.captures.raw import Capture, CaptureWriter, Recording
+from carlasc.captures import Capture, CaptureWriter, Recording
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.scans import Scan
 
 
 def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> Recording:
-    """Return a scan of random points around the sensor, some on actors that move, at a random level pose."""
+    """Return a recording of random points around the sensor, some of them on moving actors, at a random pose without roll and pitch."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform((-20, -20, -2), (20, 20, 1), (points, 3)).astype(np.float32)
     instances = rng.integers(0, actors + 1, points).astype(np.uint32)
@@ -23,7 +23,7 @@ def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> Recordi
 
 
 def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 100, points: int = 300) -> Capture:
-    """Write a capture of random recordings below `root` and return it; frame f has a picture that says so."""
+    """Write a capture of random recordings to a sequence's folder and return it. The picture of frame f is the text "picture f"."""
     writer = CaptureWriter(root)
     for frame in range(first, first + frames):
         for sensor in range(sensors):
@@ -34,7 +34,7 @@ def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 10
 
 
 def read_tree(folder: Path, leave_out: str = "raw") -> dict[str, bytes]:
-    """Return every file below a folder by its path, hidden ones included, a folder of that name left out."""
+    """Return the content of every file in a folder by its relative path, also of hidden files, except in folders called `leave_out`."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))

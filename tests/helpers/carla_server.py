@@ -1,9 +1,9 @@
-"""A stand-in for a CARLA server that keeps the API's contract: what the official package's classes do, as far as recording uses them.
+"""A stand-in for a CARLA server that keeps the contract of the API, as far as recording uses it.
 
-Places, rotations and settings are the real package's. As there: sensors deliver from threads of their own, after the tick and in any order; a spawn
-where something stands gives None; whoever touches a destroyed actor gets a RuntimeError; in asynchronous mode nothing answers to `tick`.
-Vehicles on autopilot drive straight on at 5 m/s; the ground is level; a semantic LiDAR sees the ground around it and a cloud of points within
-every vehicle and walker that is in range, its own vehicle too.
+Locations, rotations and settings are those of the official package. As on a server, sensors deliver their measurements from other threads, after the
+tick and in any order; spawning at an occupied place returns None; a call on a destroyed actor raises RuntimeError; and `tick` fails in asynchronous
+mode. Vehicles on autopilot drive straight ahead at 5 m/s, and the ground is level. A semantic LiDAR sees the ground around it, and a cloud of points in
+every vehicle and pedestrian within its range, also in its own vehicle.
 """
 
 from __future__ import annotations
@@ -62,8 +62,9 @@ class Actor:
         self.attributes = dict(blueprint.attributes)
         self.id = world.server.next_id()
         self.is_alive, self.driving, self.callback, self.started = True, False, None, False
-        self._offset = transform if parent else None
-        self._transform = transform
+        self.destination, self.max_speed = None, None
+        self.offset = transform if parent else None
+        self.transform = transform
 
     def _alive(self):
         if not self.is_alive:
@@ -74,15 +75,15 @@ class Actor:
     def get_transform(self):
         self._alive()
         if self.parent is None:
-            return self._transform
-        place = np.array(self.parent.get_transform().get_matrix()) @ np.array(self._offset.get_matrix())
+            return self.transform
+        place = np.array(self.parent.get_transform().get_matrix()) @ np.array(self.offset.get_matrix())
         turn = self.parent.get_transform().rotation
         return carla.Transform(
-            carla.Location(*map(float, place[:3, 3])), carla.Rotation(self._offset.rotation.pitch, turn.yaw, 0.0)
+            carla.Location(*map(float, place[:3, 3])), carla.Rotation(self.offset.rotation.pitch, turn.yaw, 0.0)
         )
 
     def velocity(self):
-        forward = self._transform.get_forward_vector()
+        forward = self.transform.get_forward_vector()
         speed = SPEED_M_S if self.driving else 0.0
         return carla.Vector3D(forward.x * speed, forward.y * speed, forward.z * speed)
 
@@ -102,9 +103,11 @@ class Actor:
 
     def go_to_location(self, location):
         assert isinstance(location, carla.Location) and self.started
+        self.destination = location
 
     def set_max_speed(self, speed):
         assert isinstance(speed, float) and 0 < speed < 5
+        self.max_speed = speed
 
     def listen(self, callback):
         self._alive()
@@ -114,7 +117,7 @@ class Actor:
         self._alive()
         if self.callback is not None:
             self.world.server.complaints.append(f"{self.type_id} was destroyed while it listened")
-        if self.world.server.stubborn and self.type_id.startswith("vehicle."):
+        if self.world.server.cannot_destroy and self.type_id.startswith("vehicle."):
             raise RuntimeError("time-out while waiting for the simulator")
         self.is_alive = False
         return True
@@ -164,7 +167,7 @@ class World:
         return None if at.random() < 0.2 else carla.Location(at.uniform(0, 60), at.uniform(-30, -5), 1.0)
 
     def set_pedestrians_seed(self, seed):
-        self.server.navigation = random.Random(seed)
+        self.server.navigation, self.server.pedestrians_seed = random.Random(seed), seed
 
     def try_spawn_actor(self, blueprint, transform, attach_to=None):
         assert isinstance(transform, carla.Transform)
@@ -192,10 +195,10 @@ class World:
         for actor in self.get_actors():
             if actor.driving:
                 v = actor.velocity()
-                at = actor._transform.location
+                at = actor.transform.location
                 drift = self.server.drift
-                actor._transform = carla.Transform(
-                    carla.Location(at.x + 0.1 * v.x + drift, at.y + 0.1 * v.y, at.z), actor._transform.rotation
+                actor.transform = carla.Transform(
+                    carla.Location(at.x + 0.1 * v.x + drift, at.y + 0.1 * v.y, at.z), actor.transform.rotation
                 )
         sensors = [actor for actor in self.get_actors() if actor.callback is not None]
         random.shuffle(sensors)
@@ -210,22 +213,22 @@ class World:
                 callback(data)
 
 
-class StandIn:
-    """Takes the place of the module `carla`.
+class FakeServer:
+    """Replaces the module `carla`, and is the server at the same time.
 
     Attributes:
-        fail_at: (what, how often it succeeds first, error): makes `tick` or `spawn` fail.
+        fail_at: (call, number of calls that succeed, error): makes `tick` or `spawn` fail.
         places: number of spawn points.
         silent: sensors deliver nothing.
-        stubborn: vehicles cannot be destroyed.
-        drift: metres a tick by which physics differ.
+        cannot_destroy: vehicles cannot be destroyed.
+        drift: metres per tick by which the physics differ.
     """
 
     def __init__(self, version="0.9.13"):
         self.version, self.places, self.fail_at = version, 20, None
-        self.silent, self.stubborn, self.drift = False, False, 0.0
-        self.ticks, self._ids, self.complaints, self.managers = 0, 200, [], {}
-        self.navigation = random.Random(0)
+        self.silent, self.cannot_destroy, self.drift = False, False, 0.0
+        self.ticks, self.last_id, self.complaints, self.managers = 0, 200, [], {}
+        self.navigation, self.pedestrians_seed = random.Random(0), None
         self._calls = {"tick": 0, "spawn": 0}
         self.worlds = [World(self, "Town10HD_Opt")]
         for name in ("Transform", "Location", "Rotation"):
@@ -249,8 +252,8 @@ class StandIn:
         return self.worlds[-1]
 
     def next_id(self):
-        self._ids += 1
-        return self._ids
+        self.last_id += 1
+        return self.last_id
 
     def check_failure(self, what):
         self._calls[what] += 1
@@ -259,7 +262,7 @@ class StandIn:
 
     @property
     def left_behind(self):
-        """What recording made and did not destroy."""
+        """Types of the actors that were spawned and not destroyed."""
         return [
             a.type_id
             for world in self.worlds
@@ -277,7 +280,7 @@ class StandIn:
         return SimpleNamespace(raw_data=memoryview(self.sweep(sensor).tobytes()), **common)
 
     def sweep(self, sensor):
-        """What a LiDAR sees: its surroundings in the world, brought to its own frame."""
+        """Return the detections of a LiDAR in its own frame."""
         rng = np.random.default_rng(sensor.id)
         tags = TAGS[tuple(map(int, self.version.split("-")[0].split("."))) >= (0, 9, 14)]
         at = sensor.get_transform()
@@ -306,10 +309,10 @@ class StandIn:
 
 class Manager:
     def __init__(self):
-        self.synchronous, self.seed = False, None
+        self.synchronous, self.was_synchronous, self.seed = False, False, None
 
     def set_synchronous_mode(self, on):
-        self.synchronous = on
+        self.synchronous, self.was_synchronous = on, self.was_synchronous or on
 
     def set_random_device_seed(self, seed):
         self.seed = seed

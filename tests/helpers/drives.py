@@ -1,4 +1,4 @@
-"""Small sequences on disk for the Dataset's tests: a sensor that drives a bend, random points around it, random grids."""
+"""Small sequences on disk for the tests of Dataset: a sensor that drives around a bend, random points, random grids."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from carlasc.storage.folders.folder import FolderSink
 
 
 def bend(frames: int, step_m: float = 0.8, yaw_rad: float = 0.02) -> NDArray[np.float64]:
-    """Return (F, 4, 4) poses of a drive along a bend, as poses.txt has them."""
+    """Return the (F, 4, 4) poses of a drive around a bend, as in poses.txt."""
     world = np.stack([translation((step_m * i, 0.02 * i, 0.001 * i)) @ rotation_z(yaw_rad * i) for i in range(frames)])
     return relative_to(world[0], world)
 
 
 def random_points(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """Return (N, 4) float32 points, dense near the sensor, some far outside every grid."""
+    """Return (N, 4) float32 points: many near the sensor, and some far outside of every grid."""
     points = rng.normal(0, (14, 14, 1.2), (count, 3)) - (0, 0, 0.6)
     return np.column_stack([points, np.zeros(count)]).astype(np.float32)
 
@@ -42,13 +42,13 @@ def write_drive(
 
     Args:
         folder: `<root>/<split>/<sequence>/<coordinates>`.
-        frames: the frames with scans, labels and flow; none writes grids alone.
+        frames: frames with scans, labels and flow. Empty: grids only.
         spec: grid of `evaluation/`.
-        grid_frames: the frames with grids; those of `frames` by default.
-        scans: (N, 4) points of each frame; random ones by default.
-        metadata: carlasc.json.
-        points: of each random scan.
-        seed: of everything random.
+        grid_frames: frames with grids. None: `frames`.
+        scans: (N, 4) points of each frame. None: random points.
+        metadata: content of carlasc.json.
+        points: number of points per random scan.
+        seed: seed of all random values.
     """
     rng = np.random.default_rng(seed)
     frames = list(frames)

@@ -1,4 +1,4 @@
-"""A frame of many LiDARs in a street of flat walls and boxes, ray-cast with NumPy: what the benchmarks vote on."""
+"""A frame of many LiDARs in a street of flat walls and boxes, ray-cast with NumPy: the input of the benchmarks of voting."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ GROUND_Z = -1.8  # below the ego sensor
 def street_frame(
     sensors: int = 20, channels: int = 64, columns: int = 2048, seed: int = 0, distinct: int | None = None
 ) -> list[Observation]:
-    """Return one instant seen by several LiDARs: +2 to -25 degrees, 50 m, 2 cm noise; the first one is the ego's.
+    """Return the observations of several LiDARs at one instant: +2 to -25 degrees, 50 m, 2 cm noise. The first is the ego sensor.
 
     Args:
-        sensors: how many.
-        channels: rays one above the other.
-        columns: rays around.
-        seed: of placement, scene and noise.
-        distinct: how many scans are ray-cast; the other sensors stand elsewhere but see one of these. All by default.
+        sensors: number of LiDARs.
+        channels: number of channels of each.
+        columns: number of rays per channel.
+        seed: seed of positions, scene and noise.
+        distinct: number of scans that are ray-cast. The other sensors have other positions, but the points of one of these. None: all.
     """
     rng = np.random.default_rng(seed)
     boxes, box_labels = street_boxes(rng)
@@ -32,8 +32,8 @@ def street_frame(
 
 
 def street_boxes(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return (B, 2, 3) lower and upper corners of houses along both sides, cars, people and poles, and their classes."""
-    kinds = [  # how many, class, half size, |y| from, to
+    """Return the (B, 2, 3) lower and upper corners of houses on both sides, cars, pedestrians, poles and trees, and their class ids."""
+    kinds = [  # number, class id, half of the size, smallest and greatest |y|
         (14, 1, (5.0, 4.0, 6.0), 22.0, 28.0),
         (14, 10, (2.2, 0.9, 0.8), 2.0, 14.0),
         (12, 4, (0.3, 0.3, 0.9), 8.0, 20.0),
@@ -59,7 +59,7 @@ def cast(
     columns: int,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the points (N, 3) in the sensor's frame and their classes, in the order that the LiDAR turns."""
+    """Return the (N, 3) points in the sensor's frame and their class ids, in the order of the azimuth."""
     azimuth, elevation = np.meshgrid(
         np.linspace(-np.pi, np.pi, columns, endpoint=False), np.deg2rad(np.linspace(2, -25, channels)), indexing="ij"
     )

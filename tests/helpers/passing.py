@@ -1,4 +1,4 @@
-"""A street in which one car passes and another stands, scanned from a moving sensor: where everything is at any time is known."""
+"""A street with a parked car and a passing car, scanned from a moving sensor. All positions are known at any time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CAR = (4.4, 1.9, 1.5)
 
 
 def street(frame: int) -> Street:
-    """Two houses, a pole, a parked car, and (the last box) a car that passes from behind, on the right."""
+    """Return two houses, a pole, a parked car, and (the last box) a car that overtakes on the right."""
     x = -20.0 + SPEED_M_S * frame * 0.1
     boxes = [
         ((-15, -14, 0), (10, -9, 6), BUILDING),
@@ -34,12 +34,12 @@ def street(frame: int) -> Street:
 
 
 def sensor_pose(frame: int) -> np.ndarray:
-    """The sensor drives slowly ahead."""
+    """Return (4, 4) world_T_sensor. The sensor moves slowly forward."""
     return translation((-3.0 + 0.1 * frame, 0.0, SENSOR_HEIGHT_M))
 
 
 def scan(frame: int, pose: np.ndarray, columns: int = 500) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, labels, and which points are on the passing car."""
+    """Return the points, their labels, and which of them are on the passing car."""
     here = street(frame)
     points, labels = here.scan(pose, np.random.default_rng(frame), channels=48, columns=columns)
     world = transform_points(pose, points)
@@ -50,7 +50,7 @@ def scan(frame: int, pose: np.ndarray, columns: int = 500) -> tuple[np.ndarray, 
 def write_sequence(
     folder: Path, fields: tuple[str, ...] = ("labels", "flow"), frames: int = FRAMES, poses: bool = True
 ) -> Path:
-    """Write the drive as a sequence; returns the sequence's folder."""
+    """Write the drive as a sequence. Return the folder of the sequence."""
     writer = FolderSink(folder).sequence("Val/Street/cartesian")
     trajectory = np.stack([sensor_pose(frame) for frame in range(frames)])
     if poses:
@@ -71,13 +71,12 @@ def write_sequence(
 
 
 def reference(frame: int, spec: GridSpec = SPEC) -> Grid:
-    """Return what many sensors around the scene see at the instant of a frame."""
+    """Return the grid of many sensors around the scene at the instant of a frame."""
     grid_T_world = invert(sensor_pose(frame))
     observations = []
     rng = np.random.default_rng(7)
-    for number in range(24):
+    for _ in range(24):
         place = (*rng.uniform(-18, 18, 1), *rng.uniform(-8, 8, 1), rng.uniform(1.7, 4))
         points, labels, _ = scan(frame, translation(place), columns=300)
         observations.append(Observation(points, labels, grid_T_world @ translation(place)))
-        _ = number
     return count_votes(observations, spec, CARLA).to_grid()

@@ -1,4 +1,4 @@
-"""Recording from a stand-in server. Nothing here has spoken to a live one (docs/commands/capture.md says so)."""
+"""Recording from a stand-in for the server. No test here has used a live server (see docs/commands/capture.md)."""
 
 import io
 import json
@@ -10,16 +10,17 @@ from typer.testing import CliRunner
 pytest.importorskip("carla", reason="the carla package is not installed: pip install 'carlasc[carla]'")
 
 import carla
-from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, StandIn
+from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 
 from carlasc.captures import Capture, Lidar, ServerError, record
 from carlasc.captures.carla.server import DETECTION, Server, decode_sweep
 from carlasc.captures.lidar import sensor_offsets
 from carlasc.cli import app
 from carlasc.core.geometry import transform_points
-from carlasc.errors import ArgumentError, CarlascError, ConflictError
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, DependencyError
 
-ROAD, VEHICLE, WALKER = 7, 10, 4
+ROAD, VEHICLE, WALKER = (CARLA.id_of(name) for name in ("Road", "Vehicle", "Pedestrian"))
 
 
 def call(out, server, **options):
@@ -29,7 +30,7 @@ def call(out, server, **options):
 
 @pytest.fixture(params=["0.9.13", "0.9.14", "0.9.16-dirty"])
 def server(request):
-    return StandIn(request.param)
+    return FakeServer(request.param)
 
 
 def test_a_capture_is_recorded_that_reads_back(server, tmp_path):
@@ -47,9 +48,9 @@ def test_a_capture_is_recorded_that_reads_back(server, tmp_path):
     assert np.allclose(np.diff(times), 0.1)
 
 
-def test_classes_are_ours_whatever_the_servers_version(tmp_path):
+def test_class_ids_do_not_depend_on_the_servers_version(tmp_path):
     assert TAGS[False] != TAGS[True]
-    old, new = (StandIn(version) for version in ("0.9.13", "0.9.15"))
+    old, new = (FakeServer(version) for version in ("0.9.13", "0.9.15"))
     call(tmp_path / "old", old)
     call(tmp_path / "new", new)
     for frame in range(3):
@@ -61,14 +62,14 @@ def test_classes_are_ours_whatever_the_servers_version(tmp_path):
 
 
 def test_sensors_are_placed_as_the_format_says(tmp_path):
-    server = StandIn()
+    server = FakeServer()
     call(tmp_path, server, sensors=20, count=1)
     capture = Capture(tmp_path)
     poses = np.stack([capture.read_pose(sensor, 0) for sensor in range(20)])
     (ego,) = [a for a in server.worlds[-1].actors if a.attributes.get("role_name") == "hero"]
     world_T_ego = poses[0] @ np.linalg.inv(np.block([[np.eye(3), np.array([[-0.5], [0.0], [1.8]])], [np.zeros(3), 1]]))
     assert np.allclose(
-        world_T_ego[:3, 3], [ego._transform.location.x, ego._transform.location.y, ego._transform.location.z], atol=1e-4
+        world_T_ego[:3, 3], [ego.transform.location.x, ego.transform.location.y, ego.transform.location.z], atol=1e-4
     )
     offsets = np.stack([(np.linalg.inv(world_T_ego) @ pose)[:3, 3] for pose in poses])
     assert np.allclose(poses[:, :3, :3], poses[0, :3, :3], atol=1e-6)  # the vehicle's own orientation
@@ -88,8 +89,8 @@ def test_sensors_are_placed_as_the_format_says(tmp_path):
     assert all(wanted.items() <= lidar.attributes.items() for lidar in lidars)
 
 
-def test_the_ego_vehicle_is_not_seen_and_others_are_where_they_are(tmp_path):
-    server = StandIn()
+def test_the_ego_vehicle_is_not_recorded_and_others_are_at_their_positions(tmp_path):
+    server = FakeServer()
     call(tmp_path, server)
     (ego,) = [a for a in server.worlds[-1].actors if a.attributes.get("role_name") == "hero"]
     capture = Capture(tmp_path)
@@ -97,30 +98,30 @@ def test_the_ego_vehicle_is_not_seen_and_others_are_where_they_are(tmp_path):
         recording = capture.read(sensor, 2)
         actors = recording.scan.labels != ROAD
         places = transform_points(recording.world_T_sensor, recording.scan.points[actors])
-        at = ego._transform.location
+        at = ego.transform.location
         assert np.linalg.norm(places - (at.x, at.y, at.z), axis=1).min() > 1.0
-        everybody = np.array(
+        positions = np.array(
             [
                 [place.x, place.y, place.z]
                 for a in server.worlds[-1].actors
                 if a.type_id[:7] in ("vehicle", "walker.")
-                for place in [a._transform.location]
+                for place in [a.transform.location]
             ]
         )
-        nearest = np.abs(places[:, None] - everybody[None]).max(-1).min(1)
+        nearest = np.abs(places[:, None] - positions[None]).max(-1).min(1)
         assert nearest.max() < 0.45  # within the body's points and 2 cm of noise
 
 
 def test_points_have_noise_of_at_most_two_centimetres(tmp_path):
-    call(tmp_path / "plain", StandIn(), lidar=Lidar(noise_m=0.0), count=1)
-    call(tmp_path / "noisy", StandIn(), count=1)
+    call(tmp_path / "plain", FakeServer(), lidar=Lidar(noise_m=0.0), count=1)
+    call(tmp_path / "noisy", FakeServer(), count=1)
     plain, noisy = (Capture(tmp_path / name).read(0, 0).scan.points for name in ("plain", "noisy"))
     error = np.abs(plain - noisy)
     assert 0.015 < error.max() <= 0.0201
 
 
 def test_velocities_are_over_ground_in_the_sensors_frame(tmp_path):
-    server = StandIn()
+    server = FakeServer()
     call(tmp_path, server)
     recording = Capture(tmp_path).read(0, 1)
     hit = np.unique(recording.scan.instances[recording.scan.instances > 0])
@@ -141,9 +142,9 @@ def test_velocities_are_over_ground_in_the_sensors_frame(tmp_path):
 
 
 def test_an_actor_keeps_its_number_through_the_sequence_and_in_a_second_run(tmp_path):
-    call(tmp_path / "one", StandIn())
-    server = StandIn()
-    server._ids = 5000  # a server that has been running for long
+    call(tmp_path / "one", FakeServer())
+    server = FakeServer()
+    server.last_id = 5000  # a server that has been running for long
     call(tmp_path / "other", server)
     one, other = (Capture(tmp_path / name).read(2, 2) for name in ("one", "other"))
     assert np.array_equal(one.scan.instances, other.scan.instances)
@@ -153,38 +154,38 @@ def test_an_actor_keeps_its_number_through_the_sequence_and_in_a_second_run(tmp_
 def test_the_picture_from_above_has_the_published_size(tmp_path):
     from PIL import Image
 
-    call(tmp_path, StandIn(), bev=True, count=1, sensors=1)
+    call(tmp_path, FakeServer(), bev=True, count=1, sensors=1)
     picture = Image.open(io.BytesIO(Capture(tmp_path).read_bev(0)))
     assert picture.size == (1920, 1080)
     assert np.abs(np.asarray(picture)[5, 5].astype(int) - (10, 120, 250)).max() < 8
 
 
-def all_is_undone(server):
+def assert_cleaned_up(server):
     settings = server.worlds[-1].settings
     assert server.left_behind == [] and server.complaints == []
     assert not settings.synchronous_mode and not settings.fixed_delta_seconds
     assert not any(manager.synchronous for manager in server.managers.values())
 
 
-def test_the_server_is_left_as_it_was(server, tmp_path):
+def test_the_server_is_cleaned_up(server, tmp_path):
     call(tmp_path, server)
-    all_is_undone(server)
+    assert_cleaned_up(server)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("time-out of 5000ms"), MemoryError()])
 @pytest.mark.parametrize(("what", "after"), [("tick", 0), ("tick", 2), ("spawn", 0), ("spawn", 9), ("spawn", 70)])
-def test_the_server_is_left_as_it_was_whatever_happens(tmp_path, error, what, after):
-    server = StandIn()
+def test_the_server_is_cleaned_up_after_any_error(tmp_path, error, what, after):
+    server = FakeServer()
     server.fail_at = (what, after, error)
     expected = ServerError if isinstance(error, RuntimeError) else type(error)
     with pytest.raises(expected):
         call(tmp_path, server)
-    all_is_undone(server)
+    assert_cleaned_up(server)
 
 
-def test_what_cannot_be_undone_is_told(tmp_path):
-    server = StandIn()
-    server.stubborn = True
+def test_a_failed_clean_up_is_reported(tmp_path):
+    server = FakeServer()
+    server.cannot_destroy = True
     with pytest.raises(ServerError, match="could not be cleaned up"):
         call(tmp_path, server)
     assert set(server.left_behind) <= {
@@ -194,16 +195,16 @@ def test_what_cannot_be_undone_is_told(tmp_path):
     assert not server.worlds[-1].settings.synchronous_mode
 
 
-def test_an_interrupted_recording_goes_on(tmp_path):
-    whole = call(tmp_path / "whole", StandIn(), count=5)
-    server = StandIn()
+def test_an_interrupted_recording_is_continued(tmp_path):
+    whole = call(tmp_path / "whole", FakeServer(), count=5)
+    server = FakeServer()
     server.fail_at = ("tick", 4, KeyboardInterrupt())  # the first tick is the pedestrians'
     with pytest.raises(KeyboardInterrupt):
         call(tmp_path / "cut", server, count=5)
     assert Capture(tmp_path / "cut").frames.tolist() == [0, 1, 2]
     (tmp_path / "cut" / "raw" / "labels2" / "1.npy").unlink()  # and a frame in the middle is not whole
     kept = (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns
-    result = call(tmp_path / "cut", StandIn(), count=5)
+    result = call(tmp_path / "cut", FakeServer(), count=5)
     assert (result.written, whole.written) == (3, 5)
     assert (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns == kept
     for frame in range(5):
@@ -212,64 +213,133 @@ def test_an_interrupted_recording_goes_on(tmp_path):
             assert np.array_equal(one.scan.labels, other.scan.labels) and np.allclose(
                 one.world_T_sensor, other.world_T_sensor
             )
-    idle = StandIn()
+    idle = FakeServer()
     assert call(tmp_path / "cut", idle, count=5).written == 0
     assert idle.ticks == 0  # nothing to do: the town is not even loaded
 
 
-def test_a_replay_that_leaves_the_drive_is_not_mixed_with_it(tmp_path):
-    call(tmp_path, StandIn(), count=2)
-    server = StandIn()
+def test_a_replay_that_departs_from_the_drive_is_refused(tmp_path):
+    call(tmp_path, FakeServer(), count=2)
+    server = FakeServer()
     server.drift = 0.5
     with pytest.raises(ConflictError, match="frame 0: expected the replay to follow"):
         call(tmp_path, server, count=4)
     assert Capture(tmp_path).frames.tolist() == [0, 1]
-    all_is_undone(server)
+    assert_cleaned_up(server)
 
 
-def test_other_settings_do_not_mix(tmp_path):
-    call(tmp_path, StandIn(), count=1)
+@pytest.mark.parametrize(("drift_m", "follows"), [(0.005, True), (0.03, False)])
+def test_a_replay_follows_within_two_centimetres(tmp_path, drift_m, follows):
+    call(tmp_path, FakeServer(), count=1)
+    server = FakeServer()
+    server.drift = drift_m / 2  # the first tick is the pedestrians', so frame 0 is two ticks away from the start
+    if follows:
+        assert call(tmp_path, server, count=2).written == 1
+    else:
+        with pytest.raises(ConflictError, match=f"found the ego sensor {drift_m:.2f} m away"):
+            call(tmp_path, server, count=2)
+
+
+def test_traffic_and_pedestrians_are_seeded_and_synchronous(tmp_path):
+    server = FakeServer()
+    server.fail_at = ("tick", 2, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        call(tmp_path, server, seed=7)
+    assert [(manager.seed, manager.was_synchronous) for manager in server.managers.values()] == [(7, True)]
+    assert server.pedestrians_seed == 7
+
+
+def test_pedestrians_walk_to_a_destination(tmp_path):
+    server = FakeServer()
+    call(tmp_path, server, count=1)
+    controllers = [a for a in server.worlds[-1].actors if a.type_id == "controller.ai.walker"]
+    assert len(controllers) == 25
+    assert sum(controller.destination is not None for controller in controllers) > 10
+    assert all(0.8 <= controller.max_speed <= 2.2 for controller in controllers)
+
+
+def test_the_camera_looks_down_from_50_metres(tmp_path):
+    server = FakeServer()
+    call(tmp_path, server, count=1, bev=True)
+    (camera,) = [a for a in server.worlds[-1].actors if a.type_id == "sensor.camera.rgb"]
+    place, turn = camera.offset.location, camera.offset.rotation
+    assert (place.x, place.y, place.z, turn.pitch, turn.yaw, turn.roll) == (0, 0, 50, -90, 0, 0)
+
+
+def test_each_frame_and_sensor_has_its_own_noise(tmp_path):
+    call(tmp_path / "plain", FakeServer(), lidar=Lidar(noise_m=0.0), count=2)
+    call(tmp_path / "noisy", FakeServer(), count=2)
+    noise = []
+    for sensor, frame in ((0, 0), (1, 0), (0, 1)):
+        plain, noisy = (Capture(tmp_path / name).read(sensor, frame).scan.points for name in ("plain", "noisy"))
+        noise.append((noisy - plain)[:40, 0])
+    assert all(
+        abs(np.corrcoef(one, other)[0, 1]) < 0.6 for one, other in zip(noise, noise[1:] + noise[:1], strict=True)
+    )
+
+
+def test_a_frame_without_times_is_recorded_again(tmp_path):
+    call(tmp_path, FakeServer(), count=2)
+    times = tmp_path / "raw" / "times3.txt"
+    times.write_text(times.read_text().splitlines(keepends=True)[0])
+    assert call(tmp_path, FakeServer(), count=2).written == 1
+    assert Capture(tmp_path).read_time(1, 3) > 0
+
+
+def test_without_pillow_nothing_is_written(tmp_path, monkeypatch):
+    import sys
+
+    for name in [name for name in sys.modules if name.startswith("PIL.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(DependencyError, match=r"pip install 'carlasc\[carla\]'"):
+        call(tmp_path / "out", FakeServer(), bev=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_settings_are_refused(tmp_path):
+    call(tmp_path, FakeServer(), count=1)
     with pytest.raises(ConflictError, match="seed"):
-        call(tmp_path, StandIn(), count=1, seed=1)
+        call(tmp_path, FakeServer(), count=1, seed=1)
     with pytest.raises(ConflictError, match="server_version"):
-        call(tmp_path, StandIn("0.9.15"), count=1)
+        call(tmp_path, FakeServer("0.9.15"), count=1)
     (tmp_path / "else" / "raw" / "velodyne0").mkdir(parents=True)
     with pytest.raises(ConflictError, match=r"recording\.json"):
-        call(tmp_path / "else", StandIn())
+        call(tmp_path / "else", FakeServer())
 
 
-def test_a_crowded_town_has_fewer_vehicles_but_always_the_ego_one(tmp_path):
-    server = StandIn()
+def test_a_town_without_room_has_fewer_vehicles_but_the_ego_vehicle(tmp_path):
+    server = FakeServer()
     server.places = 3
     result = call(tmp_path, server, count=1)
     assert result.vehicles == 2
-    server = StandIn()
+    server = FakeServer()
     server.places = 0
     with pytest.raises(CarlascError, match="places"):
         call(tmp_path / "none", server)
 
 
-def test_sensors_that_stay_silent_are_named(tmp_path):
-    server = StandIn()
+def test_a_sensor_without_measurements_is_named(tmp_path):
+    server = FakeServer()
     server.silent = True
     with pytest.raises(ServerError, match="expected a measurement of LiDAR 0 within"):
         call(tmp_path, server, timeout_s=0.2)
-    all_is_undone(server)
+    assert_cleaned_up(server)
 
 
-def test_a_town_that_is_not_there_is_named_with_those_that_are(tmp_path):
+def test_the_error_of_an_unknown_town_lists_the_towns(tmp_path):
     with pytest.raises(ArgumentError, match="Town01, Town10HD_Opt"):
-        call(tmp_path / "a", StandIn(), town="Town99")
+        call(tmp_path / "a", FakeServer(), town="Town99")
     assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize("options", [{"count": 0}, {"sensors": 0}, {"seed": -1}, {"traffic": "none"}])
-def test_senseless_arguments_are_refused(tmp_path, options):
+def test_arguments_out_of_range_are_refused(tmp_path, options):
     with pytest.raises(ArgumentError):
-        call(tmp_path, StandIn(), **options)
+        call(tmp_path, FakeServer(), **options)
 
 
-def test_the_real_packages_bytes_and_poses_are_understood():
+def test_bytes_and_poses_of_the_official_package_are_decoded():
     transform = carla.Transform(carla.Location(1.0, 2.0, 3.0), carla.Rotation(pitch=10.0, yaw=30.0, roll=5.0))
     records = np.array([(1, 2, 3, 0.5, 77, 14)], DETECTION)
     assert records.dtype.itemsize == 24
@@ -290,7 +360,7 @@ def test_the_real_packages_bytes_and_poses_are_understood():
     ("text", "numbers"), [("0.9.13", (0, 9, 13)), ("0.9.15-dirty", (0, 9, 15)), ("0.10.0", (0, 10, 0))]
 )
 def test_versions_are_read(text, numbers):
-    assert Server("127.0.0.1", 2000, 1.0, StandIn(text)).version_numbers == numbers
+    assert Server("127.0.0.1", 2000, 1.0, FakeServer(text)).version_numbers == numbers
 
 
 def test_without_a_server_the_command_says_so_in_one_line(tmp_path):
@@ -303,7 +373,7 @@ def test_without_a_server_the_command_says_so_in_one_line(tmp_path):
 def test_the_command_records(tmp_path, monkeypatch):
     import sys
 
-    monkeypatch.setitem(sys.modules, "carla", StandIn())
+    monkeypatch.setitem(sys.modules, "carla", FakeServer())
     options = ["--count", "2", "--sensors", "2", "--traffic", "light", "--no-bev", "--json"]
     result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), *options])
     assert result.exit_code == 0, result.stderr

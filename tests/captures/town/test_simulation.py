@@ -4,18 +4,24 @@ import hashlib
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from carlasc.captures import Capture, Drive, Lidar, simulate
-from carlasc.errors import ArgumentError, ConflictError
+from carlasc.core.tables import CARLA
+from carlasc.demo import demonstrate
+from carlasc.errors import ArgumentError, ConflictError, DependencyError
+
+for package in ("embreex", "trimesh", "PIL"):
+    pytest.importorskip(package, reason="the simulator needs carlasc[simulate]")
 
 LIDAR = Lidar(channels=8, points=800)
 SMALL: dict[str, Any] = {"count": 3, "sensors": 2, "seed": 4, "traffic": "light", "lidar": LIDAR}
@@ -33,7 +39,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_what_is_read_back_is_what_the_drive_saw(recorded: Path) -> None:
+def test_the_capture_holds_what_the_drive_records(recorded: Path) -> None:
     capture = Capture(recorded)
     drive = Drive(SMALL["seed"], SMALL["traffic"], LIDAR)
     assert capture.sensors == (0, 1)
@@ -51,6 +57,8 @@ def test_what_is_read_back_is_what_the_drive_saw(recorded: Path) -> None:
 def test_the_birds_eye_picture_has_the_published_size_and_shows_the_road_in_the_middle(recorded: Path) -> None:
     data = Capture(recorded).read_bev(0)
     assert data is not None
+    from PIL import Image
+
     picture = Image.open(io.BytesIO(data))
     assert picture.size == (1920, 1080)
     pixels = np.asarray(picture, np.int64)
@@ -108,7 +116,7 @@ def test_a_capture_of_other_settings_is_refused_and_left_alone(recorded: Path) -
     assert digests(recorded) == before
 
 
-def test_somebody_elses_capture_is_refused(tmp_path: Path) -> None:
+def test_a_capture_without_settings_is_refused(tmp_path: Path) -> None:
     (tmp_path / "raw" / "velodyne0").mkdir(parents=True)
     with pytest.raises(ConflictError, match=r"simulation\.json"):
         simulate(tmp_path, **SMALL)
@@ -125,7 +133,7 @@ def test_somebody_elses_capture_is_refused(tmp_path: Path) -> None:
         ({"workers": 0}, "workers"),
     ],
 )
-def test_senseless_arguments_are_refused_before_anything_is_written(
+def test_arguments_out_of_range_are_refused_before_anything_is_written(
     tmp_path: Path, change: dict[str, Any], word: str
 ) -> None:
     with pytest.raises(ArgumentError, match=word):
@@ -149,3 +157,67 @@ def test_the_command_records_and_prints_its_figures_as_json(tmp_path: Path) -> N
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--count", "0"]).exit_code == 2
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--traffic", "jam"]).exit_code == 2
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments]).exit_code == 1
+
+
+@pytest.mark.parametrize("package", ["embreex", "trimesh", "PIL"])
+@pytest.mark.parametrize("run", [simulate, demonstrate])
+def test_without_a_package_of_the_extra_nothing_is_written(
+    run: Callable[..., object], package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(DependencyError, match=rf"{package} .*pip install 'carlasc\[simulate\]'"):
+        run(tmp_path / "out", count=1, sensors=1, workers=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_need_pillow_and_captures_without_pictures_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("PIL.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    assert simulate(tmp_path, **{**SMALL, "count": 1, "sensors": 1}, bev=False, workers=1).written == 1
+
+
+def test_a_frame_without_its_picture_or_its_times_is_completed(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "copy")
+    raw = tmp_path / "copy" / "raw"
+    (raw / "bev" / "1.jpg").unlink()
+    (raw / "times1.txt").write_text("".join((raw / "times1.txt").read_text().splitlines(keepends=True)[:2]))
+    assert simulate(tmp_path / "copy", **SMALL, workers=1).written == 1
+    assert (raw / "bev" / "1.jpg").read_bytes() == (recorded / "raw" / "bev" / "1.jpg").read_bytes()
+    assert Capture(tmp_path / "copy").read_time(2, 1) == pytest.approx(0.2)
+
+
+def test_a_capture_of_another_version_of_the_town_is_refused(recorded: Path, tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    settings = json.loads((recorded / "raw" / "simulation.json").read_text())
+    assert settings["recipe"] == 1  # the name of the town's version in the file
+    (tmp_path / "raw" / "simulation.json").write_text(json.dumps(settings | {"recipe": 0}))
+    with pytest.raises(ConflictError, match="recipe"):
+        simulate(tmp_path, **SMALL)
+
+
+def test_the_result_counts_the_points_that_were_written_by_class(tmp_path: Path) -> None:
+    result = simulate(tmp_path, **{**SMALL, "count": 1}, bev=False, workers=1)
+    scans = [Capture(tmp_path).read(sensor, 0).scan for sensor in (0, 1)]
+    assert result.points == sum(map(len, scans)) == sum(result.classes.values())
+    labels = np.concatenate([np.asarray(scan.labels) for scan in scans])
+    assert result.classes["Road"] == np.count_nonzero(labels == CARLA.id_of("Road"))
+
+
+def test_the_command_names_options_in_its_errors(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from carlasc.cli import app
+
+    for options, message in (
+        (["--range", "0"], "carlasc: --range: expected more than 0"),
+        (["--channels", "9", "--points", "8"], "carlasc: --points: expected at least one per channel"),
+    ):
+        result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *options])
+        assert result.exit_code == 2
+        assert message in result.stderr
+    assert not (tmp_path / "out").exists()

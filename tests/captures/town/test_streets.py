@@ -32,7 +32,7 @@ def test_offsets_shrink_blocks_and_grow_the_outside(streets: Streets) -> None:
         assert (far > near) == block.outside
 
 
-def test_traffic_keeps_right_and_every_way_goes_on(streets: Streets) -> None:
+def test_lanes_are_on_the_right_and_lead_to_other_lanes(streets: Streets) -> None:
     for lane in streets.lanes:
         assert lane.exits
         for follow in lane.exits:
@@ -44,7 +44,7 @@ def test_traffic_keeps_right_and_every_way_goes_on(streets: Streets) -> None:
             np.testing.assert_allclose(offsets, LANE_WIDTH_M / 2, atol=1e-9)
 
 
-def test_lanes_are_long_enough_to_drive_on_and_headings_never_jump(streets: Streets) -> None:
+def test_lanes_have_a_minimum_length_and_smooth_headings(streets: Streets) -> None:
     for lane in streets.lanes:
         assert lane.length_m > 6.0
         steps = np.diff(lane.path, axis=0)

@@ -8,6 +8,9 @@ from carlasc.captures.town.plots import Land, Rectangle
 from carlasc.captures.town.town import build_town
 from carlasc.core.tables import CARLA
 
+pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")
+pytest.importorskip("trimesh", reason="the simulator needs carlasc[simulate]")
+
 
 def test_the_same_seed_builds_the_same_town(drive: Drive, twin: Drive) -> None:
     again = twin.town
@@ -21,12 +24,12 @@ def test_another_seed_builds_another_town(drive: Drive) -> None:
     assert other.mesh.vertices.shape != drive.town.mesh.vertices.shape
 
 
-def test_everything_that_stands_still_in_carla_stands_in_town(drive: Drive) -> None:
+def test_the_static_town_has_all_static_classes(drive: Drive) -> None:
     names = {CARLA.names[int(label)] for label in np.unique(drive.town.mesh.labels)}
     assert names == set(CARLA.names.values()) - {"Free", "Sky", "Vehicle", "Pedestrian"}
 
 
-def test_meshes_are_sound(drive: Drive) -> None:
+def test_the_mesh_is_valid(drive: Drive) -> None:
     mesh = drive.town.mesh
     assert np.isfinite(mesh.vertices).all()
     assert mesh.faces.min() >= 0
@@ -47,7 +50,7 @@ def test_road_is_level_markings_lie_just_above_and_sidewalks_are_raised(drive: D
     assert heights["Sidewalk"].max() == pytest.approx(0.15)
 
 
-def test_no_building_stands_on_a_lane(drive: Drive) -> None:
+def test_no_building_is_on_a_lane(drive: Drive) -> None:
     lanes = np.concatenate([lane.path for lane in drive.town.streets.lanes])
     for footprint, _ in drive.town.buildings:
         assert not footprint.contains(lanes, margin_m=1.5).any()
@@ -62,7 +65,7 @@ def test_rectangles_overlap_as_their_areas_do() -> None:
     assert not square.overlaps(Rectangle(np.array([2.2, 2.2]), (2.0, 2.0), np.pi / 4), margin_m=0.2)
 
 
-def test_land_is_given_once_and_only_inside_its_boundary() -> None:
+def test_land_is_reserved_once_and_only_inside_its_boundary() -> None:
     notched = np.array([[0, 0], [10, 0], [10, 10], [6, 10], [6, 5], [4, 5], [4, 10], [0, 10]], float)
     land = Land(notched)
     assert not land.reserve(Rectangle(np.array([5.0, 8.0]), (1.0, 1.0), 0.0))  # in the notch
