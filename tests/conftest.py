@@ -6,9 +6,13 @@ import os
 import tarfile
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 DATA = Path(__file__).parent / "data"
+
+hypothesis.settings.register_profile("carlasc", deadline=None)  # how long an example takes is the machine's affair
+hypothesis.settings.load_profile("carlasc")
 
 
 @pytest.fixture(scope="session")

@@ -62,7 +62,9 @@ def count_workers(workers: int | None) -> int:
         ArgumentError: no positive number.
     """
     if workers is None:
-        return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+        if sys.platform == "linux":
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1
     if workers < 1:
         raise ArgumentError("workers", expected="at least 1", found=f"{workers}")
     return workers

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import CarlascError, FormatError, import_extra
+from carlasc.running import count_workers
 from carlasc.storage.folders.trees import Tree
 
 _T = TypeVar("_T")
@@ -178,5 +179,5 @@ _scratch = _Scratch()
 
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
-    """Threads of this process: a fork inherits the object, but not its threads."""
-    return ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0))), thread_name_prefix="carlasc-decode")
+    """Return the threads of this process: after a fork, the object exists in the child, but its threads do not."""
+    return ThreadPoolExecutor(min(8, count_workers(None)), thread_name_prefix="carlasc-decode")
