@@ -8,7 +8,7 @@ SIDE_BY_SIDE := -q -n auto --dist worksteal
 COVERAGE := 90 # percent; below it, `make coverage` fails
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-lowest test-newest coverage lint types unit benchmark benchmark-ssc docs page clean
+.PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage lint types unit benchmark benchmark-ssc docs page clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -26,6 +26,10 @@ test-lowest: .venv-lowest/ready ## the quick tests with the lowest versions that
 
 test-newest: .venv-newest/ready ## the quick tests with the newest versions of everything (PYTHON=python3.13)
 	.venv-newest/bin/pytest $(SIDE_BY_SIDE)
+
+test-wheel: .venv-wheel/ready ## the quick tests with the package installed as users do, not editable
+	.venv-wheel/bin/pip install --quiet --no-deps --force-reinstall .
+	.venv-wheel/bin/pytest $(SIDE_BY_SIDE)
 
 coverage: $(VENV)/ready .system-libraries ## all tests, with the lines that they reach
 	$(RUN)/pytest $(SIDE_BY_SIDE) -m '' --cov --cov-report=term --cov-report=xml --cov-fail-under=$(COVERAGE)
@@ -54,10 +58,9 @@ docs: $(VENV)/ready ## the documentation, built strictly into site/
 	NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet
 
 clean: ## remove environments and what was built
-	rm -rf $(VENV) $(DEMO_VENV) .venv-lowest .venv-newest site demo build dist test-output .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(DEMO_VENV) .venv-lowest .venv-newest .venv-wheel site demo build dist test-output .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-# Make a virtual environment in folder $(1). uv installs five times as fast as pip, but reads neither pip's settings nor wheels on disk:
-# where it fails, pip does its work.
+# Makes a virtual environment in the folder $(1).
 define virtual_environment
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "carlasc needs Python 3.11 or newer: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 1; }
@@ -70,6 +73,7 @@ $(DEMO_VENV)/ready: pyproject.toml constraints.txt
 	$(DEMO_VENV)/bin/pip install --quiet --no-compile --constraint constraints.txt --editable '.[simulate,render]'
 	@touch $@
 
+# uv installs five times as fast as pip but does not read pip's settings, such as a mirror: where it fails, pip does the work.
 $(VENV)/ready: pyproject.toml constraints.txt
 	$(call virtual_environment,$(VENV))
 	$(RUN)/pip install --quiet --no-compile uv '$(TORCH)'
@@ -83,11 +87,16 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	VIRTUAL_ENV=.venv-lowest .venv-lowest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[all,dev]'
 	@touch $@
 
-# Without torch, which for Python 3.13 is gigabytes: its tests skip. Set NEWEST to all,dev to have it.
-NEWEST ?= zarr,hdf5,parquet,remote,kitti,render,simulate,view,plots,dev
+# Without torch, which on Linux is gigabytes: its tests skip. `EXTRAS=all,dev` has it too.
+EXTRAS ?= zarr,hdf5,parquet,remote,kitti,render,simulate,view,plots,dev
 .venv-newest/ready: pyproject.toml
 	$(call virtual_environment,.venv-newest)
-	.venv-newest/bin/pip install --quiet --no-compile --editable '.[$(NEWEST)]'
+	.venv-newest/bin/pip install --quiet --no-compile --editable '.[$(EXTRAS)]'
+	@touch $@
+
+.venv-wheel/ready: pyproject.toml constraints.txt
+	$(call virtual_environment,.venv-wheel)
+	.venv-wheel/bin/pip install --quiet --no-compile --constraint constraints.txt '.[$(EXTRAS)]'
 	@touch $@
 
 # Open3D's window and the browser tests need these; without them those tests say so and skip.

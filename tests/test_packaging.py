@@ -94,6 +94,15 @@ def test_constraints_pin_what_the_tests_install_and_nothing_else():
     assert {name for name in needed if version(name).partition("+")[0] != pinned[name]} == set()
 
 
+def test_the_release_checklist_lists_the_relative_links_of_the_readme():
+    links = re.findall(r"\]\(([^)]+)\)", (ROOT / "README.md").read_text())
+    relative = {link for link in links if not link.startswith(("http", "#"))}
+    checklist = (ROOT / "docs" / "releasing.md").read_text()
+    listed = re.search(r"<!-- relative links begin -->(.*)<!-- relative links end -->", checklist, re.DOTALL)
+    assert set(re.findall(r"`([^`]+)`", listed[1])) == relative
+    assert all((ROOT / link.partition("#")[0]).is_file() for link in relative)
+
+
 @pytest.mark.slow
 def test_the_types_are_right_on_macos_too(tmp_path):
     pytest.importorskip("mypy")
