@@ -4,9 +4,11 @@ DEMO_VENV := .venv-demo
 VENV := .venv
 SYSTEM_LIBRARIES := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1 xvfb chromium chromium-driver
 RUN := $(VENV)/bin
+SIDE_BY_SIDE := -q -n auto --dist worksteal
+COVERAGE := 90 # percent; below it, `make coverage` fails
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types unit benchmark benchmark-ssc docs page clean
+.PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage lint types unit benchmark benchmark-ssc docs page clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -14,7 +16,23 @@ help: ## list the targets
 demo: $(DEMO_VENV)/ready ## simulate a town, make its ground truth, check it, draw it
 	$(DEMO_VENV)/bin/carlasc demo demo
 
-test: $(VENV)/ready .system-libraries lint types docs unit ## everything: lint, types, documentation, tests
+test: $(VENV)/ready .system-libraries lint types docs unit ## lint, types, documentation and the quick tests
+
+test-slow: $(VENV)/ready .system-libraries ## the slow tests: notebooks, browsers, pages of commands, training, benchmarks once
+	$(RUN)/pytest $(SIDE_BY_SIDE) -m slow
+
+test-lowest: .venv-lowest/ready ## the quick tests with the lowest versions that pyproject.toml allows (PYTHON=python3.11)
+	.venv-lowest/bin/pytest $(SIDE_BY_SIDE)
+
+test-newest: .venv-newest/ready ## the quick tests with the newest versions of everything (PYTHON=python3.13)
+	.venv-newest/bin/pytest $(SIDE_BY_SIDE)
+
+test-wheel: .venv-wheel/ready ## the quick tests with the package installed as users do, not editable
+	.venv-wheel/bin/pip install --quiet --no-deps --force-reinstall .
+	.venv-wheel/bin/pytest $(SIDE_BY_SIDE)
+
+coverage: $(VENV)/ready .system-libraries ## all tests, with the lines that they reach
+	$(RUN)/pytest $(SIDE_BY_SIDE) -m '' --cov --cov-report=term --cov-report=xml --cov-fail-under=$(COVERAGE)
 
 lint: $(VENV)/ready ## ruff
 	$(RUN)/ruff check .
@@ -24,11 +42,11 @@ types: $(VENV)/ready ## mypy
 	$(RUN)/mypy
 	cd examples && MYPYPATH=. ../$(RUN)/mypy --config-file ../pyproject.toml .
 
-unit: $(VENV)/ready ## the tests
-	$(RUN)/pytest -n auto --dist worksteal -q
+unit: $(VENV)/ready ## the quick tests
+	$(RUN)/pytest $(SIDE_BY_SIDE)
 
 benchmark: $(VENV)/ready ## time the hot paths (docs/performance.md)
-	$(RUN)/pytest tests/benchmarks --benchmark-enable --benchmark-only -p no:xdist
+	$(RUN)/pytest tests/benchmarks --benchmark-enable --benchmark-only -p no:xdist -m slow
 
 benchmark-ssc: $(VENV)/ready ## train the networks on a small simulated data set and print the tables (SIZE=full on a GPU)
 	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small) --history
@@ -40,21 +58,45 @@ docs: $(VENV)/ready ## the documentation, built strictly into site/
 	NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet
 
 clean: ## remove environments and what was built
-	rm -rf $(VENV) $(DEMO_VENV) site demo build dist test-output .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(DEMO_VENV) .venv-lowest .venv-newest .venv-wheel site demo build dist test-output .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+# Makes a virtual environment in the folder $(1).
+define virtual_environment
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "carlasc needs Python 3.11 or newer: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -m venv $(1) || { echo "no virtual environment could be made: on Debian, apt install python3-venv"; exit 1; }
+endef
+TORCH := torch==2.13.0
 
 $(DEMO_VENV)/ready: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-		|| { echo "carlasc needs Python 3.11 or newer: set it with make demo PYTHON=/path/to/python3.11"; exit 1; }
-	@$(PYTHON) -m venv $(DEMO_VENV) || { echo "no virtual environment could be made: on Debian, apt install python3-venv"; exit 1; }
-	$(DEMO_VENV)/bin/pip install --quiet --constraint constraints.txt --editable '.[simulate,render]'
+	$(call virtual_environment,$(DEMO_VENV))
+	$(DEMO_VENV)/bin/pip install --quiet --no-compile --constraint constraints.txt --editable '.[simulate,render]'
 	@touch $@
 
+# uv installs five times as fast as pip but does not read pip's settings, such as a mirror: where it fails, pip does the work.
 $(VENV)/ready: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-		|| { echo "carlasc needs Python 3.11 or newer: set it with make test PYTHON=/path/to/python3.11"; exit 1; }
-	@$(PYTHON) -m venv $(VENV) || { echo "no virtual environment could be made: on Debian, apt install python3-venv"; exit 1; }
-	$(RUN)/pip install --quiet 'torch==2.13.0'
-	$(RUN)/pip install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	$(call virtual_environment,$(VENV))
+	$(RUN)/pip install --quiet --no-compile uv '$(TORCH)'
+	VIRTUAL_ENV=$(VENV) $(RUN)/uv pip install --quiet --constraint constraints.txt --editable '.[all,dev]' \
+		|| $(RUN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[all,dev]'
+	@touch $@
+
+.venv-lowest/ready: pyproject.toml
+	$(call virtual_environment,.venv-lowest)
+	.venv-lowest/bin/pip install --quiet --no-compile uv '$(TORCH)'
+	VIRTUAL_ENV=.venv-lowest .venv-lowest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[all,dev]'
+	@touch $@
+
+# Without torch, which on Linux is gigabytes: its tests skip. `EXTRAS=all,dev` has it too.
+EXTRAS ?= zarr,hdf5,parquet,remote,kitti,render,simulate,view,plots,dev
+.venv-newest/ready: pyproject.toml
+	$(call virtual_environment,.venv-newest)
+	.venv-newest/bin/pip install --quiet --no-compile --editable '.[$(EXTRAS)]'
+	@touch $@
+
+.venv-wheel/ready: pyproject.toml constraints.txt
+	$(call virtual_environment,.venv-wheel)
+	.venv-wheel/bin/pip install --quiet --no-compile --constraint constraints.txt '.[$(EXTRAS)]'
 	@touch $@
 
 # Open3D's window and the browser tests need these; without them those tests say so and skip.

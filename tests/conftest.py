@@ -4,11 +4,45 @@ from __future__ import annotations
 
 import os
 import tarfile
+from collections.abc import Generator
+from importlib.util import find_spec
 from pathlib import Path
 
+import hypothesis
 import pytest
 
+from carlasc.errors import DependencyError
+
 DATA = Path(__file__).parent / "data"
+
+hypothesis.settings.register_profile("carlasc", deadline=None)  # how long an example takes is the machine's affair
+hypothesis.settings.load_profile("carlasc")
+
+
+def _skip_without_extra() -> Generator[None]:
+    """Skip a test whose code says that an optional package is not installed. An import that fails in any other way is an error."""
+    try:
+        return (yield)
+    except DependencyError as error:
+        cause = error.__cause__
+        if isinstance(cause, ModuleNotFoundError) and cause.name and find_spec(cause.name.partition(".")[0]) is None:
+            pytest.skip(str(error))
+        raise
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None]:
+    """Skip a test that is marked with a package that is not installed, or one of whose fixtures needs such a package."""
+    for mark in item.iter_markers("needs"):
+        for package in mark.args:
+            pytest.importorskip(package)
+    return (yield from _skip_without_extra())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
+    """Skip a test that comes to a package that is not installed."""
+    return (yield from _skip_without_extra())
 
 
 @pytest.fixture(scope="session")

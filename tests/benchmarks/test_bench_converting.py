@@ -12,6 +12,8 @@ from helpers.tiny_kitti import write_tiny_kitti
 from carlasc.converting import convert
 from carlasc.motion.paths import estimate_path
 
+pytestmark = pytest.mark.slow
+
 FRAMES, POINTS = 8, 122_000
 
 

@@ -25,6 +25,8 @@ from helpers.plain_loader import PlainLoader
 
 from carlasc.dataset.samples import Dataset
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 40
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from carlasc.metrics import ConfusionMatrix, known
 
+pytestmark = pytest.mark.slow
+
 K = 11
 
 

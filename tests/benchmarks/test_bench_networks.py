@@ -16,6 +16,8 @@ from completion.networks import build_network  # noqa: E402
 
 from carlasc import GridSpec  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 SPEC = GridSpec.published().with_size((32, 32, 8))
 
 

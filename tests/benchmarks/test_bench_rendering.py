@@ -9,6 +9,8 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.viewing import render_grid, render_scan
 
+pytestmark = pytest.mark.slow
+
 
 def street(spec):
     """A grid as full as a town's: ground everywhere, walls along a street, trees, cars."""

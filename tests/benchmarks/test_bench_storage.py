@@ -22,6 +22,8 @@ import carlasc
 from carlasc.dataset.samples import Dataset
 from carlasc.storage.packing import pack
 
+pytestmark = pytest.mark.slow
+
 FRAMES, HISTORY = 40, 16
 PATH = "Train/Town01_Light/cartesian"
 STORES = ("files", "zarr", "zarr --small", "h5", "parquet")

@@ -14,6 +14,8 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.voting.ballot import count_votes
 from carlasc.groundtruth.voting.observations import Observation
 
+pytestmark = pytest.mark.slow
+
 FINEST = GridSpec.published().with_resolution(0.1)
 CASES = {
     "128x128x8": (GridSpec.published("cartesian"), "sensor"),

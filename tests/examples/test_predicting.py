@@ -164,6 +164,7 @@ def test_grids_that_do_not_divide_are_refused():
         build_network("sscnet", 11, SPEC.with_size((16, 16, 15)))
 
 
+@pytest.mark.slow
 def test_the_script_completes_and_a_mistake_is_one_line(data, tmp_path, examples):
     weights = save(tmp_path / "net.pt")
     command = [sys.executable, str(examples / "predict.py")]

@@ -159,6 +159,7 @@ def test_settings_files_of_every_network_are_read(examples):
         Config.read(files[0], ["epochs=many"])
 
 
+@pytest.mark.slow
 def test_two_processes_of_torchrun_end_with_the_weights_of_one(data, tmp_path, examples):
     config = tmp_path / "config.yaml"
     settings = replace(QUICK, network="sscnet", epochs=1)  # no batch norm: its statistics would be each process's own

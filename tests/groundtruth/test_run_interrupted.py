@@ -41,6 +41,7 @@ def _interrupt(root: Path, out: Path, kind: signal.Signals, workers: int) -> tup
     return process.returncode, stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_ctrl_c_stops_at_once_with_whole_files_and_the_next_run_finishes(capture, tmp_path, workers):
     root, whole = capture
@@ -59,6 +60,7 @@ def test_ctrl_c_stops_at_once_with_whole_files_and_the_next_run_finishes(capture
     assert read_tree(tmp_path) == whole
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_finished_by_the_next_one(capture, tmp_path):
     root, whole = capture
     assert _interrupt(root, tmp_path, signal.SIGKILL, 2)[0] == -signal.SIGKILL

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import files_of
-from storage.contract import BARE, WHOLE
 
 import carlasc
 from carlasc.errors import FormatError
 from carlasc.storage import Sequence
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
+from carlasc.testing.data import SCANS, WHOLE
 
 h5py = pytest.importorskip("h5py")
 
@@ -25,10 +25,10 @@ def points_of(count: int, seed: int = 0) -> np.ndarray:
 
 
 def write(path: Path, scans: list[np.ndarray], options: Options | None = None, field: str = "points") -> Sequence:
-    with open_sink(path, options or Options(), False) as sink, sink.sequence(BARE) as writer:
+    with open_sink(path, options or Options(), False) as sink, sink.sequence(SCANS) as writer:
         for frame, array in enumerate(scans):
             writer.write(field, frame, array)
-    return carlasc.open(path).sequences()[BARE]
+    return carlasc.open(path).sequences()[SCANS]
 
 
 def test_memory_is_used_again_only_where_shape_and_type_are_the_same(tmp_path: Path) -> None:
@@ -59,7 +59,7 @@ def test_a_4th_column_comes_back_bit_for_bit(tmp_path: Path, bits: int) -> None:
 def test_a_chunk_has_nine_eighths_of_the_first_scan_in_whole_pages(tmp_path: Path, count: int, chunk: int) -> None:
     write(tmp_path / "x.h5", [points_of(0), points_of(count), points_of(3)])
     with h5py.File(tmp_path / "x.h5") as file:
-        assert file[BARE]["scans/points/xyz"].chunks == (3, chunk)
+        assert file[SCANS]["scans/points/xyz"].chunks == (3, chunk)
 
 
 def test_a_grid_of_another_size_than_the_first_is_refused(tmp_path: Path) -> None:
@@ -68,12 +68,12 @@ def test_a_grid_of_another_size_than_the_first_is_refused(tmp_path: Path) -> Non
 
 
 def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_path: Path) -> None:
-    with open_sink(tmp_path / "x.h5", Options(), False) as sink, sink.sequence(BARE) as writer:
+    with open_sink(tmp_path / "x.h5", Options(), False) as sink, sink.sequence(SCANS) as writer:
         writer.write_document("poses.txt", b"not numbers")
         writer.write_document("times.txt", b"0\n1\n")
-    assert carlasc.open(tmp_path / "x.h5").sequences()[BARE].read_document("poses.txt") == b"not numbers"
+    assert carlasc.open(tmp_path / "x.h5").sequences()[SCANS].read_document("poses.txt") == b"not numbers"
     with h5py.File(tmp_path / "x.h5") as file:
-        assert set(file[BARE]) == {"documents", "times"}
+        assert set(file[SCANS]) == {"documents", "times"}
 
 
 @pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")])
@@ -82,10 +82,10 @@ def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
 ) -> None:
     pytest.importorskip(package)
     with open_sink(tmp_path / f"x.{kind}", Options(), False) as sink:
-        for path in (BARE, WHOLE):
+        for path in (SCANS, WHOLE):
             with sink.sequence(path) as writer:
                 writer.write("labels", 0, np.arange(3, dtype=np.uint32))
-        sink.sequence(BARE)
+        sink.sequence(SCANS)
     assert list(carlasc.open(tmp_path / f"x.{kind}").sequences()) == [WHOLE]
 
 
@@ -93,7 +93,7 @@ def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
 def test_what_an_interrupted_run_left_of_a_sequence_is_removed(tmp_path: Path, kind: str, package: str) -> None:
     pytest.importorskip(package)
     labels = np.arange(3, dtype=np.uint32)
-    interrupted = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(BARE)
+    interrupted = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
     interrupted.write("instances", 0, labels)
     for writer in interrupted.writers.values():
         writer.close()  # the field is whole, its sequence is not

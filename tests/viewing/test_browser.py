@@ -29,6 +29,7 @@ def test_it_draws_without_a_network(page):
     assert page.run("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
 
 
+@pytest.mark.slow
 def test_left_ahead_and_up_are_where_they_should_be(page):
     canvas = page.canvas()
     vehicle = canvas.shape[1] / 2
@@ -46,6 +47,7 @@ def test_left_ahead_and_up_are_where_they_should_be(page):
     assert middle_of(red_pixels(level))[0] > vehicle
 
 
+@pytest.mark.slow
 def test_data_with_y_on_the_left_is_drawn_so(browser, tmp_path):
     folder = write_blocks(tmp_path / "kitti" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
     page = Page(browser, write_page(folder, tmp_path / "scene.html").out)
@@ -55,6 +57,7 @@ def test_data_with_y_on_the_left_is_drawn_so(browser, tmp_path):
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_the_slider_moves_the_frame(page):
     before = middle_of(red_pixels(page.canvas()))
     page.run(
@@ -69,6 +72,7 @@ def test_the_slider_moves_the_frame(page):
     assert page.text("#frame-label").startswith("frame 0")
 
 
+@pytest.mark.slow
 def test_play_goes_through_the_frames_until_it_is_stopped(page):
     page.click("#play")
     seen = page.run(
@@ -85,6 +89,7 @@ def test_play_goes_through_the_frames_until_it_is_stopped(page):
     )
 
 
+@pytest.mark.slow
 def test_a_class_is_toggled_and_counted(page):
     voxels = page.run("return carlasc.contents.grids[0].label.filter((label) => label === 4).length")
     assert page.text("tr:has([data-class='4']) td:nth-child(2)") == str(voxels)
@@ -96,12 +101,14 @@ def test_a_class_is_toggled_and_counted(page):
     assert red_pixels(page.canvas()).sum() > 100
 
 
+@pytest.mark.slow
 def test_a_hidden_class_stays_hidden_in_the_next_frame(page):
     page.click("[data-class='4']")
     page.run("await carlasc.step(1)")
     assert not red_pixels(page.canvas()).any()
 
 
+@pytest.mark.slow
 def test_layers_are_toggled(page):
     grid = page.canvas()
     page.click("[data-layer='grid']")
@@ -117,6 +124,7 @@ def test_layers_are_toggled(page):
     assert red_pixels(points).sum() > 50
 
 
+@pytest.mark.slow
 def test_a_picked_voxel_shows_its_class_votes_and_position(page):
     column, row = middle_of(red_pixels(page.canvas()))
     page.run("carlasc.pick(...args)", float(column), float(row))
@@ -131,6 +139,7 @@ def test_a_picked_voxel_shows_its_class_votes_and_position(page):
     assert page.text("#card") == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["height", "votes"])
 def test_colours_can_show_height_or_votes(page, mode):
     before = page.canvas()
@@ -142,6 +151,7 @@ def test_colours_can_show_height_or_votes(page, mode):
     assert page.text("#ramp h2").lower().startswith(mode)
 
 
+@pytest.mark.slow
 def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browser, blocks, tmp_path):
     prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
     result = write_page(prediction, tmp_path / "scene.html", truth=blocks)
@@ -168,6 +178,7 @@ def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browse
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_wedges_of_a_cylindrical_grid_are_at_their_positions(browser, tmp_path):
     spec = GridSpec.published("cylindrical").with_size((64, 64, 4))
     folder = write_blocks(tmp_path / "Town01_Light" / "cylindrical", frames=1, spec=spec)
@@ -182,6 +193,7 @@ def test_wedges_of_a_cylindrical_grid_are_at_their_positions(browser, tmp_path):
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_points_alone_are_drawn(browser, tmp_path):
     from carlasc.storage.folders.folder import FolderSink
 
@@ -193,6 +205,7 @@ def test_points_alone_are_drawn(browser, tmp_path):
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1280, 800), (500, 900)])
 @pytest.mark.parametrize("compared", [False, True])
 def test_nothing_overlaps_and_nothing_is_cut_off(browser, blocks, tmp_path, size, compared):
@@ -213,6 +226,7 @@ def test_nothing_overlaps_and_nothing_is_cut_off(browser, blocks, tmp_path, size
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_a_broken_page_says_so(browser, page_file, tmp_path):
     text = page_file.read_text()
     start = text.index('id="frame0">') + len('id="frame0">')

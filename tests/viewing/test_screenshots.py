@@ -28,6 +28,7 @@ def street(tmp_path_factory):
     return folder / "cartesian"
 
 
+@pytest.mark.slow
 def test_the_page_of_a_street(browser, street, tmp_path):
     page = Page(browser, write_page(street, tmp_path / "scene.html").out, (1280, 860))
     page.run("carlasc.panels.setShadows(true)")
@@ -40,6 +41,7 @@ def test_the_page_of_a_street(browser, street, tmp_path):
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_the_window_of_a_street(street):
     try:
         import_open3d()

@@ -66,6 +66,7 @@ def test_the_birds_eye_picture_has_the_published_size_and_shows_the_road_in_the_
     assert np.abs(pixels[540, 960] - (0, 0, 142)).max() < 70  # the ego vehicle, from above
 
 
+@pytest.mark.slow
 def test_another_process_with_two_workers_and_another_hash_seed_writes_the_same_bytes(
     recorded: Path, tmp_path: Path
 ) -> None:

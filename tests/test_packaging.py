@@ -1,0 +1,111 @@
+"""What is installed: the contents of the wheel, the version, and the packages that it needs."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import PackageNotFoundError, distribution, requires, version
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import carlasc
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+BUILD_ONLY = {"build.sh", "three.entry.mjs"}  # files of the page that only its bundling needs
+
+
+def pins():
+    """Return the version of each package in constraints.txt."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return {canonicalize_name(name): pin for name, pin in (ln.split("==") for ln in lines if not ln.startswith("#"))}
+
+
+def installed_for(name, extras=frozenset()):
+    """Return the names of all packages that a package with these extras needs in this environment, its own included."""
+    found, open_ends = {}, [(canonicalize_name(name), frozenset(extras))]
+    while open_ends:
+        package, chosen = open_ends.pop()
+        if chosen | {""} <= found.get(package, set()):
+            continue
+        found.setdefault(package, set()).update(chosen | {""})
+        for line in requires(package) or ():
+            needed = Requirement(line)
+            if needed.marker is None or any(needed.marker.evaluate({"extra": extra}) for extra in chosen | {""}):
+                open_ends.append((canonicalize_name(needed.name), frozenset(needed.extras)))
+    return set(found)
+
+
+def test_the_wheel_holds_the_packages_and_nothing_that_only_builds_them(tmp_path):
+    pytest.importorskip("hatchling")
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name == f"carlasc-{carlasc.__version__}-py3-none-any.whl"
+    with ZipFile(wheel) as archive:
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+        metadata = {Path(name).name for name in archive.namelist() if ".dist-info/" in name}
+    folders = {"carlasc": ROOT, "carlasc_converters": ROOT / "converters"}
+    there = {
+        path.relative_to(parent).as_posix()
+        for folder, parent in folders.items()
+        for path in (parent / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts and path.name not in BUILD_ONLY
+    }
+    assert held == there
+    assert {"carlasc/py.typed", "carlasc/viewing/page/assets/template.html"} <= held
+    assert {"METADATA", "entry_points.txt", "LICENSE"} <= metadata
+
+
+def test_the_version_is_in_one_place():
+    assert "version" in PROJECT["dynamic"]
+    assert version("carlasc") == carlasc.__version__
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert cited is None or cited[1] == carlasc.__version__
+
+
+def test_every_requirement_has_a_lowest_version():
+    lines = PROJECT["dependencies"] + [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
+    for needed in map(Requirement, lines):
+        if needed.name not in ("carlasc", "types-PyYAML"):  # the package's own extras; the stubs follow PyYAML
+            assert any(one.operator == ">=" for one in needed.specifier), needed
+
+
+def test_all_is_every_extra_but_those_of_developers():
+    extras = PROJECT["optional-dependencies"]
+    (line,) = extras["all"]
+    assert Requirement(line).extras == set(extras) - {"all", "dev", "docs", "carla"}  # carla has few wheels
+
+
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11) or sys.platform != "linux", reason="where the pins were made")
+def test_constraints_pin_what_the_tests_install_and_nothing_else():
+    try:
+        needed = installed_for("carlasc", ("all", "dev")) - {"carlasc"}
+    except PackageNotFoundError as error:
+        pytest.skip(f"not all extras are installed: {error.name}")
+    pinned = pins()
+    if distribution("numpy").version != pinned["numpy"]:
+        pytest.skip("this environment was not installed with constraints.txt")
+    assert needed == set(pinned)
+    assert {name for name in needed if version(name).partition("+")[0] != pinned[name]} == set()
+
+
+def test_the_release_checklist_lists_the_relative_links_of_the_readme():
+    links = re.findall(r"\]\(([^)]+)\)", (ROOT / "README.md").read_text())
+    relative = {link for link in links if not link.startswith(("http", "#"))}
+    checklist = (ROOT / "docs" / "releasing.md").read_text()
+    listed = re.search(r"<!-- relative links begin -->(.*)<!-- relative links end -->", checklist, re.DOTALL)
+    assert set(re.findall(r"`([^`]+)`", listed[1])) == relative
+    assert all((ROOT / link.partition("#")[0]).is_file() for link in relative)
+
+
+@pytest.mark.slow
+def test_the_types_are_right_on_macos_too(tmp_path):
+    pytest.importorskip("mypy")
+    command = [sys.executable, "-m", "mypy", "--platform", "darwin", "--cache-dir", str(tmp_path)]
+    ran = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stdout  # names that only Linux has, such as os.sched_getaffinity
