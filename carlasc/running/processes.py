@@ -63,9 +63,8 @@ def count_workers(workers: int | None) -> int:
         ArgumentError: `workers` is not positive.
     """
     if workers is None:
-        if sys.platform == "linux":
-            return len(os.sched_getaffinity(0))
-        return os.cpu_count() or 1  # macOS does not say which cores a process may use
+        # macOS does not say which cores a process may use.
+        return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     if workers < 1:
         raise ArgumentError("workers", expected="at least 1", found=str(workers))
     return workers

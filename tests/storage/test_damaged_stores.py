@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
-from storage.contract import BARE, WHOLE
+from storage.contract import SCANS, WHOLE
 
 import carlasc
 from carlasc.errors import FormatError
@@ -36,7 +36,7 @@ class Renamed(Source):
         self.name = name
 
     def sequences(self) -> dict[str, Sequence]:
-        return {self.name: FolderSource(self.location).sequences()[BARE]}
+        return {self.name: FolderSource(self.location).sequences()[SCANS]}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_a_sequence_whose_path_leads_elsewhere_is_not_unpacked(data: Path, tmp_p
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_fields_and_text_files_whose_names_lead_elsewhere_are_not_written(tmp_path: Path, kind: str) -> None:
-    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(BARE)
+    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
     with pytest.raises(FormatError, match="leads elsewhere"):
         writer.write("../../../../victim/labels", 0, np.zeros((2, 2, 2), np.uint32))
     with pytest.raises(FormatError, match="leads elsewhere"):
@@ -90,11 +90,11 @@ def test_a_store_with_names_that_lead_elsewhere_is_not_read(data: Path, tmp_path
 
     def change(root: dict[str, Any]) -> None:
         if entry == "group":
-            root["attributes"]["sequences"] = {BARE: "../victim"}
+            root["attributes"]["sequences"] = {SCANS: "../victim"}
         elif entry == "field":
-            node(root, BARE)["attributes"]["fields"] += ["../../victim/labels"]
+            node(root, SCANS)["attributes"]["fields"] += ["../../victim/labels"]
         else:
-            node(root, BARE)["attributes"]["documents"] += ["../victim.txt"]
+            node(root, SCANS)["attributes"]["documents"] += ["../victim.txt"]
 
     store = edit_zarr(pack(data, tmp_path / "x.zarr").out, change)
     with pytest.raises(FormatError, match="leads elsewhere"):

@@ -133,7 +133,7 @@ def test_a_sequence_that_has_only_a_grid_of_another_size_is_found(tmp_path: Path
 
 
 def test_empty_folders_and_folders_without_params_are_no_fields(tmp_path: Path) -> None:
-    root = write_dataset(tmp_path / "data") / BARE
+    root = write_dataset(tmp_path / "data") / SCANS
     (root / "predictions").mkdir()
     (root / "depth").mkdir()
     (root / "depth" / "000000.label").write_bytes(bytes(4))

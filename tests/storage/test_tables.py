@@ -128,7 +128,7 @@ def test_pcodec_is_refused(tmp_path: Path) -> None:
 
 
 def frames_table(store: Path) -> list[dict[str, object]]:
-    return parquet.read_table(store / BARE / "frames.parquet").to_pylist()
+    return parquet.read_table(store / SCANS / "frames.parquet").to_pylist()
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def frames_table(store: Path) -> list[dict[str, object]]:
     ids=["a line for each frame", "a line for each number", "too few lines", "none"],
 )
 def test_lines_of_text_files_are_those_of_the_frames(tmp_path: Path, lines: int, times: list[float] | None) -> None:
-    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
         writer.write_document("times.txt", "".join(f"{line}\n" for line in range(lines)).encode())
         for frame in (1, 2, 3):
             writer.write("labels", frame, np.zeros(2, np.uint32))
@@ -149,7 +149,7 @@ def test_lines_of_text_files_are_those_of_the_frames(tmp_path: Path, lines: int,
 def test_statistics_leave_points_out_that_are_not_finite(tmp_path: Path) -> None:
     points = np.zeros((4, 4), np.float32)
     points[:, 0] = [3, np.nan, np.inf, 1]
-    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
         writer.write("points", 0, points)
         writer.write("points", 1, points[1:2])
     rows = frames_table(tmp_path / "x.parquet")
@@ -157,7 +157,7 @@ def test_statistics_leave_points_out_that_are_not_finite(tmp_path: Path) -> None
 
 
 def test_votes_of_another_width_than_the_first_frame_are_refused(tmp_path: Path) -> None:
-    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(BARE) as writer:
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
         writer.write("fine/votes", 0, np.zeros(2, layout.VOTES_DTYPE))
         with pytest.raises(FormatError, match="frame 1: its labels: expected 1 bytes each"):
             writer.write("fine/votes", 1, np.zeros(2, layout.WIDE_VOTES_DTYPE))
