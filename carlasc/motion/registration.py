@@ -118,7 +118,7 @@ def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:
 
     The normal of a single point or of a line has length 0.
     """
-    values, vectors = np.linalg.eigh(_covariances(model, _PLANE_M))
+    values, vectors = np.linalg.eigh(covariances(model, _PLANE_M))
     flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
     flat[values[:, 1] < _LINE_M**2] = 0.0
     return vectors[:, :, 0] * np.sqrt(flat)[:, None]
@@ -134,7 +134,7 @@ def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _covariances(model: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+def covariances(model: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
     """Return the (M, 3, 3) covariance of the points within a radius of each."""
     covariances = np.zeros((len(model), 3, 3))
     for i in range(len(model)):

@@ -1,5 +1,7 @@
 """Which rays of which scans vote where: scenes of a few points, with actors whose motion is given."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -195,6 +197,12 @@ class TestFeed:
         kitti = self.feed(tmp_path / "kitti", metadata=b'{"classes": "semantickitti"}')
         assert set(kitti.read(0).prepared.labels.tolist()) == {SEMANTICKITTI.id_of("other-object")}
 
+    def test_unlabelled_points_are_left_out(self, tmp_path):
+        feed = self.feed(tmp_path)
+        FolderSink(tmp_path).sequence("Val/Street/cartesian").write("labels", 3, np.array([0, ROAD], np.uint32))
+        (feed.sequence,) = FolderSource(tmp_path).sequences().values()
+        assert feed.read(3).prepared.labels.tolist() == [ROAD]
+
     def test_ranges_are_those_of_carlasc_json_unless_they_are_given(self, tmp_path):
         metadata = b'{"min_range_m": 5.0, "max_range_m": 20.0}'
         assert len(self.feed(tmp_path, metadata=metadata).read(0).prepared.points) == 0
@@ -215,12 +223,13 @@ class TestFeed:
 @pytest.mark.parametrize(("rule", "dynamic"), [(None, "align"), ("point", "drop"), ("sensor", "align"), (None, "tube")])
 def test_free_space_is_outweighed_by_few_points_of_static_classes_and_many_of_movable_ones(tmp_path, rule, dynamic):
     feed = TestFeed().feed(tmp_path, frames=range(1), dynamic=dynamic)
-    plan = Plan(SPEC, "evaluation", feed.options, Voting(rule), FrameRange())
+    flat = replace(SPEC, size=(40, 40, 16))
+    plan = Plan(flat, "evaluation", feed.options, Voting(rule), FrameRange())
     weight = free_weight(plan, feed)
     if rule == "sensor":
         assert weight is None
     elif dynamic == "tube":
         assert weight is not None and not weight.any()
     else:
-        assert weight is not None  # voxels of 0.5 m have faces of a quarter of a square metre
-        assert weight[[ROAD, VEHICLE, PEDESTRIAN]].tolist() == [0.75, 8.0, 8.0]
+        assert weight is not None  # the side of a voxel is 0.5 m wide and 0.25 m high
+        assert weight[[ROAD, VEHICLE, PEDESTRIAN]].tolist() == [0.375, 4.0, 4.0]

@@ -1,3 +1,4 @@
+import json
 import math
 
 import numpy as np
@@ -8,7 +9,9 @@ from hypothesis import strategies as st
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.from_grid import resample
+from carlasc.groundtruth import FromGrid, regrid, resample
+from carlasc.storage import FolderSink, layout
+from carlasc.storage.files import to_json
 
 
 def random_grid(seed, size=(8, 8, 4)):
@@ -55,3 +58,16 @@ def test_a_finer_or_larger_grid_is_refused():
         resample(fine, GridSpec("cylindrical", (2, 2, 2), (0, -math.pi, 0), (8, math.pi, 4)), CARLA)
     with pytest.raises(ArgumentError, match="expected bounds within"):
         resample(fine, GridSpec("cartesian", (4, 4, 2), (-8, 0, 0), (8, 8, 4)), CARLA)
+
+
+def test_the_finest_grid_of_the_same_coordinates_is_resampled_unless_another_is_named(tmp_path):
+    writer = FolderSink(tmp_path).sequence("Val/Street/cartesian")
+    for seed, (name, size) in enumerate({"middle": (8, 8, 4), "fine": (16, 16, 8), "last": (8, 8, 4)}.items()):
+        grid = random_grid(seed, size)
+        writer.write_document(layout.params_file(name), to_json(grid.spec.to_params()))
+        writer.write(f"{name}/labels", 0, grid.labels.astype(np.uint32))
+        writer.write(f"{name}/counts", 0, grid.counts)
+    for observe, chosen in ((FromGrid(), "fine"), (FromGrid("last"), "last")):
+        regrid(tmp_path, random_grid(0).spec.with_size((4, 4, 2)), observe=observe, name=f"of_{chosen}", workers=1)
+        params = json.loads((tmp_path / f"Val/Street/cartesian/of_{chosen}/params.json").read_bytes())
+        assert params["carlasc"]["grid"] == chosen

@@ -186,6 +186,7 @@ class TestWindows:
 
     def test_strides_count_from_the_current_frame(self, street):
         assert self.feed(street, window=(-5, 5), stride=2).window_of(10) == [6, 8, 10, 12, 14]
+        assert self.feed(street, window=(-5, 5), stride=2).window_of(11) == [7, 9, 11, 13, 15]
 
     def test_distance_driven_leaves_out_scans_from_the_same_place(self, street):
         window = self.feed(street, window_m=1.5).window_of(20)
