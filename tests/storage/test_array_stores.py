@@ -16,6 +16,7 @@ from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
 
 h5py = pytest.importorskip("h5py")
+pytest.importorskip("hdf5plugin")
 
 
 def points_of(count: int, seed: int = 0) -> np.ndarray:
@@ -76,7 +77,7 @@ def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_pat
         assert set(file[BARE]) == {"documents", "times"}
 
 
-@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")])
+@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "hdf5plugin"), ("parquet", "pyarrow")])
 def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
     tmp_path: Path, kind: str, package: str
 ) -> None:

@@ -20,7 +20,7 @@ from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack, unpack
 
-PACKAGES = {"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}
+PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
 KINDS = [
     pytest.param(kind, marks=pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed"))
     for kind, name in PACKAGES.items()
@@ -162,7 +162,7 @@ def test_wrong_metadata_are_one_clear_error(
 
 @pytest.fixture
 def hdf5_store(data: Path, tmp_path: Path) -> Path:
-    pytest.importorskip("h5py")
+    pytest.importorskip("hdf5plugin")
     return pack(data / "Train", tmp_path / "x.h5").out
 
 
