@@ -107,6 +107,10 @@ def zarr_store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return pack(data, tmp_path_factory.mktemp("zarr") / "x.zarr").out
 
 
+def take_completeness(root: dict[str, Any]) -> None:
+    del root["attributes"]["complete"]
+
+
 def change_type(root: dict[str, Any]) -> None:
     node(root, WHOLE)["attributes"]["type"] = "carlasc.field"
 
@@ -139,6 +143,7 @@ def remove_field(root: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (take_completeness, "expected a finished store, found one whose packing was interrupted"),
         (change_type, "expected the sequence that the store lists"),
         (remove_split, "expected the attribute split, found none: the store is damaged"),
         (change_kind, "expected a field of kind points, found 'values'"),
