@@ -18,7 +18,7 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatErr
 from carlasc.storage.downloads import TransferSettings, archives, download, extraction
 
 VAL = "/val_cartesian.zip"
-QUICK = TransferSettings(connections=3, block_bytes=20_000, wait_s=0.01)
+QUICK = TransferSettings(connections=3, block_bytes=20_000, wait_s=0.001)
 MEMBERS = {f"Val/Town07_Light/cartesian/velodyne/{i:06d}.bin": 9_000 + 16 * i for i in range(20)}
 
 
@@ -64,6 +64,11 @@ def test_progress_ends_at_the_size_and_never_passes_it(site: Site, tmp_path: Pat
 
 def test_a_server_that_drops_every_connection_is_asked_again(site: Site, tmp_path: Path) -> None:
     site.drop_after = 7_001
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_tries_count_anew_after_each_byte_of_progress(site: Site, tmp_path: Path) -> None:
+    site.drop_after = 2_500  # eight connections per block, where six without progress are the last
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
 
 
