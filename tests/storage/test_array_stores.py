@@ -16,6 +16,7 @@ from carlasc.storage.packed.protocol import Options
 from carlasc.testing.data import SCANS, WHOLE
 
 h5py = pytest.importorskip("h5py")
+pytest.importorskip("hdf5plugin")
 
 
 def points_of(count: int, seed: int = 0) -> np.ndarray:
@@ -76,7 +77,7 @@ def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_pat
         assert set(file[SCANS]) == {"documents", "times"}
 
 
-@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")])
+@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "hdf5plugin"), ("parquet", "pyarrow")])
 def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
     tmp_path: Path, kind: str, package: str
 ) -> None:
@@ -100,3 +101,12 @@ def test_what_an_interrupted_run_left_of_a_sequence_is_removed(tmp_path: Path, k
     assert any("instances" in name for name in files_of(tmp_path))
     write(tmp_path / f"x.{kind}", [labels], None, "labels")
     assert not any("instances" in name for name in files_of(tmp_path))
+
+
+@pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])
+def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> None:
+    pytest.importorskip(package)
+    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(BARE)
+    writer.write("labels", 3, np.arange(3, dtype=np.uint32))
+    with pytest.raises(FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"):
+        writer.write("labels", 3, np.arange(3, dtype=np.uint32))

@@ -20,7 +20,7 @@ from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack, unpack
 
-PACKAGES = {"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}
+PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
 KINDS = [
     pytest.param(kind, marks=pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed"))
     for kind, name in PACKAGES.items()
@@ -107,6 +107,10 @@ def zarr_store(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return pack(data, tmp_path_factory.mktemp("zarr") / "x.zarr").out
 
 
+def take_completeness(root: dict[str, Any]) -> None:
+    del root["attributes"]["complete"]
+
+
 def change_type(root: dict[str, Any]) -> None:
     node(root, WHOLE)["attributes"]["type"] = "carlasc.field"
 
@@ -139,6 +143,7 @@ def remove_field(root: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (take_completeness, "expected a finished store, found one whose packing was interrupted"),
         (change_type, "expected the sequence that the store lists"),
         (remove_split, "expected the attribute split, found none: the store is damaged"),
         (change_kind, "expected a field of kind points, found 'values'"),
@@ -162,7 +167,7 @@ def test_wrong_metadata_are_one_clear_error(
 
 @pytest.fixture
 def hdf5_store(data: Path, tmp_path: Path) -> Path:
-    pytest.importorskip("h5py")
+    pytest.importorskip("hdf5plugin")
     return pack(data / "Train", tmp_path / "x.h5").out
 
 

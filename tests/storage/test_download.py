@@ -18,7 +18,7 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatErr
 from carlasc.storage.downloads import TransferSettings, archives, download, extraction
 
 VAL = "/val_cartesian.zip"
-QUICK = TransferSettings(connections=3, block_bytes=20_000, wait_s=0.01)
+QUICK = TransferSettings(connections=3, block_bytes=20_000, wait_s=0.001)
 MEMBERS = {f"Val/Town07_Light/cartesian/velodyne/{i:06d}.bin": 9_000 + 16 * i for i in range(20)}
 
 
@@ -47,7 +47,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_zip_comes_byte_for_byte_in_blocks_and_leaves_nothing_beside_it(site: Site, tmp_path: Path) -> None:
+def test_a_zip_is_fetched_byte_for_byte_in_blocks_and_nothing_else_is_left(site: Site, tmp_path: Path) -> None:
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
     assert names(tmp_path) == ["val_cartesian.zip"]
     assert len(site.requests) > 5
@@ -62,12 +62,17 @@ def test_progress_ends_at_the_size_and_never_passes_it(site: Site, tmp_path: Pat
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
-def test_a_server_that_drops_every_connection_is_outlasted(site: Site, tmp_path: Path) -> None:
+def test_a_server_that_drops_every_connection_is_asked_again(site: Site, tmp_path: Path) -> None:
     site.drop_after = 7_001
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
 
 
-def test_an_interrupted_download_goes_on_with_what_is_there(site: Site, tmp_path: Path) -> None:
+def test_tries_count_anew_after_each_byte_of_progress(site: Site, tmp_path: Path) -> None:
+    site.drop_after = 2_500  # eight connections per block, where six without progress are the last
+    assert get(site, tmp_path).read_bytes() == site.files[VAL]
+
+
+def test_an_interrupted_download_continues_with_the_bytes_that_it_has(site: Site, tmp_path: Path) -> None:
     def stop_at_a_third(done: int, total: int) -> None:
         if done > total / 3:
             raise KeyboardInterrupt
@@ -113,7 +118,7 @@ def test_a_file_that_changed_between_two_runs_is_not_mixed(site: Site, tmp_path:
 
 
 @pytest.mark.parametrize("size_too", [False, True])
-def test_a_file_that_changes_in_the_middle_is_begun_again(site: Site, tmp_path: Path, size_too: bool) -> None:
+def test_a_file_that_changes_during_the_download_is_fetched_again(site: Site, tmp_path: Path, size_too: bool) -> None:
     changed = make_zip(2, {**MEMBERS, "Val/more": 3_000} if size_too else None)
 
     def change(number: int) -> None:
@@ -134,7 +139,7 @@ def test_a_file_that_keeps_changing_is_given_up_with_one_line(site: Site, tmp_pa
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
-def test_a_server_that_knows_no_ranges_is_read_as_a_stream(site: Site, tmp_path: Path) -> None:
+def test_a_server_without_ranges_is_read_as_a_stream(site: Site, tmp_path: Path) -> None:
     site.ranges = False
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
 
@@ -166,7 +171,7 @@ def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path:
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
-def test_a_file_without_an_etag_comes_whole_and_is_not_resumed(site: Site, tmp_path: Path) -> None:
+def test_a_file_without_an_etag_is_fetched_whole_and_not_continued(site: Site, tmp_path: Path) -> None:
     site.etags = False
 
     def stop(done: int, total: int) -> None:
@@ -192,7 +197,7 @@ def test_a_redirect_is_followed_with_its_range(site: Site, tmp_path: Path) -> No
     assert all(site.requests)
 
 
-def test_a_page_in_place_of_the_zip_is_refused_at_the_first_look(site: Site, tmp_path: Path) -> None:
+def test_a_page_instead_of_the_zip_is_refused_at_the_first_request(site: Site, tmp_path: Path) -> None:
     site.files[VAL], site.content_type = b"<html>gone</html>" * 500, "text/html"
     with pytest.raises(FormatError, match="expected a zip, found text/html"):
         get(site, tmp_path)
@@ -205,7 +210,7 @@ def test_a_missing_file_is_one_line_with_its_address(site: Site, tmp_path: Path)
         get(site, tmp_path)
 
 
-def test_a_zip_that_is_there_is_not_fetched_again_and_another_is_not_overwritten(site: Site, tmp_path: Path) -> None:
+def test_an_existing_zip_is_not_fetched_again_and_another_is_not_overwritten(site: Site, tmp_path: Path) -> None:
     path = get(site, tmp_path)
     count = len(site.requests)
     get(site, tmp_path)
@@ -216,7 +221,7 @@ def test_a_zip_that_is_there_is_not_fetched_again_and_another_is_not_overwritten
     assert path.read_bytes() == b"mine"
 
 
-def test_too_little_room_is_told_before_anything_is_written(
+def test_too_little_free_space_is_an_error_before_anything_is_written(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
@@ -227,7 +232,7 @@ def test_too_little_room_is_told_before_anything_is_written(
     assert get(site, tmp_path).exists()
 
 
-def test_unpacking_gives_the_files_removes_the_zip_and_is_not_done_twice(site: Site, tmp_path: Path) -> None:
+def test_extracting_gives_the_files_removes_the_zip_and_is_not_done_twice(site: Site, tmp_path: Path) -> None:
     assert not get(site, tmp_path, extract=True).exists()
     with zipfile.ZipFile(io.BytesIO(site.files[VAL])) as archive:
         for name in MEMBERS:
@@ -238,11 +243,11 @@ def test_unpacking_gives_the_files_removes_the_zip_and_is_not_done_twice(site: S
     assert result.archives[0].files == len(MEMBERS)
 
 
-def test_unpacking_can_keep_the_zip(site: Site, tmp_path: Path) -> None:
+def test_extracting_can_keep_the_zip(site: Site, tmp_path: Path) -> None:
     assert get(site, tmp_path, extract=True, keep=True).exists()
 
 
-def test_grids_are_unpacked_beside_the_sequences_not_over_them(site: Site, tmp_path: Path) -> None:
+def test_grids_are_extracted_to_a_folder_of_their_own(site: Site, tmp_path: Path) -> None:
     member = "Val/Town07_Light/cartesian/evaluation/000000.bin"
     site.files["/eval_fine.zip"] = make_zip(3, {member: 64})
     download(tmp_path, what="fine", base_url=site.url, extract=True, settings=QUICK)
@@ -279,7 +284,7 @@ def test_a_damaged_member_is_named_and_not_left_half_written(tmp_path: Path) -> 
     assert names(tmp_path / "out") == ["a"]
 
 
-def test_unpacking_goes_on_after_an_interruption_and_refuses_foreign_files(tmp_path: Path) -> None:
+def test_extracting_continues_after_an_interruption_and_refuses_other_files(tmp_path: Path) -> None:
     path, out = tmp_path / "x.zip", tmp_path / "out"
     path.write_bytes(make_zip(0, {"a": 100, "b": 200}))
     extraction.extract_zip(path, out, lambda _: None)

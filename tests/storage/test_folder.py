@@ -70,12 +70,12 @@ def test_a_capture_without_grids_says_what_to_run(tmp_path: Path) -> None:
         FolderSource(tmp_path).sequences()
 
 
-def test_nothing_there_is_an_error(tmp_path: Path) -> None:
+def test_a_path_without_anything_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(MissingDataError, match="found nothing"):
         carlasc.open(tmp_path / "absent")
 
 
-def test_a_scan_cut_short_names_the_file_and_the_size(data: Path, tmp_path: Path) -> None:
+def test_a_truncated_scan_names_the_file_and_the_size(data: Path, tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     file = root / WHOLE / "velodyne" / "000005.bin"
     file.write_bytes(file.read_bytes()[:-3])

@@ -24,6 +24,9 @@ from carlasc.storage import FolderSink, FolderSource
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack, unpack
 
+for package in ("zarr", "h5py", "hdf5plugin", "pyarrow"):
+    pytest.importorskip(package)
+
 KINDS = ("zarr", "h5", "parquet")
 PATH = "Train/Town01_Light/cartesian"
 SIZE = (3, 5, 2)
@@ -114,7 +117,7 @@ def test_odd_shapes_and_every_bit_pattern_come_back(
 ) -> None:
     folder = tmp_path_factory.mktemp("odd")
     writer = FolderSink(folder / "data").sequence(PATH)
-    writer.write_document("poses.txt", poses)  # whatever stands there comes back, though no program could read it
+    writer.write_document("poses.txt", poses)  # any bytes come back, even if no program can read them
     for name, size in (("evaluation", SIZE), ("evaluation_6x10x4", (6, 10, 4))):
         if any(f"{name}/labels" in frame for frame in sequence):
             writer.write_document(f"{name}/params.json", params(size) + b"\n ")
@@ -151,7 +154,7 @@ def test_points_that_cannot_be_quantised_are_refused_by_name(tmp_path: Path, kin
         pack(tmp_path / "data", tmp_path / f"x.{kind}", lossy_mm=1)
 
 
-def test_the_result_counts_bytes_a_field_and_names_what_stays_behind(data: Path, tmp_path: Path) -> None:
+def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(data: Path, tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (root / PATH / "notes.txt").write_text("mine")
     steps: list[tuple[int, int]] = []
@@ -171,7 +174,7 @@ def test_the_result_counts_bytes_a_field_and_names_what_stays_behind(data: Path,
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_place_that_is_taken_is_refused_unless_it_may_be_overwritten(data: Path, tmp_path: Path, kind: str) -> None:
+def test_an_existing_store_is_replaced_only_with_overwrite(data: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / f"x.{kind}"
     pack(data / "Val", out)
     with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
@@ -182,7 +185,7 @@ def test_a_place_that_is_taken_is_refused_unless_it_may_be_overwritten(data: Pat
     assert [entry.name for entry in tmp_path.iterdir()] == [out.name]
 
 
-def test_unpacking_refuses_a_folder_that_is_there_unless_it_may_write_into_it(data: Path, tmp_path: Path) -> None:
+def test_an_existing_folder_is_unpacked_into_only_with_overwrite(data: Path, tmp_path: Path) -> None:
     pack(data / "Val", tmp_path / "x.zarr")
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "mine.txt").write_text("mine")
@@ -193,7 +196,7 @@ def test_unpacking_refuses_a_folder_that_is_there_unless_it_may_write_into_it(da
 
 
 @pytest.mark.parametrize("out", ["x.zarr", "Train/x.zarr", ".", ".."])
-def test_a_place_inside_or_around_the_source_is_refused(tmp_path: Path, out: str) -> None:
+def test_an_output_inside_or_around_the_source_is_refused(tmp_path: Path, out: str) -> None:
     data = write_dataset(tmp_path / "data")
     before = files_of(data)
     with pytest.raises((ConflictError, ArgumentError)):
@@ -221,7 +224,7 @@ def test_a_grid_whose_size_changes_is_an_error(tmp_path: Path, kind: str) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_place_that_cannot_be_written_is_one_clear_error(data: Path, tmp_path: Path, kind: str) -> None:
+def test_an_output_that_cannot_be_written_is_one_clear_error(data: Path, tmp_path: Path, kind: str) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(CarlascError, match=rf"x\.{kind}: cannot be written: (Not a directory|File exists)"):
         pack(data / "Val", tmp_path / "file" / f"x.{kind}")
@@ -277,7 +280,7 @@ def test_a_second_run_does_not_pack_finished_sequences_again(data: Path, tmp_pat
     assert (out / PATH / "scans" / "points" / "zarr.json").stat().st_mtime_ns == before
 
 
-def test_a_killed_unpack_goes_on_file_by_file(data: Path, tmp_path: Path) -> None:
+def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> None:
     pack(data, tmp_path / "x.zarr")
     subprocess.run([sys.executable, "-c", KILLED, "unpack", tmp_path / "x.zarr", tmp_path / "files", "20"], check=False)
     assert not (tmp_path / "files").exists()
@@ -298,7 +301,8 @@ def test_the_memory_does_not_grow_with_the_sequence(tmp_path: Path) -> None:
             writer.write("points", frame, points)
         command = [sys.executable, "-c", script, tmp_path / f"data{count}", tmp_path / f"x{count}.h5"]
         peaks.append(int(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
-    assert peaks[1] - peaks[0] < 40_000  # KiB, where there are 128,000 KiB more of files
+    unit = 1 if sys.platform == "darwin" else 1024
+    assert (peaks[1] - peaks[0]) * unit < 40 << 20  # bytes, where the files have 128 MB more
 
 
 runner = CliRunner()

@@ -22,9 +22,12 @@ from carlasc.storage.packing import pack
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 
+for package in ("aiohttp", "zarr", "h5py", "hdf5plugin", "pyarrow"):
+    pytest.importorskip(package)
+
 
 class RangeHandler(SimpleHTTPRequestHandler):
-    """Python's file server, with ranges, which counts what it sends."""
+    """Python's file server with support for ranges; it counts the bytes that it sends."""
 
     sent = 0
     ranges = True
@@ -142,9 +145,7 @@ class TestFileURL(SourceContract):
 
 
 @pytest.mark.parametrize("kind", ["folder", "zip", "zarr", "h5", "parquet"])
-def test_over_http_every_kind_reads_in_place_what_stands_there(
-    published: Path, site: tuple[Path, str, type[RangeHandler]], kind: str
-) -> None:
+def test_every_kind_is_read_over_http(published: Path, site: tuple[Path, str, type[RangeHandler]], kind: str) -> None:
     folder, url, _ = site
     if kind == "folder":
         write_dataset(folder / "data")
@@ -178,7 +179,7 @@ def test_a_member_of_a_zip_over_http_costs_its_own_bytes(
     assert before - start < 200_000  # the directory, and the end of the zip where it is looked for
 
 
-def test_a_server_without_ranges_is_told_apart_before_anything_is_fetched(
+def test_a_server_without_ranges_is_an_error_before_anything_is_fetched(
     published: Path, site: tuple[Path, str, type[RangeHandler]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, url, handler = site
@@ -193,7 +194,7 @@ def test_nothing_at_a_url_is_missing_data(site: tuple[Path, str, type[RangeHandl
         carlasc.open(f"{site[1]}/absent.zip")
 
 
-def test_a_server_that_is_not_there_is_one_clear_error() -> None:
+def test_a_server_that_does_not_answer_is_one_clear_error() -> None:
     with pytest.raises(CarlascError, match=r"127\.0\.0\.1:9/x\.zip: cannot be read"):
         carlasc.open("http://127.0.0.1:9/x.zip")
 
@@ -204,7 +205,7 @@ def test_an_unknown_scheme_is_one_clear_error() -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "zip", "zarr"])
-def test_s3_reads_what_stands_there(
+def test_every_kind_is_read_from_s3(
     published: Path, tmp_path: Path, bucket: tuple[str, dict[str, Any]], kind: str
 ) -> None:
     url, options = bucket
@@ -224,7 +225,7 @@ def test_s3_reads_what_stands_there(
     assert np.array_equal(sequence.poses, here.poses)
 
 
-def test_a_corrupted_chunk_far_away_names_field_and_frame(published: Path, tmp_path: Path) -> None:
+def test_a_corrupted_remote_chunk_names_field_and_frame(published: Path, tmp_path: Path) -> None:
     data = bytearray(pack(published, tmp_path / "x.h5").out.read_bytes())
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "x.h5") as file:

@@ -209,7 +209,7 @@ def test_a_second_run_keeps_finished_sequences_unless_it_packs_differently(tmp_p
     assert not ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1)).finished(SCANS)
 
 
-def test_overwriting_takes_a_store_but_no_other_folder(store: Path, tmp_path: Path) -> None:
+def test_overwrite_replaces_a_store_but_no_other_folder(store: Path, tmp_path: Path) -> None:
     with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
         ZarrSink(store)
     with ZarrSink(store, overwrite=True):

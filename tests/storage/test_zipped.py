@@ -75,7 +75,7 @@ def test_every_member_equals_what_zipfile_reads(archive: Path) -> None:
 
 
 @pytest.mark.parametrize("keep", [0.1, 0.5, 0.98])
-def test_a_truncated_zip_says_that_it_is_cut_short(archive: Path, keep: float) -> None:
+def test_a_truncated_zip_is_one_clear_error(archive: Path, keep: float) -> None:
     data = archive.read_bytes()
     archive.write_bytes(data[: int(len(data) * keep)])
     with pytest.raises(FormatError, match=r"data\.zip: .*truncated") as caught:
