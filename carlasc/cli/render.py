@@ -74,8 +74,8 @@ def render(
 ) -> None:
     """Draw a frame (PNG) or several frames (GIF, MP4): grids, scans, scene flow, predictions with ground truth and errors.
 
-    No screen and no GPU are needed. The camera is behind and above the ego vehicle and follows it. Without --frames, a picture shows the first
-    frame and a film shows all frames.
+    No screen and no GPU are needed. The camera is behind and above the ego vehicle and follows it.
+    Without --frames, a picture shows the first frame and a film shows all frames.
     """
     from carlasc import viewing
 

@@ -53,8 +53,8 @@ def view(
 ) -> None:
     """Show a sequence in a window (Open3D), or write it as a page that any browser opens without a network (--out).
 
-    Both can be turned and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes. Without --frames, a
-    window shows all frames and a page shows the first 60.
+    Both can be rotated and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes.
+    Without --frames, a window shows all frames and a page shows the first 60.
     """
     from carlasc import viewing
 

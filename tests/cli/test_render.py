@@ -2,11 +2,12 @@ import json
 
 import numpy as np
 import pytest
-from helpers.films import read_mp4
-from PIL import Image
+from helpers.films import Image, read_mp4
 from typer.testing import CliRunner
 
 from carlasc.cli import app
+
+pytest.importorskip("embreex")
 
 
 def call(*options):

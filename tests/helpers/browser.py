@@ -70,13 +70,13 @@ class Page:
 
     def picture(self, name: str | None = None) -> NDArray[np.uint8]:
         """Return a screenshot, (H, W, 3) uint8, and keep it as test-output/<name>.png if it has a name."""
-        from PIL import Image
+        image = pytest.importorskip("PIL.Image")
 
         png = self.browser.get_screenshot_as_png()
         if name is not None:
             OUTPUT.mkdir(exist_ok=True)
             (OUTPUT / f"{name}.png").write_bytes(png)
-        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+        return np.asarray(image.open(io.BytesIO(png)).convert("RGB"))
 
     def canvas(self, name: str | None = None) -> NDArray[np.uint8]:
         """Return the part of a screenshot that three.js draws."""

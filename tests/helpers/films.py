@@ -1,10 +1,12 @@
-"""Reading films."""
+"""Reading pictures and films. Test modules that import this are skipped if a package of the render extra is missing."""
 
 from __future__ import annotations
 
-import imageio_ffmpeg
 import numpy as np
-from PIL import Image
+import pytest
+
+Image = pytest.importorskip("PIL.Image")
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 
 def read_mp4(path):

@@ -12,6 +12,7 @@ from helpers.browser import OUTPUT
 from helpers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.screens import virtual_screen
 
+from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, DependencyError
 from carlasc.viewing import Scene, Window
 from carlasc.viewing.window.libraries import import_open3d
@@ -55,10 +56,8 @@ def drive_window(tmp_path, data, actions, truth=None):
 
 
 def keep(name, picture):
-    from PIL import Image
-
     OUTPUT.mkdir(exist_ok=True)
-    Image.fromarray(picture).save(OUTPUT / f"{name}.png")
+    pytest.importorskip("PIL.Image").fromarray(picture).save(OUTPUT / f"{name}.png")
 
 
 def test_keys_step_and_toggle_scan_grid_flow_and_classes(blocks, tmp_path):
@@ -202,3 +201,38 @@ def test_without_a_screen_the_window_says_what_to_do(blocks, monkeypatch):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(DependencyError, match=r"window: expected a screen, found no DISPLAY: .*`out=\"page.html\"`"):
         Window(Scene(blocks).open())
+
+
+def drawn_arrays(window):
+    """Return the (N, 3) arrays given to Open3D since the last call, and forget them."""
+    calls = window.o3d.utility.Vector3dVector.call_args_list
+    arrays = [call.args[0] for call in calls]
+    calls.clear()
+    return arrays
+
+
+def test_hidden_classes_hide_points_too_and_colours_are_those_of_the_table(blocks, open_window):
+    window, press, _ = open_window(blocks)
+    for key in "GFV":
+        press(key)
+    drawn_arrays(window)
+    press("P")
+    points, colors = drawn_arrays(window)
+    pedestrian, road = (np.array(CARLA.colors[label]) / 255 for label in (4, 7))
+    block = np.isclose(colors, pedestrian).all(1)
+    assert np.isclose(colors[~block], road).all() and 0 < block.sum() < len(block)
+    np.testing.assert_allclose(points[block].mean(0), (10, -5, 0), atol=0.2)  # Open3D's y points to the left
+    press("4", 1, 0)
+    _, colors = drawn_arrays(window)
+    assert np.isclose(colors, road).all()
+
+
+def test_arrows_point_along_the_flow(blocks, open_window):
+    window, press, _ = open_window(blocks)
+    for key in "GV":
+        press(key)
+    drawn_arrays(window)
+    press("P")
+    press("P")
+    vertices = drawn_arrays(window)[-2]
+    assert vertices[:, 0].min() > 9 and vertices[:, 0].max() == pytest.approx(20, abs=0.5)  # 10 m/s ahead, from x = 10

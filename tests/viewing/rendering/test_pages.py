@@ -8,6 +8,8 @@ from carlasc.errors import ArgumentError
 from carlasc.viewing.colors import ClassColors, Entry
 from carlasc.viewing.rendering.pages import draw_page, plan_page
 
+pytest.importorskip("PIL")
+
 ALL = ClassColors(CARLA).entries(range(23))
 MANY = ClassColors(SEMANTICKITTI).entries(SEMANTICKITTI.names)
 

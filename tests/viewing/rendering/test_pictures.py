@@ -22,6 +22,9 @@ from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import AFTER_CLASSES, ClassColors
 from carlasc.viewing.rendering.drawings import ego_vehicle, motion_arrows, scan_extent
 
+pytest.importorskip("PIL")
+pytest.importorskip("embreex")
+
 SIZE = (320, 180)
 PUBLISHED = [GridSpec.published(name) for name in ("cartesian", "cartesian_fine", "cylindrical")]
 views = pytest.mark.parametrize("view", ["perspective", "bev"])

@@ -2,10 +2,9 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.films import count_gif, read_mp4
+from helpers.films import Image, count_gif, read_mp4
 from helpers.pixels import BLUE, RED, blue_pixels, grid_with, middle_of, red_pixels
 from helpers.viewing import draw
-from PIL import Image
 
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
@@ -14,6 +13,8 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, Dependenc
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.storage.files import to_json
 from carlasc.viewing import Viewpoint, colorblind_palette
+
+pytest.importorskip("embreex")
 
 SIZE = (320, 180)
 COARSE = GridSpec.published("cartesian")
