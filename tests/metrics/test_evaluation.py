@@ -159,7 +159,8 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     pred, truth = folders
     with pytest.raises(FormatError, match="expected classes of semantickitti"):
         evaluate(pred, truth, remap="semantickitti19")
-    with pytest.raises(MissingDataError, match="expected ground truth for the sequence"):
+    found = "found Town10_Heavy/cartesian, Town10_Light/cartesian: give both sides from the same level"
+    with pytest.raises(MissingDataError, match=f"expected ground truth for the sequence '{SEQUENCES[0]}', {found}"):
         evaluate(pred, truth / "Test")
     with pytest.raises(MissingDataError, match="grid nothing"):
         evaluate(pred, truth, grid="nothing")
@@ -274,7 +275,9 @@ def test_sequences_of_different_classes_are_not_summed(world, tmp_path):
 def test_of_several_grids_one_is_to_be_named(world, tmp_path):
     for grid in ("evaluation_a", "evaluation_b"):
         write_grids(tmp_path, world[0], world[1], grid=grid)
-    with pytest.raises(MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose one with"):
+    with pytest.raises(
+        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose one with"
+    ):
         evaluate(tmp_path, tmp_path)
     assert evaluate(tmp_path, tmp_path, truth_grid="evaluation_b").miou > 0.9
 
