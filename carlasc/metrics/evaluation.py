@@ -145,8 +145,6 @@ class _Scorer:
         sides = self.pair.prediction, self.pair.truth
         prediction, truth = (side.labels(frame) for side in sides)
         source_place, truth_place = (f"{side.location}: frame {frame}" for side in sides)
-        if prediction.size != truth.size:
-            raise FormatError(source_place, expected=f"the truth's shape {truth.shape}", found=str(prediction.shape))
         counted = self._counted(truth, frame)
         prediction = self._to_scored(prediction, self.source_classes, source_place).reshape(-1)
         truth = self._to_scored(truth, self.truth_classes, truth_place).reshape(-1)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from carlasc.core.geometry import rotation_z
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.inspection.agreement import GridEvidence
 from carlasc.inspection.alignment import choose_pairs, diagnose_poses
@@ -88,12 +89,23 @@ def test_a_mistake_in_a_minority_of_frames_is_not_reported():
     points, labels, grid = scene()
     mirrored = points * [1, -1, 1]
     evidence = GridEvidence(SPEC)
-    for wrong in (True, True, False, False):
+    for wrong in (True, True, False, True, False):  # the mistake would be better on average, but not on three quarters
         evidence.add(mirrored if wrong else points, labels, grid)
     assert evidence.diagnose().mistake is None
-    for _ in range(6):
+    for _ in range(4):
         evidence.add(mirrored, labels, grid)
     assert "y mirrored" in evidence.diagnose().mistake
+
+
+@pytest.mark.parametrize(("part", "reported"), [(np.s_[:1], True), (np.s_[:1, :, :1], False)])
+def test_a_mistake_is_reported_from_one_percent_of_the_points(part, reported):
+    points, _, grid = scene(count=20_000)
+    labels = np.minimum(grid.labels, grid.labels[:, ::-1])  # y mirrored makes no difference,
+    labels[part] = grid.labels[part]  # but for this part: 5 %, or 0.8 % of the grid
+    cells, _ = SPEC.index(points)
+    result = diagnose(points * [1, -1, 1], labels[tuple(cells.T)], Grid(SPEC, labels, grid.counts), frames=4)
+    assert 0.9 < result.share < 0.999
+    assert (result.mistake is not None and "y mirrored" in result.mistake) is reported
 
 
 def walls(seed=0):
@@ -125,6 +137,22 @@ def test_an_offset_is_from_where_the_scan_fits_to_where_the_poses_put_it():
     result = diagnose_poses(structure_along(true, walls()), stored)
     assert result.correction is None
     assert result.offset_m == pytest.approx((0.0, 1.6, 0.0), abs=0.41)
+
+
+def bend(count):
+    """Return the poses of a drive round a bend, half a metre and 3 degrees per frame."""
+    motion = rotation_z(0.05)
+    motion[0, 3] = 0.5
+    return np.stack([np.linalg.matrix_power(motion, frame) for frame in range(count)])
+
+
+@pytest.mark.parametrize(("wrong", "reported"), [(40, False), (60, True)])
+def test_a_mistake_in_poses_is_reported_if_it_explains_three_quarters_of_the_pairs(wrong, reported):
+    true, mirror = bend(60), np.diag([1.0, -1, 1, 1])
+    stored = np.concatenate([mirror @ true[:wrong] @ mirror, true[wrong:]])
+    correction = diagnose_poses(structure_along(true, walls()), stored).correction
+    assert (correction is not None and correction.name == "poses with y mirrored against the scans") is reported
+    assert reported or correction is None
 
 
 def test_pairs_are_two_metres_apart_or_ten_frames():

@@ -159,7 +159,8 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     pred, truth = folders
     with pytest.raises(FormatError, match="expected classes of semantickitti"):
         evaluate(pred, truth, remap="semantickitti19")
-    with pytest.raises(MissingDataError, match="expected ground truth for the sequence"):
+    found = "found Town10_Heavy/cartesian, Town10_Light/cartesian: give both sides from the same level"
+    with pytest.raises(MissingDataError, match=f"expected ground truth for the sequence '{SEQUENCES[0]}', {found}"):
         evaluate(pred, truth / "Test")
     with pytest.raises(MissingDataError, match="grid nothing"):
         evaluate(pred, truth, grid="nothing")
