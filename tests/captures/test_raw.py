@@ -28,6 +28,13 @@ def test_the_golden_capture_is_read_as_the_format_says(golden_capture):
     assert capture.read_bev(100) == (golden_capture / "cartesian/bev/000000.jpg").read_bytes()
 
 
+def test_arrays_in_fortran_order_are_read(tmp_path):
+    capture = write_capture(tmp_path, frames=1)
+    points = capture.read(0, 100).scan.points
+    np.save(_npy(capture, "velodyne0"), np.asfortranarray(points))
+    assert np.array_equal(capture.read(0, 100).scan.points, points)
+
+
 def test_raw_itself_is_taken_as_well_as_the_folder_that_holds_it(tmp_path):
     write_capture(tmp_path, frames=1)
     assert Capture(tmp_path).raw == Capture(tmp_path / "raw").raw == tmp_path / "raw"

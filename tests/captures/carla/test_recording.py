@@ -2,6 +2,8 @@
 
 import io
 import json
+import queue
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import carla
 from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 
 from carlasc.captures import Capture, Lidar, ServerError, record
+from carlasc.captures.carla.sensors import ActorNumbers
 from carlasc.captures.carla.server import DETECTION, Server, decode_sweep
 from carlasc.captures.lidar import sensor_offsets
 from carlasc.cli import app
@@ -149,6 +152,23 @@ def test_an_actor_keeps_its_number_through_the_sequence_and_in_a_second_run(tmp_
     one, other = (Capture(tmp_path / name).read(2, 2) for name in ("one", "other"))
     assert np.array_equal(one.scan.instances, other.scan.instances)
     assert one.scan.instances.max() < 100
+
+
+def test_actors_are_numbered_in_the_order_in_which_they_were_spawned():
+    numbers = ActorNumbers([300, 205, 290])
+    assert numbers.of(np.array([290, 0, 300, 205, 300])).tolist() == [3, 0, 1, 2, 1]
+    assert numbers.of(np.array([999])).tolist() == [4]  # one that was spawned later
+    assert numbers.of(np.array([], np.uint32)).tolist() == []
+
+
+def test_a_measurement_of_another_tick_is_skipped_or_refused():
+    with Server("127.0.0.1", 2000, 0.1, FakeServer()) as server:
+        arrived = queue.Queue()
+        for tick in (4, 5, 7):
+            arrived.put(SimpleNamespace(frame=tick))
+        assert server.measurement(arrived, 5, "LiDAR 0").frame == 5
+        with pytest.raises(ServerError, match="expected tick 6 of LiDAR 0, found 7: check that no other client"):
+            server.measurement(arrived, 6, "LiDAR 0")
 
 
 def test_the_picture_from_above_has_the_published_size(tmp_path):

@@ -23,7 +23,7 @@ def test_a_ray_hits_the_nearest_triangle_at_its_exact_distance() -> None:
     rays, triangles, distances = scene.cast(np.array([0.0, 0.1, 0.2]), directions, 50.0)
     assert rays.tolist() == [0]
     assert mesh.labels[triangles].tolist() == [1]
-    np.testing.assert_allclose(distances, 9.0, atol=1e-6)
+    assert distances.tolist() == pytest.approx([9.0], abs=1e-6)
     assert np.abs(scene.normals(triangles)[0]).tolist() == [1.0, 0.0, 0.0]
 
 
@@ -40,7 +40,7 @@ def test_distances_do_not_depend_on_the_centre_of_the_scene() -> None:
     builder.boxes(1, (1010, 500, -1), (2, 2, 2))
     scene = RayScene(builder.build(), np.array([1000.0, 500.0, 0.0]))
     _, _, distances = scene.cast(np.array([1000.0, 500.1, 0.2]), np.array([[1.0, 0.0, 0.0]]), 50.0)
-    np.testing.assert_allclose(distances, 9.0, atol=1e-6)
+    assert distances.tolist() == pytest.approx([9.0], abs=1e-6)
 
 
 def test_the_exact_rotation_is_a_rotation() -> None:
