@@ -64,7 +64,11 @@ def test_failed_frames_are_listed_and_the_exit_code_is_1(source, tmp_path):
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (("--res", "0.2", "--grids", "none"), 2, "--grids: expected scans, because options of the grid are given, found none"),
+        (
+            ("--res", "0.2", "--grids", "none"),
+            2,
+            "--grids: expected scans, because options of the grid are given, found none",
+        ),
         (("--classes", "poss"), 2, "--classes: expected one of carla, semantickitti"),
         (("--sequences", "05"), 1, "expected the sequences 05, found only 00"),
         (("--preset", "coarse", "--res", "0.2"), 2, "expected one of --res, --size and --preset"),
