@@ -8,13 +8,11 @@ from carlasc.errors import ConflictError
 
 
 def check_outside(out: Path, source: str) -> None:
-    """Check that a folder to write to is not the source, and not inside it. A source behind a URL is never local.
+    """Check that a folder to write to is not the source, and not inside it. A URL is never the same place.
 
     Raises:
         ConflictError: it is.
     """
-    if "://" in source:
-        return
     target, origin = out.resolve(), Path(source).resolve()
     if target.is_relative_to(origin):
         raise ConflictError(

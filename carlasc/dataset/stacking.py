@@ -32,16 +32,16 @@ def stack_scans(
     """Bin scans into a stack of grids.
 
     Args:
-        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, rows or the transpose of contiguous x, y and z;
-            None leaves its grid empty.
+        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, as rows or as the transpose of contiguous
+            x, y and z; None gives an empty grid.
         grid_T_scans: (T, 4, 4) transforms from each scan's frame to the grid's.
         spec: the grid.
-        what: "occupancy" marks voxels that hold a point, "density" counts their points (65535 at most).
+        what: "occupancy" marks voxels that hold a point, "density" counts the points of each voxel (at most 65535).
         min_range_m: points nearer to their own sensor are left out; None keeps all.
         max_range_m: points farther from it are left out; None keeps all.
 
     Returns:
-        (T, X, Y, Z) uint8 0 or 1, or uint16 points a voxel.
+        (T, X, Y, Z) uint8 0 or 1, or uint16 number of points per voxel.
     """
     stack = np.zeros((len(scans), *spec.size), np.uint8 if what == "occupancy" else np.uint16)
     cells, geometry = Cells.of(spec), _geometry(spec)

@@ -95,7 +95,7 @@ def open_split(source: str | Path, split: str | list[str], config: Config, *, tr
             raise ArgumentError(
                 "remap",
                 expected=f"one for data with the classes {data.classes.name}",
-                found=config.remap,
+                found="semantickitti19",
                 advice="set remap=carlasc11 for CarlaSC's classes",
             )
         data.classes = SEMANTICKITTI19

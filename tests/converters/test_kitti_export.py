@@ -202,3 +202,66 @@ def test_tiny_round_trip_of_several_sequences(tmp_path):
             )
             assert before == after
     assert carlasc.open(tmp_path / "middle").sequences().keys() == {SEQUENCE, "Val/KITTI_08/cartesian"}
+
+
+def test_frames_are_written_again_only_if_asked_for(tmp_path):
+    write_carlasc(tmp_path / "in")
+    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    scan = tmp_path / "out" / "sequences" / "00" / "velodyne" / "000000.bin"
+    written = scan.read_bytes()
+    scan.write_bytes(b"changed")
+    assert export("kitti", tmp_path / "in", tmp_path / "out", workers=1).made == 0
+    assert scan.read_bytes() == b"changed"
+    assert export("kitti", tmp_path / "in", tmp_path / "out", overwrite=True, workers=1).made == 1
+    assert scan.read_bytes() == written
+
+
+def test_points_out_of_range_are_in_no_voxel(tmp_path):
+    points, _, _ = write_carlasc(tmp_path / "in")
+    ranges = {"frame": "carlasc", "classes": "carla", "min_range_m": 2.0, "max_range_m": 4.0}
+    (tmp_path / "in" / "Val/Town07_Light/cartesian/carlasc.json").write_bytes(to_json(ranges))
+    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    index = SPEC.flat_index(points[(distance >= 2) & (distance <= 4), :3] * [1, -1, 1])
+    expected = np.zeros(SPEC.num_voxels, bool)
+    expected[index[index >= 0]] = True
+    path = tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.bin"
+    assert np.array_equal(unpack_bits(path.read_bytes(), SPEC.size, "bin").reshape(-1), expected)
+
+
+def test_the_finest_grid_is_taken_and_a_cylindrical_one_is_refused(tmp_path):
+    write_carlasc(tmp_path / "in")
+    writer = FolderSink(tmp_path / "in").sequence("Val/Town07_Light/cartesian")
+    coarse = SPEC.with_size((5, 4, 5))
+    writer.write_document("coarse/params.json", to_json(coarse.to_params()))
+    writer.write("coarse/labels", 0, np.zeros(coarse.size, np.uint32))
+    writer.write("coarse/counts", 0, np.ones(coarse.size, np.float32))
+    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    labels = tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.label"
+    assert labels.stat().st_size == 2 * SPEC.num_voxels
+    round_ = GridSpec("cylindrical", (4, 4, 2), (0.0, -3.0, -2.0), (8.0, 3.0, 0.5))
+    writer.write_document("round/params.json", to_json(round_.to_params()))
+    with pytest.raises(ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"):
+        export("kitti", tmp_path / "in", tmp_path / "other", grid="round", workers=1)
+
+
+def test_a_grid_that_is_named_is_exported_instead_of_the_original_voxels(tmp_path):
+    write_tiny_kitti(tmp_path / "in", frames=1, voxels=True)
+    options = {"classes": "semantickitti", "axes": "right", "grids": "voxels", "flow": "none", "workers": 1}
+    convert("kitti", tmp_path / "in", tmp_path / "middle", **options)
+    export("kitti", tmp_path / "middle", tmp_path / "out", grid="evaluation_256x256x32", workers=1)
+    before, after = (tmp_path / side / "sequences" / "00" / "voxels" for side in ("in", "out"))
+    size = (256, 256, 32)
+    labels = np.fromfile(after / "000000.label", "<u2").reshape(size)
+    occluded = unpack_bits((after / "000000.occluded").read_bytes(), size, "occluded")
+    assert occluded[labels > 0].all()
+    assert (before / "000000.occluded").read_bytes() != (after / "000000.occluded").read_bytes()
+
+
+@pytest.mark.parametrize("order", [("cartesian", "cylindrical"), ("cylindrical", "cartesian")])
+def test_of_two_coordinates_the_cartesian_sequence_is_exported(tmp_path, order):
+    for coordinates in order:
+        writer = FolderSink(tmp_path / "in").sequence(f"Val/Town07_Light/{coordinates}")
+        writer.write("points", 0, np.ones((1, 4), np.float32))
+    result = export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    assert list(result.sequences) == ["Val/Town07_Light/cartesian"]

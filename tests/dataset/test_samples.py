@@ -486,3 +486,34 @@ def test_an_empty_scan_is_an_empty_grid(tmp_path):
 
 def test_open_source_objects_and_paths_give_the_same(world):
     assert repr(Dataset(carlasc.storage.open(world), "val")) == repr(Dataset(world, "val"))
+
+
+def test_negative_indices_count_from_the_end_and_others_are_out_of_range(world):
+    dataset = Dataset(world, "val", fields=("points",))
+    assert [dataset[index]["frame"] for index in (-3, -1, 2)] == [0, 2, 2]
+    for index in (-4, 3):
+        with pytest.raises(IndexError, match=f"sample {index} is out of range: there are 3 samples"):
+            dataset[index]
+
+
+def test_a_pickled_dataset_leaves_its_decoded_scans_behind(world):
+    dataset = Dataset(world, "val", history=3)
+    small = len(pickle.dumps(dataset))
+    expected = dataset[2]["occupancy"]
+    again = pickle.dumps(dataset)
+    assert len(again) <= small + 1000
+    np.testing.assert_array_equal(pickle.loads(again)[2]["occupancy"], expected)
+
+
+def test_a_mirrored_pose_is_no_rigid_transform(tmp_path):
+    folder = write_drive(tmp_path / "A" / "cartesian", range(3), spec=SMALL)
+    poses = bend(3)
+    poses[1, :, 1] *= -1
+    (folder / "poses.txt").write_bytes(layout.encode_poses(poses))
+    expect(FormatError, "poses.txt, line 2: expected a rigid transform", tmp_path, history=2)
+
+
+@pytest.mark.parametrize("remap", [[0.5, 1.0], {0: -1}, [0, -2]])
+def test_remaps_of_fractions_or_negative_ids_are_refused(world, remap):
+    with pytest.raises(ArgumentError, match="remap: expected"):
+        Dataset(world, remap=remap)

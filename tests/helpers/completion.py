@@ -1,4 +1,4 @@
-"""A tiny data set for the example networks: random scans, and grids that follow from them."""
+"""A tiny data set for the example networks: random scans, and grids made from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CLASSES = (1, 7, 8, 10)  # CARLA: building, road, sidewalk, vehicle
 def write_split(
     root: Path, split: str, sequences: list[str], frames: int, seed: int = 0, classes=CLASSES, table="carla"
 ) -> None:
-    """Write sequences whose voxels take their class from the quarter they lie in, where there is a point, else free."""
+    """Write sequences. A voxel with a point has the class of its quarter of the grid; all others are free."""
     rng = np.random.default_rng(seed)
     quarter = np.array(classes)[2 * (np.arange(16) >= 8)[:, None] + (np.arange(16) >= 8)[None, :]]
     for name in sequences:

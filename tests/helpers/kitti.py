@@ -1,6 +1,6 @@
 """Small SemanticKITTI data sets made of a simulated drive: right-handed, camera-frame poses, moving classes, instances, voxels.
 
-Nothing here uses the converter: files are written as FORMAT section 6 describes them.
+Nothing here uses the converter: files are written as the format page describes them (docs/format.md#semantickitti).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ CAMERA_T_LIDAR = (
 
 @dataclass(frozen=True)
 class KittiTruth:
-    """What is known of a written sequence.
+    """The truth of a written sequence.
 
     Attributes:
         folder: the sequence's folder.
-        frames: its frame numbers: those of the drive count from the first one.
+        frames: its frame numbers, from 0 for the first frame of the drive.
         poses: (F, 4, 4) first_T_lidar, right-handed, by frame number.
         flow: (N, 3) m/s of each point by frame, right-handed sensor frame, zero for actors that never move.
     """
@@ -62,7 +62,7 @@ def write_kitti(
         frames: frames of the drive; they are renumbered from 0.
         sequence: its number.
         labels: whether labels and voxels are written.
-        voxels_every: voxels stand for every so manyth frame, 0 for none.
+        voxels_every: every N-th frame gets voxels; 0 for none.
         odometry: poses go to `root/poses/<sequence>.txt`, as in KITTI odometry.
     """
     folder = root / "sequences" / sequence
@@ -97,7 +97,7 @@ def write_kitti(
 
 
 def kitti_classes(labels: NDArray[np.unsignedinteger], moves: NDArray[np.bool_]) -> NDArray[np.uint32]:
-    """Return SemanticKITTI's classes of CARLA's; what moves has a moving class."""
+    """Return SemanticKITTI's classes for CARLA's; points of moving actors get a moving class."""
     classes = REMAPS["carla_to_semantickitti"](labels).astype(np.uint32)
     for standing, moving in MOVING_CLASS.items():
         classes[(classes == standing) & moves] = moving
@@ -137,7 +137,7 @@ def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes:
 
 
 def _movers(drive: Drive, frames: range) -> set[int]:
-    """Actors that move at some time of the drive: SemanticKITTI calls these moving all the time."""
+    """Return the actors that move at some time of the drive: they have a moving class in all frames."""
     return {
         actor.id for frame in frames for actor in drive.actors(frame) if float(np.square(actor.velocity).sum()) > 0.1**2
     }

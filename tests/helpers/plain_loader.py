@@ -1,6 +1,6 @@
-"""The plain NumPy loader that `carlasc.Dataset` is measured against and must agree with: (N, 3) float64 rows, step by step.
+"""A plain NumPy loader, with which `carlasc.Dataset` must agree and whose speed it is compared with.
 
-Written from FORMAT section 5. It reads the published layout straight from the folder.
+Written from the format page (docs/format.md#training-samples), on (N, 3) float64 rows. It reads the published layout from the folder.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""SemanticKITTI data sets of a few random points: for what does not depend on what a scan shows."""
+"""SemanticKITTI data sets of a few random points, for tests that do not depend on the content of a scan."""
 
 from __future__ import annotations
 
