@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from carlasc.errors import ArgumentError, FormatError
 
 Variant = Literal["standard", "pasco"]
+_SLOTS = 256  # of the tables of latest segments and pairs; a power of two
 _MATCH = 0.5  # more than half of the union in common: at most one segment can have that, so matching needs no search
 
 
@@ -127,15 +129,12 @@ class PanopticQuality:
         counted = None if mask is None else np.asarray(mask, np.bool_).reshape(-1)
         if counted is not None:
             sides = [(classes[counted], ids[counted]) for classes, ids in sides]
-        is_thing = np.zeros(self.num_classes, np.bool_)
-        is_thing[sorted(self.things)] = True
         for name, (classes, _) in zip(("prediction", "truth"), sides, strict=True):
             if len(classes) and (classes.min() < 0 or classes.max() >= self.num_classes):
                 raise FormatError(
                     name, expected=f"class ids 0..{self.num_classes - 1}", found=f"{classes.min()} to {classes.max()}"
                 )
-        pred, true = ((classes, np.where(is_thing[classes], ids, 0)) for classes, ids in sides)
-        self.add(match_segments(pred, true, free=self.free))
+        self.add(match_segments(*sides, things=self.things, free=self.free))
         return self
 
     def add(self, segments: Segments, *, fewest: int = 0) -> None:
@@ -194,6 +193,7 @@ def match_segments(
     prediction: tuple[NDArray[Any], NDArray[Any]],
     truth: tuple[NDArray[Any], NDArray[Any]],
     *,
+    things: Collection[int] | None = None,
     overlap: NDArray[np.bool_] | None = None,
     free: int = 0,
 ) -> Segments:
@@ -202,68 +202,77 @@ def match_segments(
     Args:
         prediction: (N,) class ids and (N,) instance ids; equal pairs are one segment.
         truth: likewise.
+        things: classes whose instances are apart; all elements of another class are one segment. None: all classes are things.
         overlap: (N,) bool: elements that may be in common; all of them if None.
         free: class of elements without a segment.
 
     Returns:
         The segments; those of the free class are left out.
     """
-    keys = [(np.asarray(classes, np.int64) << 32) | np.asarray(ids, np.int64) for classes, ids in (prediction, truth)]
-    used = [np.asarray(classes) != free for classes, _ in (prediction, truth)]
-    pred_keys, pred_size, true_keys, true_size, overlaps = _match(
-        keys[0], keys[1], used[0], used[1], np.ones(len(keys[0]), np.bool_) if overlap is None else overlap
-    )
+    sides = [np.ascontiguousarray(array).reshape(-1) for side in (prediction, truth) for array in side]
+    may_overlap = np.ones(1, np.bool_) if overlap is None else overlap
+    is_thing = np.ones(1, np.bool_)
+    if things is not None:
+        is_thing = np.zeros(1 + max((int(side.max(initial=0)) for side in sides[::2]), default=0), np.bool_)
+        is_thing[[thing for thing in things if thing < len(is_thing)]] = True
+    pred_keys, pred_size, true_keys, true_size, overlaps = _match(*sides, is_thing, may_overlap, free)
     same = pred_keys[overlaps[:, 0]] >> 32 == true_keys[overlaps[:, 1]] >> 32
     return Segments(pred_keys >> 32, pred_size, true_keys >> 32, true_size, overlaps[same])
 
 
 @numba.njit(cache=True, nogil=True)
-def _match(pred, true, has_pred, has_true, may_overlap):  # type: ignore[no-untyped-def]
-    """Number the segments of both sides in the order in which they occur, and count elements and overlaps, in one pass."""
-    pred_numbers = {np.int64(-1): np.int64(-1)}
-    true_numbers = {np.int64(-1): np.int64(-1)}
+def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
+    """Number the segments of both sides in the order in which they occur, and count elements and overlaps, in one pass.
+
+    Few segments take turns along a row. Small tables of the latest ones, at a place that the key gives, spare most look-ups.
+    """
+    numbers = {np.int64(-1): np.int64(-1)}  # side and key -> number
+    keys = [[np.int64(0) for _ in range(0)] for _ in range(2)]
+    sizes = [[np.int64(0) for _ in range(0)] for _ in range(2)]
+    latest, latest_number = np.full((2, _SLOTS), -1, np.int64), np.zeros((2, _SLOTS), np.int64)
     pairs = {np.int64(-1): np.int64(0)}
-    pred_keys, true_keys = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
-    pred_sizes, true_sizes = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
-    last_pred, last_true, p, t = np.int64(-2), np.int64(-2), np.int64(-1), np.int64(-1)
-    last_pair, run = np.int64(-1), np.int64(0)
-    for n in range(len(pred)):
-        if not has_pred[n] and not has_true[n]:
+    open_pairs, open_counts = np.full(_SLOTS, -1, np.int64), np.zeros(_SLOTS, np.int64)
+    number = np.zeros(2, np.int64)
+    everywhere, all_things = len(may_overlap) == 1, len(is_thing) == 1 and is_thing[0]
+    for n in range(len(pred_class)):
+        has_pred, has_true = pred_class[n] != free, true_class[n] != free
+        if not has_pred and not has_true:
             continue  # most elements are free on both sides
-        if has_pred[n]:
-            if pred[n] != last_pred:  # neighbours are mostly of one segment: ask the table only where it changes
-                last_pred = pred[n]
-                if last_pred not in pred_numbers:
-                    pred_numbers[last_pred] = np.int64(len(pred_keys))
-                    pred_keys.append(last_pred)
-                    pred_sizes.append(np.int64(0))
-                p = pred_numbers[last_pred]
-            pred_sizes[p] += 1
-        if has_true[n]:
-            if true[n] != last_true:
-                last_true = true[n]
-                if last_true not in true_numbers:
-                    true_numbers[last_true] = np.int64(len(true_keys))
-                    true_keys.append(last_true)
-                    true_sizes.append(np.int64(0))
-                t = true_numbers[last_true]
-            true_sizes[t] += 1
-        if has_pred[n] and has_true[n] and may_overlap[n]:
-            pair = p << 32 | t
-            if pair != last_pair:
-                if run:
-                    pairs[last_pair] = pairs.get(last_pair, np.int64(0)) + run
-                last_pair, run = pair, np.int64(0)
-            run += 1
-    if run:
-        pairs[last_pair] = pairs.get(last_pair, np.int64(0)) + run
+        for side in range(2):
+            if not (has_pred if side == 0 else has_true):
+                continue
+            one, other = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
+            key = np.int64(one) << 32
+            if all_things or is_thing[one]:
+                key |= np.int64(other)
+            slot = (key ^ key >> 32) & (_SLOTS - 1)
+            if latest[side, slot] != key:
+                place = key << 1 | side
+                if place not in numbers:
+                    numbers[place] = np.int64(len(keys[side]))
+                    keys[side].append(key)
+                    sizes[side].append(np.int64(0))
+                latest[side, slot], latest_number[side, slot] = key, numbers[place]
+            number[side] = latest_number[side, slot]
+            sizes[side][number[side]] += 1
+        if has_pred and has_true and (everywhere or may_overlap[n]):
+            pair = number[0] << 32 | number[1]
+            slot = (number[0] + 7 * number[1]) & (_SLOTS - 1)
+            if open_pairs[slot] != pair:
+                if open_pairs[slot] >= 0:
+                    pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
+                open_pairs[slot], open_counts[slot] = pair, 0
+            open_counts[slot] += 1
+    for slot in range(_SLOTS):
+        if open_pairs[slot] >= 0:
+            pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
     overlaps = np.empty((len(pairs) - 1, 3), np.int64)
     row = 0
     for pair, count in pairs.items():
         if pair >= 0:
             overlaps[row, 0], overlaps[row, 1], overlaps[row, 2] = pair >> 32, pair & 0xFFFFFFFF, count
             row += 1
-    return np.array(pred_keys), np.array(pred_sizes), np.array(true_keys), np.array(true_sizes), overlaps
+    return np.array(keys[0]), np.array(sizes[0]), np.array(keys[1]), np.array(sizes[1]), overlaps
 
 
 def _ratio(numerator: ArrayLike, denominator: ArrayLike) -> NDArray[np.float64]:
