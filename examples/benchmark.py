@@ -185,7 +185,7 @@ def main(
             figures = {
                 "size": size,
                 "device": _describe(processes),
-                "results": [result.figures() for runs in results.values() for result in runs],
+                "results": [result.to_dict() for runs in results.values() for result in runs],
             }
             networks = results.pop("")
             print_tables([semantic_table(networks), geometric_table(networks), *average_seeds(results)])

@@ -35,7 +35,7 @@ def score_towns(
     spec = spec.with_bounds((*spec.lower[:2], low), (*spec.upper[:2], high))
     build_towns(out, TOWNS[::every], frames=1, sensors=20, spec=spec, workers=workers)
     predict_dataset(Model.read(weights), str(out), None, torch.device("cpu"), "eager")
-    return evaluate(out, out, pred_grid="completion", name=weights.name)
+    return evaluate(out, out, grid="completion", name=weights.name)
 
 
 def main(

@@ -1,4 +1,4 @@
-"""What every command shares: errors to exit codes, progress, figures as JSON, and the parsing of small values."""
+"""What all commands share: exit codes for errors, progress, figures as JSON, and the parsing of small values."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -20,77 +20,99 @@ from carlasc.errors import ArgumentError, CarlascError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from carlasc.core.frames import FrameRange
+else:
+    FrameRange = object  # only an annotation here: importing it loads NumPy, for which `--help` would wait
+
 _Number = TypeVar("_Number", int, float)
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
-_ARGUMENT = re.compile(
-    r"`(\w+)(?:=([^`]+))?`"
-)  # how the library's errors name an argument: `workers`, `overwrite=True`
+_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
 
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
-Workers = Annotated[int | None, typer.Option(help="Processes that work side by side; all cores if not given.", min=1)]
+Workers = Annotated[
+    int | None, typer.Option(help="Processes that work side by side; if not given, one per core.", min=1)
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
 
 
 class CommandGroup(TyperGroup):
-    """Turns the library's errors into one line on stderr and an honest exit code."""
+    """Turns errors of the library into one line on stderr and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command: 1 where the work failed, 2 where an argument made no sense, 130 where it was interrupted."""
+        """Run a command. Exit codes: 1 if the work failed, 2 for a wrong argument, 130 if it was interrupted."""
         try:
             return super().invoke(ctx)
-        except ArgumentError as error:
-            fail(str(self._with_options(ctx, error)), WRONG_USAGE)
         except CarlascError as error:
-            fail(str(self._with_options(ctx, error)))
+            options, shown = self._options(ctx), copy.copy(error)
+            shown.where = options.get(error.where, error.where)
+            message = _replace_arguments(str(shown), options)
+            fail(message, WRONG_USAGE if isinstance(error, ArgumentError) else FAILED)
+        except _BatchError as error:
+            for message in error.messages:
+                typer.echo(f"carlasc: {_replace_arguments(message, self._options(ctx))}", err=True)
+            fail(str(error))
         except KeyboardInterrupt:
-            fail("interrupted: what is written is whole; run the same command again to go on", INTERRUPTED)
+            fail("interrupted: files written so far are complete; run the same command again to go on", INTERRUPTED)
         except BrokenPipeError:  # `carlasc info | head`
             sys.stderr.close()
             raise typer.Exit(FAILED) from None
 
-    def _with_options(self, ctx: Any, error: CarlascError) -> CarlascError:
-        """Return an error of the library with the command's options for the names of arguments: `--window` for window."""
+    def _options(self, ctx: Any) -> dict[str, str]:
+        """Return what a user types for each parameter of the command that runs, by its name."""
         command = self.commands.get(ctx.invoked_subcommand or "")
-        options = {} if command is None else {p.name: option_of(p) for p in command.params if p.name}
-        changed = copy.copy(error)
-        changed.where = options.get(error.where, error.where)
-        for part in ("problem", "expected", "found", "advice"):
-            setattr(changed, part, _ARGUMENT.sub(lambda match: _as_option(match, options), getattr(error, part)))
-        return changed
+        return {} if command is None else {p.name: _typed(p) for p in command.params if p.name}
 
 
-def option_of(parameter: Any) -> str:
-    """Return what a user types for a parameter of a command: `--frames`, or `SOURCE`."""
+def _typed(parameter: Any) -> str:
+    """Return what a user types for a parameter: `--frames`, or `SOURCE`."""
     longest = max(parameter.opts, key=len)
     return longest if longest.startswith("-") else (parameter.metavar or longest).upper()
 
 
-def _as_option(match: re.Match[str], options: Mapping[str, str]) -> str:
-    name, value = match[1], match[2]
-    if name not in options:
-        return match[0]
-    return f"`{options[name]}`" if value in ("True", None) else f"`{options[name]} {value.strip(chr(34))}`"
+def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
+    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite` ``, where there is such an option."""
+
+    def replace(match: re.Match[str]) -> str:
+        name, value = match[1], match[2]
+        if name not in options:
+            return match[0]
+        return f"`{options[name]}`" if value in ("True", None) else f"`{options[name]} {value.strip(chr(34))}`"
+
+    return _ARGUMENT.sub(replace, text)
 
 
 def fail(message: str, code: int = FAILED) -> None:
-    """Print one line on stderr and leave with an exit code."""
+    """Print one line on stderr and end the command with an exit code."""
     typer.echo(f"carlasc: {message}", err=True)
     raise typer.Exit(code)
 
 
-def report_failures(failures: list[tuple[Any, str]], total: int, what: str = "frames") -> None:
-    """List what a batch could not do, and exit 1 if there was anything."""
+class _BatchError(Exception):
+    """Parts of a batch failed; `messages` say which and why."""
+
+    def __init__(self, summary: str, messages: list[str]) -> None:
+        super().__init__(summary)
+        self.messages = messages
+
+
+def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str = "frames") -> None:
+    """End the command with exit code 1, and with what failed on stderr, if anything in a batch failed.
+
+    Args:
+        failures: (what failed, message) of each.
+        total: how many were tried.
+        what: what they are called.
+    """
     if failures:
-        for _, message in failures:
-            typer.echo(f"carlasc: {message}", err=True)
-        fail(f"{len(failures)} of {total} {what} failed; the others are done: fix these and run again")
+        summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
+        raise _BatchError(summary, [message for _, message in failures])
 
 
 @contextmanager
 def progress_bar(description: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on stderr while the block runs; it is quiet where there is no terminal.
+    """Show a progress bar on stderr while the block runs, if stderr is a terminal.
 
     Yields:
         A callback of (done, total) for the library's `progress` arguments.
@@ -120,14 +142,14 @@ def progress_bar(description: str, unit: str = "frames") -> Iterator[Callable[[i
 
 
 def console() -> Console:
-    """Return the console of stdout; tables are as wide as they need where it is no terminal."""
+    """Return the console of stdout; 160 characters wide if it is not a terminal."""
     from rich.console import Console
 
     return Console() if sys.stdout.isatty() else Console(width=160)
 
 
 def print_json(value: Any) -> None:
-    """Print a result as JSON: dataclasses, paths and NumPy values included."""
+    """Print a result as JSON; it may hold dataclasses, paths and NumPy values."""
     typer.echo(json.dumps(value, indent=2, default=_plain))
 
 
@@ -135,7 +157,7 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     """Read "a,b,c".
 
     Raises:
-        ArgumentError: not numbers, or not as many as one of `counts`.
+        ArgumentError: these are not numbers, or their number is not one of `counts`.
     """
     try:
         values = tuple(kind(part) for part in text.split(","))
@@ -144,7 +166,7 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     if len(values) not in counts:
         wanted = " or ".join(map(str, counts))
         raise ArgumentError(
-            option, expected=f"{wanted} {'whole ' if kind is int else ''}numbers with commas between", found=f"{text!r}"
+            option, expected=f"{wanted} {'whole ' if kind is int else ''}numbers with commas between", found=repr(text)
         )
     return values
 
@@ -153,20 +175,28 @@ def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
     """Read a half-open range of frame numbers: "A:B", "A:", ":B", or one frame "A".
 
     Raises:
-        ArgumentError: it is no range.
+        ArgumentError: it is not a range.
     """
-    if text is None:
-        return None
-    first, colon, last = text.partition(":")
-    try:
-        start, stop = int(first) if first else None, int(last) if last else None
-    except ValueError:
-        raise ArgumentError("--frames", expected="A:B, A:, :B or a frame number", found=f"{text!r}") from None
-    if not colon:
-        return start, None if start is None else start + 1
-    if start is not None and stop is not None and start >= stop:
-        raise ArgumentError("--frames", expected="a range that holds a frame", found=f"{text!r}")
-    return start, stop
+    frames = _read_frames(text)
+    return None if frames is None else (frames.start, frames.stop)
+
+
+def _read_frames(text: str | None) -> FrameRange | None:
+    from carlasc.core.frames import FrameRange
+
+    return None if text is None else FrameRange.parse(text)
+
+
+FramesOption = Annotated[  # a parser's ValueError would become typer's message; that of a callback keeps its own
+    FrameRange | None,
+    typer.Option(
+        "--frames",
+        metavar="A:B",
+        help="Only frames A to B, B not included; A:, :B and a single frame A are allowed too.",
+        parser=str,
+        callback=_read_frames,
+    ),
+]
 
 
 def _plain(value: Any) -> Any:

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 
 def info(
-    path: Annotated[
+    source: Annotated[
         str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, a capture, or a URL.")
     ] = ".",
     as_json: Json = False,
 ) -> None:
-    """Say what is there: splits, sequences, frames, fields, grids and how they were made. No frame is read."""
+    """List what a data set holds: splits, sequences, frames, fields, grids and how they were made. No frame is read."""
     from carlasc.inspection.overview import info as look
 
-    overview = look(path)
+    overview = look(source)
     if as_json:
         print_json(overview.to_dict())
     else:
@@ -29,21 +29,22 @@ def info(
 
 
 def _print(overview: Overview) -> None:
-    from rich.table import Table
+    from carlasc.cli.tables import print_table
 
     out = console()
     splits = ", ".join(f"{name} {count}" for name, count in overview.splits.items())
     out.print(f"[bold]{overview.location}[/bold]: {overview.level} ({overview.store})", highlight=False)
     if overview.sequences:
-        out.print(f"{len(overview.sequences)} sequences: {splits}{_size(overview.bytes)}", highlight=False)
-        table = Table("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Frame", "Classes", "About")
-        for sequence in overview.sequences:
-            table.add_row(*_row(sequence))
-        out.print(table)
+        size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
+        out.print(f"{len(overview.sequences)} sequences: {splits}{size}", highlight=False)
+        header = ("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Frame", "Classes", "Size")
+        print_table(out, header, [_row(sequence) for sequence in overview.sequences])
     for sequence in overview.sequences:
         if sequence.problem:
             out.print(f"{sequence.path or sequence.name}: {sequence.problem}", highlight=False, markup=False)
-    _print_grids(overview)
+    if kinds := _kinds_of_grids(overview):
+        header = ("Grid", "Axes", "Size", "Cell", "Bounds", "Parts", "Sequences", "Frames", "Made")
+        print_table(out, header, [_grid_row(grids) for grids in kinds])
     for capture in overview.captures:
         span = f"{capture.first}..{capture.last}" + (f" with {capture.gaps} gaps" if capture.gaps else "")
         text = f"raw capture {capture.path or '.'}: {capture.sensors} sensors, {capture.frames} frames ({span})"
@@ -62,38 +63,33 @@ def _row(sequence: SequenceOverview) -> list[str]:
         ", ".join(grid.name for grid in sequence.grids) or "none",
         sequence.frame,
         sequence.classes,
-        _size(sequence.bytes).removeprefix(", "),
+        "" if sequence.bytes is None else f"about {_size(sequence.bytes)}",
     ]
 
 
-def _print_grids(overview: Overview) -> None:
-    """Print each kind of grid once, with the number of sequences that have it."""
-    from rich.table import Table
-
+def _kinds_of_grids(overview: Overview) -> list[list[GridOverview]]:
+    """Return the grids of all sequences, those that differ in nothing but their sequence and frames together."""
     kinds: dict[tuple[object, ...], list[GridOverview]] = {}
     for sequence in overview.sequences:
         for grid in sequence.grids:
-            kinds.setdefault((grid.name, grid.coordinates, grid.size, grid.lower, grid.upper, _made(grid)), []).append(
-                grid
-            )
-    if not kinds:
-        return
-    table = Table("Grid", "Axes", "Size", "Cell", "Bounds", "Parts", "Sequences", "Frames", "Made")
-    for grids in kinds.values():
-        grid = grids[0]
-        bounds = ", ".join(f"{low:g}..{up:g}" for low, up in zip(grid.lower, grid.upper, strict=True))
-        table.add_row(
-            grid.name,
-            grid.coordinates,
-            " x ".join(map(str, grid.size)),
-            " x ".join(f"{edge:.4g}" for edge in grid.voxel_size),
-            bounds,
-            ", ".join(grid.parts),
-            str(len(grids)),
-            str(sum(g.frames for g in grids)),
-            _made(grid),
-        )
-    console().print(table)
+            kind = (grid.name, grid.coordinates, grid.size, grid.lower, grid.upper, _made(grid))
+            kinds.setdefault(kind, []).append(grid)
+    return list(kinds.values())
+
+
+def _grid_row(grids: list[GridOverview]) -> list[str]:
+    grid = grids[0]
+    return [
+        grid.name,
+        grid.coordinates,
+        " x ".join(map(str, grid.size)),
+        " x ".join(f"{edge:.4g}" for edge in grid.voxel_size),
+        ", ".join(f"{low:g}..{up:g}" for low, up in zip(grid.lower, grid.upper, strict=True)),
+        ", ".join(grid.parts),
+        str(len(grids)),
+        str(sum(g.frames for g in grids)),
+        _made(grid),
+    ]
 
 
 def _made(grid: GridOverview) -> str:
@@ -102,7 +98,5 @@ def _made(grid: GridOverview) -> str:
     return ", ".join(f"{key} {value}" for key, value in grid.made.items() if isinstance(value, str | int | float))
 
 
-def _size(count: int | None) -> str:
-    if count is None:
-        return ""
-    return f", {count / 1e9:.2f} GB" if count >= 1e8 else f", {count / 1e6:.2f} MB"
+def _size(count: int) -> str:
+    return f"{count / 1e9:.2f} GB" if count >= 1e8 else f"{count / 1e6:.2f} MB"

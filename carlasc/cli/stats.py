@@ -10,36 +10,40 @@ import typer
 from carlasc.cli.common import Json, console, print_json, progress_bar, report_failures
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
+    from carlasc.core import ClassTable
     from carlasc.inspection.statistics import Histogram, Kind, Statistics
 
 _KINDS: tuple[Kind, ...] = ("points", "voxels")
 
 
 def stats(
-    path: Annotated[
+    source: Annotated[
         str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, or a URL.")
     ] = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
-        typer.Option(help="Shares of all, of each split too, or of each sequence too."),
+        typer.Option(help="Print the shares of the whole, of each split too, or of each sequence too."),
     ] = "split",
-    grid: Annotated[str, typer.Option(help="Grid whose voxels are counted.")] = "evaluation",
+    grid: Annotated[
+        str, typer.Option(help="Grid whose voxels are counted; in a sequence with one other grid, that one.")
+    ] = "evaluation",
     remap: Annotated[
-        str, typer.Option(help="Classes of the second table: auto, none, carlasc11, semantickitti19, ...")
+        str, typer.Option(help="Remap to the classes of the second table: auto, none, carlasc11, semantickitti19, ...")
     ] = "auto",
-    every: Annotated[int, typer.Option(help="Count every so many frames.")] = 1,
-    plot: Annotated[Path | None, typer.Option(help="Draw the histograms: a .png, .svg or .pdf file.")] = None,
-    workers: Annotated[int, typer.Option(help="Processes that count side by side.", min=1)] = 1,
+    every: Annotated[int, typer.Option(metavar="N", help="Count every N-th frame.")] = 1,
+    plot: Annotated[Path | None, typer.Option(help="Draw the histograms to a .png, .svg or .pdf file.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes that work side by side.", min=1)] = 1,
     as_json: Json = False,
 ) -> None:
-    """Count the classes of points and of known voxels, with class weights; as tables, a plot, JSON."""
+    """Count the classes of points and of known voxels, and compute class weights: as tables, a plot or JSON."""
+    from carlasc.inspection.charts import check_plot, draw_histograms
     from carlasc.inspection.statistics import stats as count
 
+    if plot is not None:  # counting may take hours: a mistake in this option is reported before
+        check_plot(plot)
     with progress_bar("Counting") as progress:
         result = count(
-            path,
+            source,
             grid=grid,
             remap=None if remap == "none" else remap,
             every=every,
@@ -47,8 +51,6 @@ def stats(
             progress=progress,
         )
     if plot is not None:
-        from carlasc.inspection.charts import draw_histograms
-
         draw_histograms(result, plot)
     if as_json:
         print_json(result.to_dict())
@@ -60,62 +62,54 @@ def stats(
 
 
 def print_statistics(result: Statistics, by: str = "split") -> None:
-    """Print the class tables; `carlasc demo` does so too."""
+    """Print the class tables; `carlasc demo` uses it too."""
+    from carlasc.cli.tables import print_table
+
     out = console()
     splits = result.by_split() if by == "split" else {}
     if set(splits) == {"none"}:
         splits = {}
-    out.print(_class_table(result, splits, remapped=False))
-    if result.remap:
-        out.print(_class_table(result, splits, remapped=True))
+    for remapped in (False, True) if result.remap else (False,):
+        classes = result.remap.target if remapped and result.remap else result.classes
+        header, rows = _class_table(result, classes, splits, remapped=remapped)
+        print_table(out, header, rows, title=f"Classes of {classes.name}", turn=False)
     if by == "sequence":
         for kind in _KINDS:
-            out.print(_sequence_table(result, kind))
+            header, rows = _sequence_table(result, kind)
+            print_table(out, header, rows, title=f"{kind}, % by sequence")
     total = result.total
     if total.grids:
-        text = f"{total.known_share:.1%} of voxels known ({total.grids} grids); shares of voxels are those of known ones, and class 0 of points is unlabelled"
+        text = f"{total.known_share:.1%} of voxels known ({total.grids} grids); shares of voxels are shares of the known voxels; class 0 of points is unlabelled"
         out.print(text, highlight=False)
 
 
-def _class_table(result: Statistics, splits: dict[str, Histogram], *, remapped: bool) -> Table:
-    """A row a class: how often it stands, its share in all and in each split, its weight."""
-    from rich.table import Table
-
-    classes = result.remap.target if remapped and result.remap else result.classes
-    table = Table(title=f"Classes of {classes.name}", title_justify="left")
-    table.add_column("Class")
-    for header in (
-        "points",
-        "%",
-        "voxels",
-        "%",
-        *(f"{split} {kind} %" for split in splits for kind in _KINDS),
-        "weight",
-    ):
-        table.add_column(header, justify="right")
+def _class_table(
+    result: Statistics, classes: ClassTable, splits: dict[str, Histogram], *, remapped: bool
+) -> tuple[list[str], list[list[str]]]:
+    """Return a header and a row per class: its counts, its shares in the whole and in each split, its weight."""
+    shares = [f"{split} {kind} %" for split in splits for kind in _KINDS]
+    header = ["Class", *(text for kind in _KINDS for text in (kind, f"{kind} %")), *shares]
     totals = [_counts(result, result.total, kind, remapped) for kind in _KINDS]
-    shares = [_counts(result, histogram, kind, remapped) for histogram in splits.values() for kind in _KINDS]
+    parts = [_counts(result, histogram, kind, remapped) for histogram in splits.values() for kind in _KINDS]
     weights = result.weights() if remapped or result.remap is None else {}
+    header += ["weight"] if weights else []
+    rows = []
     for name in classes.names.values():
         if any(counts[name] for counts in totals):
             cells = [cell for counts in totals for cell in (f"{counts[name]:,}", _percent(counts, name))]
-            weight = f"{weights[name]:.4f}" if name in weights else ""
-            table.add_row(name, *cells, *(_percent(counts, name) for counts in shares), weight)
-    return table
+            weight = [f"{weights[name]:.4f}"] if weights else []
+            rows.append([name, *cells, *(_percent(counts, name) for counts in parts), *weight])
+    return header, rows
 
 
-def _sequence_table(result: Statistics, kind: Kind) -> Table:
-    """A row a sequence: the share of each class."""
-    from rich.table import Table
-
+def _sequence_table(result: Statistics, kind: Kind) -> tuple[list[str], list[list[str]]]:
+    """Return a header and a row per sequence: the share of each class."""
     names = list(_counts(result, result.total, kind, remapped=True))
-    table = Table("Sequence", title=f"{kind}, % by sequence", title_justify="left")
-    for name in names:
-        table.add_column(name, justify="right")
+    rows = []
     for path, histogram in result.sequences.items():
         counts = _counts(result, histogram, kind, remapped=True)
-        table.add_row(path or result.location, *(_percent(counts, name) for name in names))
-    return table
+        rows.append([path or result.location, *(_percent(counts, name) for name in names)])
+    return ["Sequence", *names], rows
 
 
 def _counts(result: Statistics, histogram: Histogram, kind: Kind, remapped: bool) -> dict[str, int]:

@@ -17,29 +17,32 @@ _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 
 def validate(
-    path: Annotated[
+    source: Annotated[
         str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, or a URL.")
     ] = ".",
     every: Annotated[
-        int | None, typer.Option(help="Read the contents of every so many frames; about forty a sequence if not given.")
+        int | None,
+        typer.Option(
+            metavar="N", help="Read the contents of every N-th frame; of about forty frames per sequence if not given."
+        ),
     ] = None,
     full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Print every finding, not only the first of a kind.")
+        bool, typer.Option("--all", help="Print all findings, not only the first three of each kind.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Check a data set: files, poses, times, scans against poses and grids. Exit code 1 if there is an error.
+    """Check a data set: files, poses, times, and whether scans agree with poses and grids. The exit code is 1 if there is an error.
 
-    Finds files of the wrong size, labels without votes, unknown classes, poses that are not rigid or jump, gaps; and tells from the
-    scans whether y is mirrored, poses are those of a camera, rotations are transposed, or a grid is shifted by a cell.
+    It finds files of the wrong size, labels without votes, unknown classes, poses that are not rigid or jump, and gaps. From the
+    scans it recognizes a mirrored y axis, poses of a camera, transposed rotations, and a grid that is shifted by a cell.
     """
     from carlasc.inspection.validation import validate as examine
 
     if full and every is not None:
-        raise ArgumentError("--every", expected="only one of --every and --full", found="both")
+        raise ArgumentError("every", expected="only one of --every and --full", found="both")
     with progress_bar("Validating", unit="steps") as progress:
-        result = examine(path, every=1 if full else every, progress=progress)
+        result = examine(source, every=1 if full else every, progress=progress)
     if as_json:
         print_json(result.to_dict())
     else:
@@ -49,7 +52,7 @@ def validate(
 
 
 def print_result(result: ValidationResult, *, everything: bool = False) -> None:
-    """Print findings by kind, worst first; `carlasc demo` does so too."""
+    """Print the findings by kind, errors first; `carlasc demo` uses it too."""
     from rich.text import Text
 
     from carlasc.inspection.findings import SEVERITIES
@@ -61,13 +64,13 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
         for finding in shown:
             out.print(Text(f"  {finding}"), soft_wrap=True)
         if len(findings) > len(shown):
-            out.print(Text(f"  ... and {len(findings) - len(shown)} more (--all shows them)"))
+            out.print(Text(f"  ... and {len(findings) - len(shown)} more (--all prints them)"))
     for report in result.sequences:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})" for grid, share in report.voxel_share.items()
         ]
         if report.pose_share is not None:
-            figures.append(f"{report.pose_share:.1%} of structure on an earlier scan's under the poses")
+            figures.append(f"{report.pose_share:.1%} of a scan's structure on that of an earlier scan under the poses")
         name = report.path or result.location
         text = f"{name}: {report.frames} frames, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
         out.print(Text(text), soft_wrap=True)

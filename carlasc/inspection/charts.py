@@ -1,9 +1,10 @@
-"""Class histograms as a picture."""
+"""Class histograms drawn as a picture."""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -15,20 +16,38 @@ _SUFFIXES = (".png", ".svg", ".pdf")
 _OF: dict[Kind, str] = {"points": "points", "voxels": "known voxels"}
 
 
-def draw_histograms(statistics: Statistics, path: Path) -> None:
-    """Draw the share of each class, points beside voxels, a bar a split, on a logarithmic scale.
+def check_plot(plot: Path) -> ModuleType:
+    """Check that a plot can be drawn to a file, before the figures for it are computed.
+
+    Args:
+        plot: the file, as for `draw_histograms`.
+
+    Returns:
+        The module `matplotlib.figure`.
+
+    Raises:
+        ArgumentError: the name has another ending.
+        DependencyError: Matplotlib is not installed.
+    """
+    if plot.suffix.lower() not in _SUFFIXES:
+        raise ArgumentError(
+            "plot", expected=f"a file that ends in {', '.join(_SUFFIXES)}", found=plot.suffix or "no ending"
+        )
+    return import_extra("matplotlib.figure", "plots")
+
+
+def draw_histograms(statistics: Statistics, plot: Path) -> None:
+    """Draw the share of each class, points beside voxels, one bar per split, on a logarithmic scale.
 
     Args:
         statistics: as `stats` returns them.
-        path: a .png, .svg or .pdf file.
+        plot: a .png, .svg or .pdf file.
 
     Raises:
-        ArgumentError: another ending.
+        ArgumentError: the name has another ending.
         DependencyError: Matplotlib is not installed.
     """
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ArgumentError(path, expected=f"a file ending in {', '.join(_SUFFIXES)}", found=f"{path.suffix or 'none'}")
-    figures = import_extra("matplotlib.figure", "plots")
+    figures = check_plot(plot)
     splits = statistics.by_split()
     names, colors = statistics.classes.names, statistics.classes.palette / 255
     ids = [i for i in names if any(histogram.of(kind)[i] for histogram in splits.values() for kind in KINDS)]
@@ -39,9 +58,9 @@ def draw_histograms(statistics: Statistics, path: Path) -> None:
             if not counts.sum():
                 continue
             height = 0.8 / len(splits)
-            places = np.arange(len(ids)) + (row - (len(splits) - 1) / 2) * height
+            positions = np.arange(len(ids)) + (row - (len(splits) - 1) / 2) * height
             axes.barh(
-                places,
+                positions,
                 counts / counts.sum(),
                 height,
                 color=colors[ids],
@@ -62,5 +81,5 @@ def draw_histograms(statistics: Statistics, path: Path) -> None:
         title += f" (darkest first: {', '.join(splits)})"
     figure.suptitle(title if np.isnan(known) else f"{title}, {known:.1%} of voxels known")
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix[1:].lower(), dpi=150)
-    write_atomic(path, buffer.getvalue())
+    figure.savefig(buffer, format=plot.suffix[1:].lower(), dpi=150)
+    write_atomic(plot, buffer.getvalue())

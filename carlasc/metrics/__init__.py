@@ -3,13 +3,14 @@
 from carlasc.metrics.casting import cast_rays, rayiou_directions
 from carlasc.metrics.confusion import Completeness, ConfusionMatrix
 from carlasc.metrics.conventions import CONVENTIONS, Convention, ConventionScore, convention_named
-from carlasc.metrics.evaluation import Evaluation, evaluate
+from carlasc.metrics.evaluation import evaluate
 from carlasc.metrics.masks import distance_band, field_of_view, known, semantickitti
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore
 from carlasc.metrics.rays import RayIoU, RayPQ, RayScore, ray_origins
 from carlasc.metrics.regions import Breakdown, distance_bands, height_bands, motion, visibility
 from carlasc.metrics.sampling import Comparison, Interval, bootstrap, compare
-from carlasc.metrics.tables import Table, geometric_table, semantic_table
+from carlasc.metrics.scores import Evaluation, geometric_table, semantic_table
+from carlasc.metrics.tables import Table
 from carlasc.metrics.temporal import Consistency, Forecasting, ForecastScore, moved_grid, shape_consistency
 from carlasc.metrics.truth import TruthScore, score_truth
 from carlasc.metrics.uncertainty import Reliability, Uncertainty, UncertaintyScore

@@ -1,4 +1,4 @@
-"""Which voxels count. Masks are (X, Y, Z) bool and combine with `&`."""
+"""Masks that say which voxels count: (X, Y, Z) bool, combined with `&`."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from carlasc.errors import ArgumentError, FormatError
 
 
 def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return the voxels that somebody saw: count > 0, the data set's own rule."""
+    """Return the voxels that have votes (count > 0): the data set's own rule."""
     return counts > 0
 
 
 def semantickitti(labels: NDArray[np.integer], invalid: NDArray[Any] | None = None) -> NDArray[np.bool_]:
-    """Return the voxels that SemanticKITTI's completion benchmark scores (FORMAT section 6).
+    """Return the voxels that SemanticKITTI's completion benchmark scores (see the format page, `docs/format.md#semantickitti`).
 
-    A raw 0 is empty and counts; a class outside the benchmark's 19 does not, nor does an invalid voxel.
+    Voxels with the raw id 0 are empty and count. Voxels of a class outside the benchmark's 19 and invalid voxels do not.
 
     Args:
         labels: (X, Y, Z) raw SemanticKITTI ids.
-        invalid: (X, Y, Z), non-zero where no merged scan saw the voxel.
+        invalid: (X, Y, Z), non-zero for voxels that no merged scan observed.
 
     Raises:
-        FormatError: an id that SemanticKITTI does not have, or shapes that differ.
+        FormatError: an id is not one of SemanticKITTI's, or shapes differ.
     """
     scored = (labels == 0) | (remap_named("semantickitti19")(labels) != 0)
     if invalid is None:
         return scored
     if invalid.shape != labels.shape:
-        raise FormatError("invalid voxels", expected=f"the labels' shape {labels.shape}", found=f"{invalid.shape}")
+        raise FormatError("invalid", expected=f"the labels' shape {labels.shape}", found=str(invalid.shape))
     return scored & (invalid == 0)
 
 
@@ -42,10 +42,12 @@ def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) 
     """Return the voxels whose centre is at a horizontal distance of `near_m <= r < far_m` from the sensor.
 
     Raises:
-        ArgumentError: an empty band.
+        ArgumentError: `near_m` is negative, or `far_m` is not greater than `near_m`.
     """
-    if not 0 <= near_m < far_m:
-        raise ArgumentError("distance band", expected="0 <= near < far", found=f"{near_m} and {far_m} m")
+    if not near_m >= 0:
+        raise ArgumentError("near_m", expected="0 or more", found=f"{near_m:g}")
+    if not far_m > near_m:
+        raise ArgumentError("far_m", expected=f"more than {near_m:g}, where the band starts", found=f"{far_m:g}")
     centers = spec.from_axes(spec.centers())
     distance = np.hypot(centers[..., 0], centers[..., 1])
     return np.asarray((distance >= near_m) & (distance < far_m))
@@ -56,7 +58,7 @@ def field_of_view(
     horizontal_rad: float = 2 * math.pi,
     vertical_rad: tuple[float, float] = (-math.pi / 2, math.pi / 2),
 ) -> NDArray[np.bool_]:
-    """Return the voxels whose centre the sensor at the origin could look at.
+    """Return the voxels whose centre is in the field of view of a sensor at the origin.
 
     Args:
         spec: the grid, in the sensor's frame.
@@ -64,15 +66,13 @@ def field_of_view(
         vertical_rad: lowest and highest elevation; the data set's LiDAR: -25 to +2 degrees.
 
     Raises:
-        ArgumentError: angles that open nothing.
+        ArgumentError: `horizontal_rad` is not in (0, 2 pi], or the lowest elevation is not below the highest.
     """
     low, high = vertical_rad
-    if not (0 < horizontal_rad <= 2 * math.pi and low < high):
-        raise ArgumentError(
-            "field of view",
-            expected="an angle in (0, 2 pi] and low < high",
-            found=f"{horizontal_rad}, {low} and {high} rad",
-        )
+    if not 0 < horizontal_rad <= 2 * math.pi:
+        raise ArgumentError("horizontal_rad", expected="an angle in (0, 2 pi]", found=f"{horizontal_rad:g}")
+    if not low < high:
+        raise ArgumentError("vertical_rad", expected="(lowest, highest) elevation", found=f"({low:g}, {high:g})")
     x, y, z = np.moveaxis(spec.from_axes(spec.centers()), -1, 0)
     elevation = np.arctan2(z, np.hypot(x, y))
     seen = (np.abs(np.arctan2(y, x)) <= horizontal_rad / 2) & (elevation >= low) & (elevation <= high)

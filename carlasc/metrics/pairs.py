@@ -1,4 +1,4 @@
-"""Finding which predicted grid belongs to which true one, in Sources and in plain folders of `.label` files."""
+"""Matching the predicted grids with the true ones, in Sources and in plain folders of `.label` files."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import Sequence, Source, as_source, layout
 
-Where = str | os.PathLike[str] | Source
-_BITS = 8
+Place = str | os.PathLike[str] | Source
+_BITS = 8  # voxels per byte of an .invalid file
 
 
 class GridFrames(ABC):
     """The frames of one grid.
 
     Attributes:
-        path: of the sequence; "" where there is just one.
-        location: what to call it in errors.
-        spec: its geometry, None where nothing says.
-        classes: the table of its ids, None where nothing says.
+        path: of the sequence; "" for a plain folder.
+        location: what to call the grid in errors.
+        spec: its geometry; None if it is not known.
+        classes: the class table of its ids; None if it is not known.
     """
 
     path: str
@@ -42,11 +42,11 @@ class GridFrames(ABC):
 
     @abstractmethod
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
-        """Return a frame's labels: (X, Y, Z), or flat where the geometry is not known."""
+        """Return the labels of a frame: (X, Y, Z), or (X * Y * Z,) if the geometry is not known."""
 
     @abstractmethod
     def known(self, frame: int) -> NDArray[np.bool_] | None:
-        """Return which voxels of a frame are known (counts > 0, or not invalid), None where nothing says."""
+        """Return which voxels of a frame are known (counts > 0, or not invalid); None if the data do not say."""
 
 
 class SequenceGrid(GridFrames):
@@ -58,7 +58,7 @@ class SequenceGrid(GridFrames):
         self.spec, self.classes = sequence.grids[grid], sequence.classes_of(grid)
 
     def frames(self) -> NDArray[np.int64]:
-        """Return the frames with labels."""
+        """Return the sorted frames that have labels."""
         return self.sequence.frames(f"{self.grid}/labels")
 
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
@@ -66,16 +66,20 @@ class SequenceGrid(GridFrames):
         return self.sequence.read(f"{self.grid}/labels", frame)
 
     def known(self, frame: int) -> NDArray[np.bool_] | None:
-        """Return where the counts are above 0."""
+        """Return (X, Y, Z) which voxels have votes; None for a grid without counts."""
         field = f"{self.grid}/counts"
         return self.sequence.read(field, frame) > 0 if field in self.sequence.fields() else None
 
 
 class LabelFolder(GridFrames):
-    """A plain folder of `000000.label` files without params.json, as other tools leave it.
+    """A folder of `000000.label` files without params.json, as other tools write it.
 
-    Beside them, `000000.bin` holds counts (float32), or `000000.invalid` SemanticKITTI's bit-packed mask. Labels are uint32, the layout's
-    type; uint16 on both sides where the truth is SemanticKITTI's.
+    The same folder may hold counts (`000000.bin`, float32) or SemanticKITTI's masks (`000000.invalid`, one bit per voxel). Labels are uint32,
+    as in the layout, or uint16 where the ground truth is SemanticKITTI's.
+
+    Attributes:
+        dtype: type of the labels in the files.
+        voxels: number of voxels per frame; None if it is not known.
     """
 
     spec = None
@@ -84,12 +88,12 @@ class LabelFolder(GridFrames):
     def __init__(self, folder: Path) -> None:
         self.folder, self.path, self.location = folder, "", str(folder)
         self.dtype: np.dtype[np.unsignedinteger] = np.dtype("<u4")
-        self.voxels: int | None = None  # of a frame, where something says
+        self.voxels: int | None = None
         if len(self.frames()):
-            self._look_beside(int(self.frames()[0]))
+            self._read_size(int(self.frames()[0]))
 
-    def _look_beside(self, frame: int) -> None:
-        """Learn from the files beside the labels how many voxels there are, and whether they are SemanticKITTI's."""
+    def _read_size(self, frame: int) -> None:
+        """Find the number of voxels, and whether the labels are SemanticKITTI's, from the size of the frame's other file."""
         if (counts := self._file(frame, ".bin")).is_file():
             self.voxels = counts.stat().st_size // 4
         elif (invalid := self._file(frame, ".invalid")).is_file():
@@ -101,25 +105,29 @@ class LabelFolder(GridFrames):
         return np.array(sorted(number for number in numbers if number is not None), np.int64)
 
     def frames(self) -> NDArray[np.int64]:
-        """Return the frames of the files."""
+        """Return the sorted frames that have a `.label` file."""
         return self._frames
 
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
-        """Return flat labels."""
+        """Return (X * Y * Z,) labels.
+
+        Raises:
+            FormatError: the file does not have the size of a grid.
+        """
         path = self._file(frame, ".label")
         size, width = path.stat().st_size, self.dtype.itemsize
         if size % width or (self.voxels is not None and size != width * self.voxels):
-            expected = "labels" if self.voxels is None else f"{self.voxels} labels"
+            number = "labels" if self.voxels is None else f"{self.voxels} labels"
             raise FormatError(
                 path,
-                expected=f"{expected} of {width} bytes ({self.dtype.name})",
+                expected=f"{number} of {width} bytes ({self.dtype.name})",
                 found=f"{size} bytes",
-                advice="cut short, of another grid, or of another type",
+                advice="the file is truncated, of another grid, or of another type",
             )
         return np.fromfile(path, self.dtype)
 
     def known(self, frame: int) -> NDArray[np.bool_] | None:
-        """Return where counts are above 0, or SemanticKITTI's voxels that are not invalid."""
+        """Return (X * Y * Z,) which voxels have votes, or are not invalid; None if there is no such file."""
         if (counts := self._file(frame, ".bin")).is_file():
             return np.fromfile(counts, "<f4") > 0
         if (invalid := self._file(frame, ".invalid")).is_file():
@@ -134,54 +142,60 @@ class LabelFolder(GridFrames):
 class Pair:
     """A predicted grid and the true one."""
 
-    pred: GridFrames
+    prediction: GridFrames
     truth: GridFrames
 
 
-def pair_grids(pred: Where, truth: Where, pred_grid: str | None, truth_grid: str | None) -> list[Pair]:
-    """Match predictions with truth: by the sequence's path, or, where each side has just one, by that.
+def pair_grids(source: Place, truth: Place, grid: str | None, truth_grid: str | None) -> list[Pair]:
+    """Match predictions with the ground truth: by the paths of their sequences, or, if each side has one sequence, that one.
+
+    Args:
+        source: the predictions, as for `evaluate`.
+        truth: the ground truth.
+        grid: name of the predicted grid; None takes `truth_grid`.
+        truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
 
     Raises:
-        MissingDataError: a side has no grid, or a prediction has no truth.
+        MissingDataError: a side has no grid, or a predicted sequence has no ground truth.
     """
     truths = {grids.path: grids for grids in _open_grids(truth, truth_grid)}
-    preds = list(_open_grids(pred, pred_grid or truth_grid))
-    if len(preds) == len(truths) == 1:
-        pairs = [Pair(preds[0], next(iter(truths.values())))]
+    predictions = list(_open_grids(source, grid or truth_grid))
+    if len(predictions) == len(truths) == 1:
+        pairs = [Pair(predictions[0], next(iter(truths.values())))]
     else:
         pairs = []
-        for grids in preds:
-            if grids.path not in truths:
+        for prediction in predictions:
+            if prediction.path not in truths:
                 raise MissingDataError(
-                    grids.location,
-                    expected=f"truth for the sequence {grids.path!r}",
-                    found=f"{_shorten(truths)}",
-                    advice="give both sides from the same level",
+                    prediction.location,
+                    expected=f"ground truth for the sequence {prediction.path!r}",
+                    found=_shorten(truths),
+                    advice="give both sides from the same level, such as two data sets or two splits",
                 )
-            pairs.append(Pair(grids, truths[grids.path]))
+            pairs.append(Pair(prediction, truths[prediction.path]))
     for pair in pairs:
-        _tell_size(pair)
+        _share_size(pair)
     return pairs
 
 
-def _tell_size(pair: Pair) -> None:
-    """Let a plain folder of predictions know the size and, of SemanticKITTI's, the type that the truth says."""
-    if isinstance(pair.pred, LabelFolder):
+def _share_size(pair: Pair) -> None:
+    """Give a plain folder of predictions the number of voxels, and the type of SemanticKITTI's labels, from the ground truth."""
+    if isinstance(pair.prediction, LabelFolder):
         if pair.truth.spec is not None:
-            pair.pred.voxels = int(np.prod(pair.truth.spec.size))
+            pair.prediction.voxels = int(np.prod(pair.truth.spec.size))
         elif isinstance(pair.truth, LabelFolder):
-            pair.pred.voxels, pair.pred.dtype = pair.truth.voxels, pair.truth.dtype
+            pair.prediction.voxels, pair.prediction.dtype = pair.truth.voxels, pair.truth.dtype
 
 
-def _open_grids(where: Where, grid: str | None) -> Iterator[GridFrames]:
-    if not isinstance(where, Source):
-        folder = Path(where)
-        if (folder / layout.PARAMS).is_file():  # one grid's folder: the sequence is the folder above
-            where, grid = folder.absolute().parent, folder.absolute().name
+def _open_grids(place: Place, grid: str | None) -> Iterator[GridFrames]:
+    if not isinstance(place, Source):
+        folder = Path(place)
+        if (folder / layout.PARAMS).is_file():  # the folder of one grid: its sequence is the folder above
+            place, grid = folder.absolute().parent, folder.absolute().name
         elif folder.is_dir() and len((plain := LabelFolder(folder)).frames()):
             yield plain
             return
-    source = as_source(where)
+    source = as_source(place)
     found = False
     for sequence in source.sequences().values():
         if name := _choose_grid(sequence, grid):
@@ -194,7 +208,7 @@ def _open_grids(where: Where, grid: str | None) -> Iterator[GridFrames]:
 
 
 def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
-    """The grid of that name; without a name the published one, or the only one there is."""
+    """Return the grid of that name; without a name `evaluation`, or the only grid; None if the sequence has no such grid."""
     names = [name for name in sequence.grids if f"{name}/labels" in sequence.fields()]
     if grid is not None:
         return grid if grid in names else None
@@ -204,8 +218,8 @@ def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
         raise MissingDataError(
             sequence.location,
             expected=f"the grid {layout.EVALUATION}",
-            found=f"{', '.join(names)}",
-            advice="choose one by name",
+            found=", ".join(names),
+            advice="choose one with `grid` or `truth_grid`",
         )
     return names[0] if names else None
 

@@ -1,4 +1,4 @@
-"""Scoring ground truth itself: a grid against a better one of the same scene and instant."""
+"""Scoring ground truth itself: a grid against a better grid of the same scene at the same time."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from carlasc.metrics.confusion import ConfusionMatrix
 
 @dataclass(frozen=True)
 class TruthScore:
-    """How a ground truth compares with a reference. Scores of frames add up with `+`.
+    """The comparison of a ground truth with a reference. Scores of frames are added with `+`.
 
     Attributes:
-        matrix: confusion over the voxels known to both: its `iou`, `accuracy`, `recall`, `false_positives`, `completeness()`.
-        known: voxels that the grid knows, among those scored.
-        known_reference: voxels that the reference knows.
-        known_both: voxels that both know.
+        matrix: confusion matrix over the voxels that are known in both grids, the reference in rows.
+        known: number of voxels that are known in the grid.
+        known_reference: number of voxels that are known in the reference.
+        known_both: number of voxels that are known in both.
     """
 
     matrix: ConfusionMatrix
@@ -30,12 +30,12 @@ class TruthScore:
 
     @property
     def coverage(self) -> float:
-        """Share of the voxels known to the reference that the grid knows too; NaN when there are none."""
+        """Share of the voxels known in the reference that are known in the grid too; NaN if the reference has none."""
         return self.known_both / self.known_reference if self.known_reference else float("nan")
 
     @property
     def accuracy(self) -> float:
-        """Share of the voxels known to both whose classes agree."""
+        """Share of the voxels known in both grids whose classes agree."""
         return self.matrix.accuracy
 
     def __add__(self, other: TruthScore) -> TruthScore:
@@ -48,21 +48,21 @@ class TruthScore:
 
 
 def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.bool_] | None = None) -> TruthScore:
-    """Score a ground truth grid against a reference, over the voxels known to both.
+    """Score a ground truth grid against a reference, over the voxels that are known in both.
 
     Args:
-        grid: what is scored; voxels with count 0 are unknown.
-        reference: what is right, of the same spec.
-        num_classes: ids are below it.
-        mask: (X, Y, Z) bool: only these voxels are looked at (a distance band, ...).
+        grid: the grid that is scored; voxels with count 0 are unknown.
+        reference: the grid that is taken to be right, of the same spec.
+        num_classes: number of classes; ids are below it.
+        mask: (X, Y, Z) bool: only these voxels are scored, such as a distance band; None scores all.
 
     Raises:
-        FormatError: the grids differ in geometry, or ids are out of range.
+        FormatError: the grids differ in geometry, or an id is out of range.
     """
     if grid.spec != reference.spec:
-        raise FormatError("grid", expected=f"the reference's {reference.spec}", found=f"{grid.spec} (or other bounds)")
-    looked_at = np.ones(grid.spec.size, np.bool_) if mask is None else mask
-    known, known_reference = grid.known & looked_at, reference.known & looked_at
+        raise FormatError("grid", expected=f"the reference's {reference.spec}", found=f"{grid.spec}, or other bounds")
+    selected = np.ones(grid.spec.size, np.bool_) if mask is None else mask
+    known, known_reference = grid.known & selected, reference.known & selected
     both = known & known_reference
     matrix = ConfusionMatrix(num_classes).update(grid.labels, reference.labels, both)
     return TruthScore(matrix, int(known.sum()), int(known_reference.sum()), int(both.sum()))

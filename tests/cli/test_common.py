@@ -1,6 +1,8 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -8,8 +10,8 @@ import typer
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.cli.common import CommandGroup, parse_frames, parse_numbers, print_json, report_failures
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.cli.common import CommandGroup, FramesOption, parse_frames, parse_numbers, print_json, report_failures
+from carlasc.errors import ArgumentError, ConflictError, FormatError
 
 
 def run(action):
@@ -21,7 +23,11 @@ def run(action):
 
 @pytest.mark.parametrize(
     ("error", "code"),
-    [(FormatError("a.bin: expected x, found y"), 1), (ArgumentError("--res: no"), 2), (KeyboardInterrupt(), 130)],
+    [
+        (FormatError("a.bin", expected="x", found="y"), 1),
+        (ArgumentError("res", expected="a number", found="x"), 2),
+        (KeyboardInterrupt(), 130),
+    ],
 )
 def test_an_error_is_one_line_and_an_honest_exit_code(error, code):
     def action():
@@ -31,6 +37,80 @@ def test_an_error_is_one_line_and_an_honest_exit_code(error, code):
     assert result.exit_code == code
     assert result.stderr.count("\n") == 1
     assert "Traceback" not in result.output
+
+
+def run_with_options(error):
+    """Run a command that has some of the library's arguments as options, and fails with an error; return its message."""
+
+    def action(
+        source: str,
+        out: Annotated[Path | None, typer.Option("-o", "--out")] = None,
+        window: int = 1,
+        near_m: Annotated[float, typer.Option("--near")] = 0.0,
+        overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
+        frames: FramesOption = None,
+    ):
+        if error is not None:
+            raise error
+        typer.echo(repr(frames))
+
+    app = typer.Typer(cls=CommandGroup)
+    app.command("one")(action)
+    app.command("other")(lambda: None)
+    return lambda *arguments: CliRunner().invoke(app, ["one", "data", *arguments])
+
+
+@pytest.mark.parametrize(
+    ("where", "named"),
+    [
+        ("window", "--window"),
+        ("near_m", "--near"),
+        ("out", "--out"),
+        ("source", "SOURCE"),
+        ("truth_grid", "truth_grid"),
+        ("a/window", "a/window"),
+    ],
+)
+def test_an_argument_is_named_as_the_option_that_gives_it(where, named):
+    result = run_with_options(ArgumentError(where, expected="5", found="6"))()
+    assert result.stderr == f"carlasc: {named}: expected 5, found 6\n"
+    assert result.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("advice", "shown"),
+    [
+        ("give `overwrite=True`", "give `--overwrite`"),
+        ("give `window=8` or `near_m=2.5`", "give `--window 8` or `--near 2.5`"),
+        ('give `out="town"`', "give `--out town`"),
+        ("see `window`", "see `--window`"),
+        ("give `workers=2`", "give `workers=2`"),
+        ("run `carlasc info`", "run `carlasc info`"),
+        ("one window", "one window"),
+    ],
+)
+def test_advice_names_options_where_the_command_has_them(advice, shown):
+    error = ConflictError("a.bin", expected="b", found="c", advice=advice)
+    assert run_with_options(error)().stderr == f"carlasc: a.bin: expected b, found c: {shown}\n"
+    assert error.advice == advice
+
+
+def test_messages_of_a_batch_name_options_too():
+    def action(overwrite: Annotated[bool, typer.Option("--overwrite")] = False):
+        report_failures([(1, "a: give `overwrite=True`")], 2)
+
+    assert run(action).stderr.splitlines()[0] == "carlasc: a: give `--overwrite`"
+
+
+def test_a_range_of_frames_is_an_option_with_a_message_of_one_line():
+    command = run_with_options(None)
+    assert command().stdout == "None\n"
+    assert command("--frames", "3:7").stdout == "FrameRange(start=3, stop=7)\n"
+    result = command("--frames", "7:3")
+    assert (result.exit_code, result.stderr) == (
+        2,
+        "carlasc: --frames: expected a range that holds a frame, found 7:3\n",
+    )
 
 
 def test_a_bug_keeps_its_traceback():
@@ -55,7 +135,7 @@ def test_frames_are_half_open_ranges():
     assert parse_frames(":7") == (None, 7)
     assert parse_frames("3") == (3, 4)
     for text in ("a:b", "7:3", "3:3", "1:2:3"):
-        with pytest.raises(ArgumentError, match="--frames"):
+        with pytest.raises(ArgumentError, match="frames: expected"):
             parse_frames(text)
 
 

@@ -44,7 +44,7 @@ def test_validate_of_broken_data_groups_what_it_found_and_exits_1(sequence: Path
 def test_validate_prints_a_few_of_a_kind_and_all_on_request(sequence: Path) -> None:
     path = sequence / "evaluation" / "params.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"grid_size": [64.0, 64.0, 8.0]}))
-    assert "... and 3 more (--all shows them)" in run("validate", sequence).output
+    assert "... and 3 more (--all prints them)" in run("validate", sequence).output
     assert "more (--all" not in run("validate", sequence, "--all").output
 
 

@@ -70,7 +70,7 @@ def test_grids_beside_the_data_leave_the_data_as_they_are(data, tmp_path):
     model = Model.read(save(tmp_path / "net.pt"))
     predict_dataset(model, str(root), None, CPU, "eager")
     assert all(path.read_bytes() == content for path, content in before.items())
-    assert evaluate(root, root, pred_grid="completion").frames == 2
+    assert evaluate(root, root, grid="completion").frames == 2
     with pytest.raises(ConflictError, match="expected predictions of sscnet"):
         predict_dataset(Model.read(save(tmp_path / "other.pt", "sscnet")), str(root), None, CPU, "eager")
 

@@ -174,7 +174,7 @@ def test_a_chart_is_drawn(
 
 
 def test_a_chart_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="expected a file ending in .png"):
+    with pytest.raises(ArgumentError, match="plot: expected a file that ends in .png"):
         draw_histograms(Statistics("", CARLA, None, {}, {}), tmp_path / "classes.doc")
 
 

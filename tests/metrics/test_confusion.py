@@ -87,18 +87,18 @@ def test_tensors_count_as_arrays_do():
 
 def test_the_count_on_another_device_is_that_on_the_cpu():
     torch = pytest.importorskip("torch")
-    from carlasc.metrics import confusion
+    from carlasc.metrics.counting import count_tensors
 
     pred, target, mask = labels_and_mask(4)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     tensors = [torch.from_numpy(a).to(device) for a in (pred, target, mask)]
     expected = ConfusionMatrix(K).update(pred, target, mask)
-    np.testing.assert_array_equal(confusion._count_on(device, *tensors, K), expected.counts)
-    np.testing.assert_array_equal(confusion._count_on(device, tensors[0], target, mask, K), expected.counts)
+    np.testing.assert_array_equal(count_tensors(device, *tensors, K), expected.counts)
+    np.testing.assert_array_equal(count_tensors(device, tensors[0], target, mask, K), expected.counts)
     with pytest.raises(FormatError, match=r"prediction: expected class ids 0\.\.2, found"):
-        confusion._count_on(device, *tensors, 3)
+        count_tensors(device, *tensors, 3)
     with pytest.raises(FormatError, match="truth: expected integer"):
-        confusion._count_on(device, tensors[0], tensors[1].float(), None, K)
+        count_tensors(device, tensors[0], tensors[1].float(), None, K)
 
 
 def test_ids_out_of_range_are_named_unless_masked():
@@ -111,20 +111,43 @@ def test_ids_out_of_range_are_named_unless_masked():
 
 
 def test_shapes_and_types_that_do_not_fit_are_refused():
-    with pytest.raises(FormatError, match=r"truth's shape \(2, 2\), found \(4,\)"):
+    with pytest.raises(FormatError, match=r"prediction: expected the truth's shape \(2, 2\), found \(4,\)"):
         ConfusionMatrix(K).update(np.zeros(4, int), np.zeros((2, 2), int))
-    with pytest.raises(FormatError, match=r"mask of \(3,\)"):
+    with pytest.raises(FormatError, match=r"mask: expected the truth's shape \(4,\), found \(3,\)"):
         ConfusionMatrix(K).update(np.zeros(4, int), np.zeros(4, int), np.ones(3, bool))
     with pytest.raises(FormatError, match="prediction: expected integer class ids, found float64"):
         ConfusionMatrix(K).update(np.zeros(4), np.zeros(4, int))
-    with pytest.raises(ArgumentError):
+    with pytest.raises(ArgumentError, match="num_classes: expected 1 or more, found 0"):
         ConfusionMatrix(0)
-    with pytest.raises(ArgumentError):
+    for free in (-1, 3):
+        with pytest.raises(ArgumentError, match=rf"free: expected a class id in 0\.\.2, found {free}"):
+            ConfusionMatrix(3, free=free)
+    with pytest.raises(ArgumentError, match="counts"):
         ConfusionMatrix(3, counts=np.zeros((2, 2), int))
-    with pytest.raises(ArgumentError):
+    with pytest.raises(ArgumentError, match="expected 3 classes with free 0, found 4 classes with free 0"):
         ConfusionMatrix(3) + ConfusionMatrix(4)
-    with pytest.raises(ArgumentError):
+    with pytest.raises(ArgumentError, match="expected 3 classes with free 0, found 3 classes with free 1"):
+        ConfusionMatrix(3) + ConfusionMatrix(3, free=1)
+    with pytest.raises(ArgumentError, match="absent: expected zero or skip, found 'maybe'"):
         ConfusionMatrix(3).mean_iou(absent="maybe")
+
+
+def test_counts_given_at_the_start_are_copied_and_compared():
+    counts = np.array([[5, 1], [2, 3]])
+    matrix = ConfusionMatrix(2, counts=counts)
+    matrix.update(np.array([1]), np.array([0]))
+    np.testing.assert_array_equal(matrix.counts, [[5, 2], [2, 3]])
+    np.testing.assert_array_equal(counts, [[5, 1], [2, 3]])
+    assert ConfusionMatrix(2, counts=counts) == ConfusionMatrix(2, counts=counts)
+    assert ConfusionMatrix(2, counts=counts) != ConfusionMatrix(2, counts=counts.T)
+    assert ConfusionMatrix(2, counts=counts) != ConfusionMatrix(2, counts=counts, free=1)
+
+
+def test_free_may_be_any_class():
+    matrix = ConfusionMatrix(3, free=2, counts=np.array([[4, 1, 1], [0, 2, 1], [2, 0, 9]]))
+    geometry = matrix.completeness()  # occupied are 0 and 1: 7 of them right, 9 predicted, 9 true
+    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx((7 / 9, 7 / 9, 7 / 11))
+    assert matrix.mean_iou(with_free=False) == pytest.approx((4 / 8 + 2 / 4) / 2)
 
 
 def test_metrics_of_arrays_do_not_import_torch():

@@ -83,7 +83,7 @@ def test_frames_regions_and_masks_choose_what_counts(folders, world):
 def test_predictions_beside_the_data_are_found_by_the_name_of_their_grid(folders, world):
     _, truth = folders
     write_grids(truth, world[2], grid="completion", classes="carlasc11")
-    assert evaluate(truth, truth, pred_grid="completion").matrix == expected_matrix(world)
+    assert evaluate(truth, truth, grid="completion").matrix == expected_matrix(world)
 
 
 def test_one_sequence_pairs_with_one_sequence_whatever_their_paths(folders, world):
@@ -159,16 +159,20 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     pred, truth = folders
     with pytest.raises(FormatError, match="expected classes of semantickitti"):
         evaluate(pred, truth, remap="semantickitti19")
-    with pytest.raises(MissingDataError, match="expected truth for the sequence"):
+    with pytest.raises(MissingDataError, match="expected ground truth for the sequence"):
         evaluate(pred, truth / "Test")
     with pytest.raises(MissingDataError, match="grid nothing"):
-        evaluate(pred, truth, pred_grid="nothing")
+        evaluate(pred, truth, grid="nothing")
     with pytest.raises(MissingDataError, match="none in the range"):
         evaluate(pred, truth, frames=(7, 9))
-    with pytest.raises(ArgumentError, match="mask"):
+    with pytest.raises(ArgumentError, match="mask: expected known, semantickitti or all, found 'some'"):
         evaluate(pred, truth, mask="some")
-    write_grids(tmp_path / "bare", world[0])
-    assert "expected counts" in evaluate(pred, tmp_path / "bare").failures[0][1]
+    with pytest.raises(ArgumentError, match="absent: expected zero or skip"):
+        evaluate(pred, truth, absent="maybe")
+    with pytest.raises(ArgumentError, match="frames: expected a range that holds a frame"):
+        evaluate(pred, truth, frames=(2, 1))
+    write_grids(tmp_path / "without_counts", world[0])
+    assert "expected counts" in evaluate(pred, tmp_path / "without_counts").failures[0][1]
 
 
 def test_absent_classes_count_zero_or_are_left_out(folders, world, tmp_path):
@@ -196,4 +200,4 @@ def test_tables_hold_the_figures_in_percent(folders):
     latex = geometric.to_latex()
     assert r"Net\_1 & " in latex
     assert latex.count(r"\\") == 2
-    assert json.loads(json.dumps(result.figures()))["class_iou"].keys() == set(CARLASC11.names.values())
+    assert json.loads(json.dumps(result.to_dict()))["class_iou"].keys() == set(CARLASC11.names.values())

@@ -51,10 +51,15 @@ def test_semantickitti_scores_empty_voxels_but_neither_ignored_classes_nor_inval
 
 
 def test_masks_that_can_hold_nothing_are_refused():
-    with pytest.raises(ArgumentError):
+    with pytest.raises(ArgumentError, match="far_m: expected more than 5, where the band starts, found 5"):
         distance_band(SPEC, 5, 5)
-    with pytest.raises(ArgumentError):
-        field_of_view(SPEC, 0.0)
+    with pytest.raises(ArgumentError, match="near_m: expected 0 or more, found -1"):
+        distance_band(SPEC, -1, 5)
+    for angle in (0.0, 6.3):
+        with pytest.raises(ArgumentError, match=r"horizontal_rad: expected an angle in \(0, 2 pi\]"):
+            field_of_view(SPEC, angle)
+    with pytest.raises(ArgumentError, match="vertical_rad"):
+        field_of_view(SPEC, vertical_rad=(0.1, 0.1))
 
 
 def test_known_is_a_count_above_zero():
