@@ -23,6 +23,7 @@ _COMMANDS = (  # in the order of `--help`: the order in which a newcomer needs t
     "stats",
     "validate",
     "evaluate",
+    "scores",
     "render",
     "view",
     "download",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -14,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI19
+from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import ConfusionMatrix
 
 IGNORED = -1
 """Target of the classes that a convention leaves out: such a voxel of the truth does not count; predicted, it is free."""
+
+_LEFT_OUT, _UNKNOWN = 254, 255  # of the look-up tables; scored ids are below
 
 Absent = Literal["zero", "skip", "skip-truth", "nan"]
 
@@ -56,11 +59,13 @@ class Convention:
         free: id of free space among them.
         averaged: ids over which the mean is taken.
         maps: name of a class table -> id -> scored id, or IGNORED.
+        usual_truth: the class table of true labels that do not name one: what the benchmark's own files hold.
+        usual_prediction: likewise of predictions.
+        seen_by: which of the data's masks says what is known: "lidar" or "camera".
         unknown: what a voxel is that the truth never evaluated (count 0): "left out", or "free" where the benchmark cannot tell.
         absent: what a class in neither the prediction nor the truth adds to the mean: "zero"; "skip": it is left out; "skip-truth": a
             class absent from the truth is left out even where it was predicted; "nan": the mean is NaN.
         epsilon: added to the denominator of each IoU.
-        impossible: why data of a LiDAR cannot have this score; None where they can.
         notes: what else a reader must know, in one sentence.
     """
 
@@ -70,10 +75,12 @@ class Convention:
     free: int
     averaged: tuple[int, ...]
     maps: Mapping[str, Mapping[int, int]] = field(repr=False)
+    usual_truth: ClassTable
+    usual_prediction: ClassTable
+    seen_by: Literal["lidar", "camera"] = "lidar"
     unknown: Literal["left out", "free"] = "left out"
     absent: Absent = "zero"
     epsilon: float = 0.0
-    impossible: str | None = None
     notes: str = ""
 
     @property
@@ -85,17 +92,52 @@ class Convention:
         """Check that labels of a class table can be scored.
 
         Raises:
-            ArgumentError: the convention needs what these data cannot have.
-            FormatError: it has no map from these classes.
+            FormatError: the convention has no map from these classes.
         """
-        if self.impossible:
-            raise ArgumentError("convention", problem=f"{self.name}: {self.impossible}")
         if table.name not in self.maps:
             raise FormatError(
                 where,
                 expected=f"classes that the convention {self.name} has a map for ({', '.join(self.maps)})",
                 found=table.name,
             )
+
+    def prepare(
+        self,
+        prediction: tuple[NDArray[Any], ClassTable],
+        truth: tuple[NDArray[Any], ClassTable],
+        known: NDArray[np.bool_] | None,
+        region: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+        """Bring a frame into the scored classes.
+
+        Args:
+            prediction: labels of any shape, and the table of their ids.
+            truth: labels of the same shape, and the table of their ids.
+            known: voxels of the truth that were evaluated, of as many elements; None: all of them.
+            region: voxels that count, of as many elements; None: all of them.
+
+        Returns:
+            Predicted and true labels in the scored classes, and the voxels that count.
+
+        Raises:
+            FormatError: an id has no target.
+        """
+        pred, true = (
+            self._map(labels, table, name) for (labels, table), name in ((prediction, "prediction"), (truth, "truth"))
+        )
+        counted = true != _LEFT_OUT
+        if known is not None:
+            seen = known.reshape(true.shape)
+            if self.unknown == "free":
+                true = np.where(seen, true, self.free)
+                counted |= ~seen
+            else:
+                counted &= seen
+        if region is not None:
+            counted &= region.reshape(true.shape)
+        pred[pred == _LEFT_OUT] = self.free
+        true[true == _LEFT_OUT] = self.free
+        return pred, true, counted
 
     def count(
         self,
@@ -104,35 +146,8 @@ class Convention:
         known: NDArray[np.bool_] | None,
         region: NDArray[np.bool_] | None = None,
     ) -> ConfusionMatrix:
-        """Count a frame.
-
-        Args:
-            prediction: labels of any shape, and the table of their ids.
-            truth: labels of the same shape, and the table of their ids.
-            known: voxels of the truth that were evaluated, of the same shape; None: all of them.
-            region: voxels that count, of the same shape; None: all of them.
-
-        Returns:
-            Confusion of the scored classes, truth in rows.
-
-        Raises:
-            FormatError: shapes differ, or an id has no target.
-        """
-        pred, true = (
-            self._map(labels, table, name) for (labels, table), name in ((prediction, "prediction"), (truth, "truth"))
-        )
-        counted = true != IGNORED
-        if known is not None:
-            if self.unknown == "free":
-                true = np.where(known, true, self.free)
-                counted |= ~known
-            else:
-                counted &= known
-        if region is not None:
-            counted &= region
-        pred = np.where(pred == IGNORED, self.free, pred)
-        matrix = ConfusionMatrix(self.num_classes, free=self.free)
-        return matrix.update(pred, np.where(counted, true, self.free), counted)
+        """Return the confusion matrix of a frame in the scored classes; arguments and errors as for `prepare`."""
+        return ConfusionMatrix(self.num_classes, free=self.free).update(*self.prepare(prediction, truth, known, region))
 
     def score(self, matrix: ConfusionMatrix) -> ConventionScore:
         """Return the figures of a confusion matrix, which may be a sum over many frames."""
@@ -158,12 +173,11 @@ class Convention:
             1 - found.recall,
         )
 
-    def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.int16]:
-        mapping = self.maps[table.name]
-        lookup = np.full(max(mapping) + 2, np.iinfo(np.int16).min, np.int16)
-        lookup[list(mapping)] = list(mapping.values())
-        found = lookup[np.minimum(labels, len(lookup) - 1)]
-        if (unknown := found == np.iinfo(np.int16).min).any():
+    def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
+        lookup = self._lookups[table.name]
+        beyond = len(lookup) - 1  # the last entry stands for every id beyond the table's
+        found = lookup[labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)]
+        if (unknown := found == _UNKNOWN).any():
             bad = int(labels[unknown][0])
             raise FormatError(
                 where,
@@ -172,6 +186,15 @@ class Convention:
                 advice=f"the convention {self.name} has no class for it",
             )
         return found
+
+    @cached_property
+    def _lookups(self) -> dict[str, NDArray[np.uint8]]:
+        lookups = {}
+        for name, mapping in self.maps.items():
+            lookups[name] = np.full(max(mapping) + 2, _UNKNOWN, np.uint8)  # one more: for all ids beyond the last
+            for old, new in mapping.items():
+                lookups[name][old] = _LEFT_OUT if new == IGNORED else new
+        return lookups
 
 
 def convention_named(name: str) -> Convention:
@@ -183,6 +206,14 @@ def convention_named(name: str) -> Convention:
     if name not in CONVENTIONS:
         raise ArgumentError("convention", expected=f"one of {', '.join(CONVENTIONS)}", found=repr(name))
     return CONVENTIONS[name]
+
+
+def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
+    """Return a convention that scores the ids of a class table as they are: known voxels, the mean over all classes, free among them."""
+    return Convention(
+        "own", f"the data's own classes ({table.name})", table, free, tuple(sorted(table.names)), {table.name: _identity(table)},
+        table, table, notes="Scores of other data sets cannot be compared with this one.",
+    )  # fmt: skip
 
 
 def _table(name: str, names: str, free: int) -> ClassTable:
@@ -266,6 +297,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                     "carlasc11": _identity(CARLASC11),
                     "semantickitti": _via(REMAPS["semantickitti_to_carla"].mapping, REMAPS["carlasc11"].mapping),
                 },
+                CARLA,
+                CARLASC11,
                 notes="Free space is one of the classes of the mean.",
             ),
             Convention(
@@ -280,6 +313,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                     "carla": _without_zero(_via(_CARLA_TO_RAW, _RAW_TO_19)) | {13: 0, 21: 0},
                     "carlasc11": _CARLASC11_TO_19,
                 },
+                SEMANTICKITTI,
+                SEMANTICKITTI,
                 notes="Classes outside the 19 do not count in the truth; predicted, they are empty (the official script stops there).",
             ),
             Convention(
@@ -289,6 +324,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 0,
                 tuple(range(1, 19)),
                 _SSCBENCH_MAPS,
+                SEMANTICKITTI,
+                SEMANTICKITTI,
                 epsilon=1e-5,
                 notes="An unknown voxel is left out only where its label is 0; ours always are.",
             ),
@@ -299,6 +336,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 17,
                 _THINGS_AND_STUFF,
                 _OCC3D_MAPS,
+                OCC3D,
+                OCC3D,
                 absent="skip",
                 notes='"others" is one of the classes of the mean; SparseOcc\'s script is occ3d-lidar-sparseocc.',
             ),
@@ -309,6 +348,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 17,
                 _THINGS_AND_STUFF,
                 _OCC3D_MAPS,
+                OCC3D,
+                OCC3D,
                 absent="skip-truth",
                 notes="A class absent from the truth is left out of the mean even where it was predicted.",
             ),
@@ -319,8 +360,11 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 17,
                 _THINGS_AND_STUFF,
                 _OCC3D_MAPS,
+                OCC3D,
+                OCC3D,
                 absent="skip",
-                impossible="these data have no cameras, so no voxel is known to be seen by one",
+                seen_by="camera",
+                notes="Data without cameras do not know which voxels one would see: there is no such score for them.",
             ),
             Convention(
                 "openoccupancy",
@@ -330,6 +374,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 tuple(range(1, 17)),
                 {name: _via(mapping, _TO_OPENOCCUPANCY) for name, mapping in _OCC3D_MAPS.items()}
                 | {"openoccupancy": _identity(OPENOCCUPANCY) | {255: IGNORED}},
+                OPENOCCUPANCY,
+                OPENOCCUPANCY,
                 unknown="free",
                 absent="nan",
                 notes="The benchmark has no mask: a voxel that nobody saw counts as empty, and a class that is absent makes the mean NaN.",

@@ -215,7 +215,9 @@ def match_segments(
     if things is not None:
         is_thing = np.zeros(1 + max((int(side.max(initial=0)) for side in sides[::2]), default=0), np.bool_)
         is_thing[[thing for thing in things if thing < len(is_thing)]] = True
-    pred_keys, pred_size, true_keys, true_size, overlaps = _match(*sides, is_thing, may_overlap, free)
+    pred_keys, pred_size, true_keys, true_size, overlaps = _match(
+        sides[0], sides[1], sides[2], sides[3], is_thing, may_overlap, free
+    )
     same = pred_keys[overlaps[:, 0]] >> 32 == true_keys[overlaps[:, 1]] >> 32
     return Segments(pred_keys >> 32, pred_size, true_keys >> 32, true_size, overlaps[same])
 
@@ -261,9 +263,9 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
             if open_pairs[slot] != pair:
                 if open_pairs[slot] >= 0:
                     pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
-                open_pairs[slot], open_counts[slot] = pair, 0
-            open_counts[slot] += 1
-    for slot in range(_SLOTS):
+                open_pairs[slot], open_counts[slot] = pair, np.int64(0)
+            open_counts[slot] += np.int64(1)
+    for slot in np.arange(_SLOTS):
         if open_pairs[slot] >= 0:
             pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
     overlaps = np.empty((len(pairs) - 1, 3), np.int64)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,15 @@ class Comparison:
     difference: Interval
     p_value: float
     sequences: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures by name, as fractions, for JSON."""
+        return {
+            "difference": self.difference.value,
+            "interval": [self.difference.low, self.difference.high],
+            "p_value": self.p_value,
+            "sequences": list(self.sequences),
+        }
 
 
 def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95) -> Interval:

@@ -7,7 +7,7 @@ import pytest
 
 from carlasc import Grid, GridSpec
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics import distance_band, field_of_view, known, score_truth, semantickitti
+from carlasc.metrics import distance_band, field_of_view, known, score_truth
 
 SPEC = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -1.0), (4.0, 4.0, 1.0))
 
@@ -39,15 +39,6 @@ def test_vertical_field_of_view_leaves_out_what_is_above():
     seen = field_of_view(SPEC, vertical_rad=(-math.pi / 2, 0.0))
     assert seen[..., 0].all()
     assert not seen[..., 1].any()
-
-
-def test_semantickitti_scores_empty_voxels_but_neither_ignored_classes_nor_invalid_ones():
-    labels = np.array([0, 0, 1, 52, 99, 10, 252, 40], np.uint16)
-    invalid = np.array([0, 1, 0, 0, 0, 0, 0, 1])
-    np.testing.assert_array_equal(semantickitti(labels), [1, 1, 0, 0, 0, 1, 1, 1])
-    np.testing.assert_array_equal(semantickitti(labels, invalid), [1, 0, 0, 0, 0, 1, 1, 0])
-    with pytest.raises(FormatError):
-        semantickitti(labels, invalid[:3])
 
 
 def test_masks_that_can_hold_nothing_are_refused():
