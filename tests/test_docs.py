@@ -1,5 +1,6 @@
-"""What the documentation shows is so: commands and scripts run, figures are drawn anew, pages and options are all there."""
+"""The documentation is true: its commands and scripts run, its figures are up to date, each command and option exists and has a page."""
 
+import ast
 import os
 import re
 import shlex
@@ -123,6 +124,103 @@ def group():
     from typer.main import get_command
 
     return get_command(cli.app)
+
+
+def inline_code():
+    """Return (page, text) of the code between backticks in the prose of the documentation and of the README."""
+    for page, path in {"README.md": ROOT / "README.md", **PAGES}.items():
+        prose = re.sub(r"^```.*?^```$", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
+        yield from ((page, text) for text in re.findall(r"`([^`\n]+)`", prose))
+
+
+def options_named_in(text):
+    return re.findall(r"(?<!\S)--[a-z][a-z0-9-]*", text)
+
+
+def options_of_examples():
+    """Return the options of the scripts in examples/: those that are declared, and those made of the names of parameters."""
+    found = set()
+    for path in (ROOT / "examples").rglob("*.py"):
+        found.update(re.findall(r'Option\(\s*"(--[a-z-]+)"', path.read_text()))
+        found.update(
+            "--" + name.replace("_", "-") for name in re.findall(r"^    (\w+): Annotated", path.read_text(), re.M)
+        )
+    return found
+
+
+def problems_of(page, text, commands):
+    """Return what is wrong with a piece of inline code that names a command or an option."""
+    everywhere = {"--help", "--version"}
+    if named := re.match(r"carlasc ([a-z]+)\b", text):
+        if named[1] not in commands:
+            return [f"{page}: `{text}`: there is no command {named[1]}"]
+        known = commands[named[1]] | everywhere
+    elif text.startswith(("-", "carlasc -")):
+        known = set().union(*commands.values()) | everywhere | options_of_examples()
+    else:  # another program
+        return []
+    return [
+        f"{page}: `{text}`: there is no option {option}" for option in options_named_in(text) if option not in known
+    ]
+
+
+def options_of_commands():
+    return {
+        name: {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        for name, command in group().commands.items()
+    }
+
+
+def test_commands_and_options_in_the_text_exist():
+    commands = options_of_commands()
+    assert not [problem for page, text in inline_code() for problem in problems_of(page, text, commands)]
+
+
+@pytest.mark.parametrize(
+    ("text", "sound"),
+    [
+        ("carlasc info --json", True),
+        ("carlasc info --workers 2", False),
+        ("carlasc mend", False),
+        ("--overwrite", True),
+        ("--overwrite=yes --nonsense", False),
+        ("pytest --nonsense", True),
+    ],
+)
+def test_a_command_or_option_that_does_not_exist_is_found(text, sound):
+    assert (problems_of("page.md", text, options_of_commands()) == []) is sound
+
+
+def messages(part):
+    """Return patterns of the texts that the errors of the package give for a part of their message."""
+    for folder in ("carlasc", "converters"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.keyword) and node.arg == part:
+                    for text in ast.walk(node.value):
+                        if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                            yield re.escape(text.value)
+                        elif isinstance(text, ast.JoinedStr):
+                            pieces = (
+                                re.escape(str(getattr(piece, "value", ""))) if isinstance(piece, ast.Constant) else ".+"
+                                for piece in text.values
+                            )
+                            yield "".join(pieces)
+
+
+def quoted_errors():
+    """Return (page, what was expected) of each error message that the documentation quotes."""
+    for page, path in PAGES.items():
+        for text in re.findall(r"(?:carlasc: |\")[^\n\"]*?expected ([^\n\"]*)", path.read_text()):
+            yield page, re.split(r", found |\.\.\.", text)[0].strip()
+
+
+def test_error_messages_that_are_quoted_exist():
+    quoted = sorted(set(quoted_errors()))
+    patterns = [re.compile(pattern) for pattern in messages("expected")]
+    assert len(quoted) > 5
+    for page, expected in quoted:
+        assert any(pattern.fullmatch(expected) for pattern in patterns), f"{page}: no error says: expected {expected}"
 
 
 def test_every_command_has_a_page_and_every_page_a_command():

@@ -1,4 +1,4 @@
-"""The command line: one file a command, each of which parses, calls one function of the library, and prints its result."""
+"""The command line: one file per command, which parses, calls one function of the library, and prints its result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 
 from carlasc.cli.common import CommandGroup
 
-_COMMANDS = (  # in the order of `--help`: the order in which a newcomer needs them
+_COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
     "demo",
     "simulate",
     "regrid",
@@ -37,7 +37,7 @@ _SETTINGS: dict[str, Any] = {
 
 
 class _Commands(MutableMapping[str, Any]):
-    """The commands by name; a command's file is loaded when it is asked for: reading all of them takes as long as `--help` may."""
+    """The commands by name. The file of a command is imported on first use, so that `carlasc COMMAND` imports only one."""
 
     def __init__(self) -> None:
         self._loaded: dict[str, Any] = {
@@ -46,9 +46,9 @@ class _Commands(MutableMapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         if self._loaded[name] is None:
-            alone = typer.Typer(add_completion=False, **_SETTINGS)
-            alone.command(name)(getattr(importlib.import_module(f"carlasc.cli.{name}"), name))
-            self._loaded[name] = _without_flag_types(typer.main.get_command(alone))
+            single = typer.Typer(add_completion=False, **_SETTINGS)
+            single.command(name)(getattr(importlib.import_module(f"carlasc.cli.{name}"), name))
+            self._loaded[name] = _without_flag_types(typer.main.get_command(single))
         return self._loaded[name]
 
     def __setitem__(self, name: str, command: Any) -> None:
@@ -65,7 +65,7 @@ class _Commands(MutableMapping[str, Any]):
 
 
 def _without_flag_types(command: Any) -> Any:
-    """Take the type out of the help of flags: "--overwrite <bool>" would say that a value follows."""
+    """Remove the type from the help of flags: "--overwrite <bool>" would mean that a value follows."""
     for parameter in command.params:
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
@@ -87,12 +87,12 @@ app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
     **_SETTINGS,
-    help="Read, convert, regenerate and train on CarlaSC: complete, trace-free semantic scenes.",
+    help="Read, convert, regenerate and score CarlaSC data: complete, trace-free semantic scenes.",
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         from carlasc import __version__
 
         typer.echo(__version__)

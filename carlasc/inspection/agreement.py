@@ -1,8 +1,8 @@
-"""Do the scans lie in the voxels of their grid? And if not: which mistake, undone, would put them there?
+"""The agreement of scans with a grid: how many points lie in voxels of their class, and which known mistake explains a low share.
 
-The share of labelled points that fall in voxels of their class is measured as things stand, with the points' axes changed in the ways in which they
-are commonly mistaken, and with the grid shifted by one cell each way. Only points in known voxels count, so that a grid with gaps is no worse
-than a full one, as long as enough of them are known.
+The share of labelled points that fall in voxels of their class is measured for the data as they are, for points whose axes are changed in
+the ways that are common mistakes, and for the grid shifted by one cell in each direction. Only points in known voxels count, so that a grid
+with unknown voxels is not rated lower than a full one.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ from carlasc.core.grids import Grid, GridSpec
 
 _MIN_POINTS = 100
 _MAX_POINTS = 20_000
-_GAIN = 0.01  # a mistake undone must put this share of the points right, more than chance could,
-_MISSES = 1.15  # leave so many times fewer wrong, or
-_LARGE_GAIN = 0.05  # put as many right as this,
-_WINS = 0.75  # and do better on this share of the frames
-_TIE = 0.005
+# A mistake is reported if undoing it raises the share of right points by _GAIN and by more than chance could, and either reduces
+# the wrong points by the factor _FEWER_WRONG or raises the share by _LARGE_GAIN; and if it does so on the share _WINS of the frames.
+_GAIN = 0.01
+_FEWER_WRONG = 1.15
+_LARGE_GAIN = 0.05
+_WINS = 0.75
+_TIE = 0.005  # of two mistakes whose shares differ by less, the first is reported
 
-_AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # what the points look like; the matrix that undoes it
+_AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # description of the mistake, and the matrix that undoes it
     ("points with y mirrored against the grid", np.diag([1.0, -1, 1])),
     ("points with x mirrored against the grid", np.diag([-1.0, 1, 1])),
     ("points turned by half a turn against the grid", np.diag([-1.0, -1, 1])),
@@ -36,20 +38,20 @@ _AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # what the points look l
     ("points in camera axes (x right, y down, z forward)", np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])),
 )
 _STEPS = (-1, 0, 1)
-_SHIFTS = tuple(  # the nearer cells first
+_SHIFTS = tuple(  # nearest first
     sorted(((x, y, z) for x in _STEPS for y in _STEPS for z in _STEPS if x or y or z), key=lambda s: sum(map(abs, s)))
 )
 
 
 @dataclass(frozen=True)
 class GridDiagnosis:
-    """What a grid's scans say of it.
+    """The agreement of a grid with its scans.
 
     Attributes:
-        share: mean share of points in known space that lie in a voxel of their class; NaN where no frame had enough points.
-        occupied_share: the same for voxels of any class but free.
+        share: mean share of the points in known voxels whose voxel has their class; NaN if no frame had enough points.
+        occupied_share: the same share, where a voxel of any class but free is right.
         frames: number of frames with enough points.
-        mistake: what it looks like, None where the scans fit best as they stand.
+        mistake: description of the mistake that explains the share; None if the data fit best as they are.
         corrected_share: the share with the mistake undone.
     """
 
@@ -62,13 +64,12 @@ class GridDiagnosis:
 
 @dataclass
 class GridEvidence:
-    """Gathers, frame by frame, how well scans lie in a grid as they stand and with each mistake undone."""
+    """Measures, frame by frame, the agreement of scans with a grid: as they are, and with each known mistake undone."""
 
     spec: GridSpec
-    _right: list[NDArray[np.int64]] = field(
-        default_factory=list
-    )  # a frame: points in voxels of their class, by candidate
-    _known: list[NDArray[np.int64]] = field(default_factory=list)  # and points in known voxels
+    # per frame, (1 + mistakes,) number of points in voxels of their class, and in known voxels; first for the data as they are
+    _right: list[NDArray[np.int64]] = field(default_factory=list)
+    _known: list[NDArray[np.int64]] = field(default_factory=list)
     _occupied: list[float] = field(default_factory=list)
 
     def add(self, points: NDArray[np.floating], labels: NDArray[np.integer] | None, grid: Grid) -> None:
@@ -76,8 +77,8 @@ class GridEvidence:
 
         Args:
             points: (N, 3) metres, finite.
-            labels: (N,) classes, 0 is unlabelled and left out; None compares with any class but free.
-            grid: of this frame, of `spec`.
+            labels: (N,) class ids; points with id 0 are unlabelled and left out. None compares with any class but free.
+            grid: the grid of this frame, with geometry `spec`.
         """
         if labels is not None:
             points, labels = points[labels != 0], labels[labels != 0]
@@ -85,24 +86,24 @@ class GridEvidence:
         points, labels = points[::step], None if labels is None else labels[::step]
         as_is = _place(points, self.spec)
         own = _look_up(as_is, labels, grid)
-        verdicts = [own, *(_look_up(_place(points @ matrix.T, self.spec), labels, grid) for _, matrix in _AXES)]
-        if max(verdict.known.sum() for verdict in verdicts) < _MIN_POINTS:
+        matches = [own, *(_look_up(_place(points @ matrix.T, self.spec), labels, grid) for _, matrix in _AXES)]
+        if max(match.known.sum() for match in matches) < _MIN_POINTS:
             return
         for shift in _SHIFTS:
             shifted, within = as_is.shifted(shift, self.spec)
-            there = _look_up(shifted, labels, grid)
-            # points whose content the shift has pushed out of the grid speak neither for it nor against it
-            verdicts.append(_Verdicts(*(np.append(n, o[~within]) for n, o in zip(there, own, strict=True))))
-        self._right.append(np.array([np.count_nonzero(verdict.right) for verdict in verdicts]))
-        self._known.append(np.array([np.count_nonzero(verdict.known) for verdict in verdicts]))
+            moved = _look_up(shifted, labels, grid)
+            # points whose voxel is outside the grid after the shift count as they did before
+            matches.append(_Match(*(np.append(new, old[~within]) for new, old in zip(moved, own, strict=True))))
+        self._right.append(np.array([np.count_nonzero(match.right) for match in matches]))
+        self._known.append(np.array([np.count_nonzero(match.known) for match in matches]))
         occupied = _look_up(as_is, None, grid)
         self._occupied.append(float(occupied.right.sum() / max(occupied.known.sum(), 1)))
 
     def diagnose(self) -> GridDiagnosis:
-        """Say which mistake, if any, explains the frames seen so far.
+        """Return the share of right points over the frames added so far, and the mistake, if any, that explains it.
 
-        A point votes where it is, so the right candidate has the most points in known space. Candidates are compared by the points that they put
-        right among so many: one that throws most of them out of the grid is not better for the few that it keeps.
+        The data as they are and with each mistake undone are compared by the number of right points, divided by the largest number of points
+        in known voxels that any of them has: one that moves most points out of the grid does not win by the few that stay.
         """
         if not self._right:
             return GridDiagnosis(float("nan"), float("nan"), 0)
@@ -113,7 +114,7 @@ class GridEvidence:
         best = 0
         for column in range(1, shares.shape[1]):
             gain = means[column] - means[0]
-            fewer = 1 - means[0] > _MISSES * (1 - means[column])
+            fewer = 1 - means[0] > _FEWER_WRONG * (1 - means[column])
             clear = gain > max(_GAIN, chance) and (fewer or gain > _LARGE_GAIN)
             better = best == 0 or means[column] > means[best] + _TIE
             if clear and better and (shares[:, column] > shares[:, 0]).mean() >= _WINS:
@@ -127,22 +128,22 @@ class GridEvidence:
 
 @dataclass(frozen=True)
 class _Placement:
-    """The cells (M, 3) of the points that are in the grid, and which of all points those are."""
+    """The points that are in a grid: their cells (M, 3), and their indices (M,) among all points."""
 
     cells: NDArray[np.int32]
     points: NDArray[np.int64]
 
     def shifted(self, shift: tuple[int, int, int], spec: GridSpec) -> tuple[_Placement, NDArray[np.bool_]]:
-        """The same where the grid's content stands `shift` cells too far along its axes, and which of the cells still exist then."""
+        """Return the placement in a grid whose labels are `shift` cells too far along its axes, and (M,) which cells are still inside."""
         cells = self.cells + np.array(shift, np.int32)
         if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
-            cells[:, 1] %= spec.size[1]  # the azimuth goes round
+            cells[:, 1] %= spec.size[1]  # the azimuth is periodic
         within = np.all((cells >= 0) & (cells < np.array(spec.size)), axis=1)
         return _Placement(cells[within], self.points[within]), within
 
 
-class _Verdicts(NamedTuple):
-    """For each placed point, whether its voxel is known, and whether it is known and of the point's class."""
+class _Match(NamedTuple):
+    """For each point in the grid, whether its voxel is known, and whether it is known and has the class of the point."""
 
     known: NDArray[np.bool_]
     right: NDArray[np.bool_]
@@ -153,14 +154,15 @@ def _place(points: NDArray[np.floating], spec: GridSpec) -> _Placement:
     return _Placement(cells[inside], np.flatnonzero(inside))
 
 
-def _look_up(placement: _Placement, labels: NDArray[np.integer] | None, grid: Grid) -> _Verdicts:
+def _look_up(placement: _Placement, labels: NDArray[np.integer] | None, grid: Grid) -> _Match:
     index = np.ravel_multi_index(tuple(placement.cells.T), grid.spec.size)
     voxels = grid.labels.reshape(-1)[index]
     known = np.ones(len(voxels), np.bool_) if grid.counts is None else grid.counts.reshape(-1)[index] > 0
-    return _Verdicts(known, known & (voxels != 0 if labels is None else voxels == labels[placement.points]))
+    return _Match(known, known & (voxels != 0 if labels is None else voxels == labels[placement.points]))
 
 
 def _mistake(column: int, spec: GridSpec) -> str:
+    """Return the description of a mistake by its place among all of them; 0 is none."""
     if column <= len(_AXES):
         return _AXES[column - 1][0]
     shift = _SHIFTS[column - 1 - len(_AXES)]

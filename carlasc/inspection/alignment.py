@@ -1,9 +1,8 @@
-"""Do the poses put the scans on each other? And if not: which mistake, undone, would?
+"""The agreement of poses with scans: how well scans overlap under the poses, and which known mistake explains a poor overlap.
 
-A later scan's structure, moved by the poses, must land on an earlier scan's. The share of its points that do is measured for the poses as they
-stand and for the poses with each known mistake undone. Poses are wrong when a mistake undone puts clearly more points in
-place, over most of the pairs of scans on which the two differ at all: a drive straight on cannot tell a mirrored y, and is not
-made worse by one.
+The structure of a scan, moved by the poses, must fall on the structure of an earlier scan. The share of its points that do is measured for
+the poses as they are, and for the poses with each known mistake undone. Poses are reported as wrong if undoing a mistake clearly raises this
+share on most of the pairs of scans on which it makes a difference at all: on a straight road, for instance, a mirrored y axis makes none.
 """
 
 from __future__ import annotations
@@ -22,30 +21,30 @@ from carlasc.inspection.structure import MAX_RANGE_M
 Poses: TypeAlias = NDArray[np.float64]
 
 _VOXEL_M = 0.4
-_LEVER_M = 15.0  # how far away a turn is felt when two motions are compared
+_LEVER_M = 15.0  # motions are compared by what they do to a point at this distance
 _DIFFERENT_M = 0.3
 _MIN_POINTS = 150
 _MAX_POINTS = 6000
 _OFFSET_POINTS = 1500
 _OFFSET_PAIRS = 12
-_OFFSET_SHARE = 0.3  # of the pairs must be off, and clearly: the sensor may stand for most of a drive
-_GOOD = 0.75  # poses that put this much of the structure in place are not searched for an offset
-_STRIDE_M = 2.0  # scans of a pair are this far apart, in metres or
-_STRIDE_RAD = np.deg2rad(10.0)  # in angle: enough to tell, not so far that they see different things
-_REACH = 10  # frames that a pair may be apart
-_GAIN = 0.05  # how much more of the structure a correction must put in place
-_WINS = 0.75  # on which share of the pairs
-_TIE = 0.01
+_OFFSET_SHARE = 0.3  # share of the pairs that must have an offset: the sensor may stand still for most of a drive
+_GOOD = 0.75  # no offset is searched for poses with this share of overlap
+_STRIDE_M = 2.0  # the scans of a pair are this far apart, or
+_STRIDE_RAD = np.deg2rad(10.0)  # turned by this angle: enough to see a mistake, little enough for the scans to overlap
+_REACH = 10  # the scans of a pair are at most this number of frames apart
+_GAIN = 0.05  # a correction must raise the share of overlap by this
+_WINS = 0.75  # on this share of the pairs
+_TIE = 0.01  # of two corrections whose shares differ by less, the first is taken
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A way in which poses are commonly wrong, with its undoing.
+    """A common mistake in poses, and how to undo it.
 
     Attributes:
-        name: what the poses look like, to be read after "they look like".
-        advice: what to do.
-        undo: takes (F, 4, 4) poses as they stand to what they would be without the mistake.
+        name: description of poses with this mistake.
+        advice: how to correct the file.
+        undo: maps (F, 4, 4) poses with the mistake to the poses without it.
     """
 
     name: str
@@ -55,15 +54,15 @@ class Correction:
 
 @dataclass(frozen=True)
 class PoseDiagnosis:
-    """What the scans say of the poses.
+    """The agreement of poses with scans.
 
     Attributes:
-        share: mean share of structure that the poses as they stand put in place.
-        pairs: number of pairs of scans with enough structure; 0 means that nothing can be said.
-        correction: the mistake that, undone, puts clearly more of it in place; None where the poses stand.
-        corrected_share: the share with it undone, over the pairs on which it differs.
-        share_there: the share of the poses as they stand, over the same pairs.
-        offset_m: (3,) where no known mistake explains it: how far, about, the poses put a scan beside its place a pair; None otherwise.
+        share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses as they are.
+        pairs: number of pairs of scans with enough structure; with 0 there is no result.
+        correction: the mistake that, undone, raises the share clearly; None if there is none.
+        corrected_share: the share with the mistake undone, over the pairs on which this makes a difference.
+        share_there: the share of the poses as they are, over the same pairs.
+        offset_m: (x, y, z) median distance between where the poses put a scan and where it fits, if no known mistake explains it; else None.
     """
 
     share: float
@@ -77,12 +76,12 @@ class PoseDiagnosis:
 def diagnose_poses(
     structure: Callable[[int], NDArray[np.float64]], poses: Poses, *, max_pairs: int = 24
 ) -> PoseDiagnosis:
-    """Align scans under their poses, and under the poses with each known mistake undone.
+    """Measure the overlap of scans under their poses, and under the poses with each known mistake undone.
 
     Args:
-        structure: returns the (M, 3) static structure of the i-th scan, metres, sensor frame (see `static_structure`).
+        structure: returns the (M, 3) structure of the i-th scan, metres, in the frame of the sensor (see `static_structure`).
         poses: (F, 4, 4) float64 first_T_sensor of each scan, in order of time; rigid.
-        max_pairs: how many pairs of scans to look at.
+        max_pairs: largest number of pairs of scans that are compared.
     """
     corrections = known_corrections()
     corrected = [poses, *(correction.undo(poses) for correction in corrections)]
@@ -107,32 +106,34 @@ def diagnose_poses(
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
-    """Choose pairs of scans a stride apart: half of them spread over the drive, half where it turns most."""
+    """Choose pairs of scans some metres apart: half of them spread over the drive, half where the sensor turns most."""
     if len(poses) < 2:
         return []
     candidates = [(first, _partner(poses, first)) for first in range(len(poses) - 1)]
     spread = {candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)}
     turns = [_angle(relative(poses, first, second)) for first, second in candidates]
     turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
-    # neighbours see the same turn: take one in three of the sharpest
+    # neighbouring pairs are in the same turn: take every third of the sharpest
     return sorted(spread | set(turning[: 3 * (max_pairs // 2) : 3]))
 
 
 def known_corrections() -> tuple[Correction, ...]:
-    """Return the mistakes that are looked for, the commoner ones first: a tie goes to the first."""
+    """Return the mistakes that are searched for, more common ones first: of two equally good ones the first is reported."""
     axes = [Correction(name, advice, _in_axes(matrix)) for name, advice, matrix in _axes_mistakes()]
     others = [
         Correction(
-            "transposed rotations", "write R, not its transpose (is the file read column by column?)", _transpose
+            "transposed rotations",
+            "write R instead of its transpose; the matrices may have been read column by column",
+            _transpose,
         ),
         Correction(
             "inverted transforms (first frame to sensor)",
-            "write sensor-to-first-frame: invert them",
+            "write the transforms from the sensor to the first frame: invert them",
             invert,
         ),
         Correction(
-            "poses of a sensor that moves, with scans that do not",
-            "the scans are in one common frame already, or the poses are of another sequence",
+            "poses of a moving sensor beside scans that are all in one frame",
+            "move each scan to the frame of its own sensor, or take the poses of this sequence",
             lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
         ),
     ]
@@ -145,27 +146,31 @@ def relative(poses: Poses, earlier: int, later: int) -> Transform:
 
 
 def _best_correction(shares: NDArray[np.float64], differs: NDArray[np.bool_]) -> tuple[int, float, float] | None:
-    """Weigh (P, 1 + C) shares, column 0 those of the poses as they stand; a correction counts on the pairs on which it differs.
+    """Choose the correction with the best overlap.
+
+    Args:
+        shares: (P, 1 + C) share of overlap of each pair, in column 0 for the poses as they are, then for each correction.
+        differs: (P, 1 + C) whether the motion of the pair differs from that of column 0; a correction is judged by these pairs only.
 
     Returns:
-        The column of the best correction, and the shares without and with it on those pairs; None if none is clearly better.
+        The column of the best correction, and the mean shares without and with it on those pairs; None if none is clearly better.
     """
     own, best, best_total = shares[:, 0], None, -1.0
     for column in range(1, shares.shape[1]):
-        there = differs[:, column]
-        gain = (shares[:, column] - own)[there]
-        if not there.any() or gain.mean() < _GAIN or (gain > 0).mean() < _WINS:
+        judged = differs[:, column]
+        gain = (shares[:, column] - own)[judged]
+        if not judged.any() or gain.mean() < _GAIN or (gain > 0).mean() < _WINS:
             continue
-        total = float(np.where(there, shares[:, column], own).mean())
+        total = float(np.where(judged, shares[:, column], own).mean())
         if total > best_total + _TIE:
-            best, best_total = (column, float(own[there].mean()), float(shares[there, column].mean())), total
+            best, best_total = (column, float(own[judged].mean()), float(shares[judged, column].mean())), total
     return best
 
 
 def _common_offset(
     structure: Callable[[int], NDArray[np.float64]], poses: Poses, pairs: list[tuple[int, int]]
 ) -> tuple[float, float, float] | None:
-    """Slide each later scan beside where the poses put it: where does most of it find structure, pair for pair?"""
+    """Return the median of the offsets at which the later scans of pairs overlap best; None if few pairs have a clear one."""
     steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * _VOXEL_M
     offsets, chosen = [], pairs[:: max(1, len(pairs) // _OFFSET_PAIRS)]
     for earlier, later in chosen:
@@ -182,12 +187,11 @@ def _common_offset(
 
 
 def _partner(poses: Poses, first: int) -> int:
-    """The next scan a stride away, or the last within reach; one of the next where the sensor, says the pose, stands."""
+    """Return the next scan that is far enough away, or the last within reach; one of the next scans if the poses do not move."""
     last = min(first + _REACH, len(poses) - 1)
     if _distance(poses[first], poses[last]) < _DIFFERENT_M:
-        return min(
-            first + (1, 4)[first % 2], last
-        )  # it may not: near enough to find a fast one, far enough for a slow one
+        # the sensor may have moved all the same: one frame apart shows a fast motion, four frames apart a slow one
+        return min(first + (1, 4)[first % 2], last)
     for second in range(first + 1, last):
         motion = relative(poses, first, second)
         if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or _angle(motion) >= _STRIDE_RAD:
@@ -196,6 +200,7 @@ def _partner(poses: Poses, first: int) -> int:
 
 
 def _occupancy(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return a grid of cells of 0.4 m about the sensor: which of them hold points."""
     cells = int(2 * MAX_RANGE_M / _VOXEL_M)
     occupied = np.zeros((cells, cells, cells), np.bool_)
     occupied[tuple(_cells(points)[0].T)] = True
@@ -209,6 +214,7 @@ def _cells(points: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.b
 
 
 def _share(occupied: NDArray[np.bool_], points: NDArray[np.float64]) -> float:
+    """Return the share of the points that are in occupied cells."""
     cells, _ = _cells(points)
     return float(np.count_nonzero(occupied[tuple(cells.T)])) / len(points)
 
@@ -222,7 +228,7 @@ def _angle(motion: Transform) -> float:
 
 
 def _distance(a: Transform, b: Transform) -> float:
-    """How far apart two motions put a point 15 m away."""
+    """Return about how far apart, in metres, two motions put a point that is 15 m away."""
     between = invert(a) @ b
     return float(np.linalg.norm(between[:3, 3]) + _LEVER_M * _angle(between))
 
@@ -234,29 +240,28 @@ def _transpose(poses: Poses) -> Poses:
 
 
 def _in_axes(stored_T_sensor: NDArray[np.float64]) -> Callable[[Poses], Poses]:
-    """Undo a change of axes: the poses were written in axes that `stored_T_sensor` (3, 3) takes the sensor's to."""
+    """Return what undoes a change of axes: the poses are stored in axes that `stored_T_sensor` (3, 3) maps the sensor's to."""
     change = np.eye(4)
     change[:3, :3] = stored_T_sensor
     return lambda poses: change.T @ poses @ change
 
 
 def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
-    """All 47 other ways to call the axes, signs included; the ones with a name in the field first."""
+    """Return all 47 other choices of axes and their signs: (description, advice, matrix); well-known ones first."""
     mirrored = np.diag([1.0, -1.0, 1.0])
-    camera_of_kitti = np.array(
-        [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]
-    )  # x right, y down, z forward from x forward, y left
-    camera_advice = "take them to the LiDAR's frame: inv(Tr) @ P @ Tr, Tr from calib.txt"
+    # x right, y down, z forward, from x forward, y left, z up
+    camera_of_kitti = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    camera_advice = "convert them to the frame of the LiDAR: inv(Tr) @ P @ Tr, Tr from calib.txt"
     mistakes = [
         (
             "poses with y mirrored against the scans",
-            "scans and poses must share one handedness: mirror y in both (S @ P @ S with S = diag(1, -1, 1, 1)) or in neither",
+            "scans and poses must have the same handedness: mirror y in both (S @ P @ S with S = diag(1, -1, 1, 1)) or in neither",
             mirrored,
         ),
         ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti),
         ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti @ mirrored),
-        ("camera-frame poses with their y mirrored", camera_advice, mirrored @ camera_of_kitti),
-        ("camera-frame poses with their y mirrored", camera_advice, mirrored @ camera_of_kitti @ mirrored),
+        ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti),
+        ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti @ mirrored),
     ]
     known = [np.eye(3), *(matrix for _, _, matrix in mistakes)]
     for order in itertools.permutations(range(3)):
@@ -268,6 +273,6 @@ def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
                     f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for sign, axis in zip(signs, order, strict=True)
                 )
                 kind = "camera-frame poses" if order[2] == 0 else "poses in other axes than the scans"
-                advice = camera_advice if order[2] == 0 else "take them to the scans' axes"
-                mistakes.append((f"{kind} (their x, y, z are {names})", advice, matrix))
+                advice = camera_advice if order[2] == 0 else "convert them to the axes of the scans"
+                mistakes.append((f"{kind} (x, y, z are {names})", advice, matrix))
     return mistakes

@@ -1,4 +1,4 @@
-"""Checks of a sequence's files, one by one and against each other: sizes, counts of frames, values."""
+"""Checks of the files of a sequence, alone and against each other: sizes, numbers of frames, values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PER_POINT = ("labels", "flow", "instances")
 
 
 def check_documents(sequence: Sequence) -> Iterator[Finding]:
-    """Check carlasc.json and each grid's params.json, and that there is something to read at all."""
+    """Check carlasc.json and the params.json of each grid, and that the sequence holds data."""
     where = sequence.location
     described = True
     try:
@@ -35,11 +35,11 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
         yield Finding.from_error("params", sequence.path, where, error)
         return
     if not sequence.fields():
-        advice = "is the sequence whole? Copy it again, or give another folder"
+        advice = "the sequence is empty or not complete: copy it again, or give another folder"
         yield Finding("error", "empty", sequence.path, where, "scans or grids", "none", advice)
     elif not grids:
-        advice = "scans only: `carlasc regrid` makes grids, or give eval_*.zip as the grids' root"
-        yield Finding("note", "no-grids", sequence.path, where, "an evaluation folder", "no grid", advice)
+        advice = "make grids with `carlasc regrid`, or read those of eval_*.zip with `grids_source`"
+        yield Finding("note", "no-grids", sequence.path, where, "a folder of grids", "scans only", advice)
     if isinstance(sequence, FolderSequence):
         yield from _check_grid_folders(sequence, set(grids))
     for name, spec in grids.items():
@@ -49,7 +49,7 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
         try:
             classes = sequence.classes_of(name)
         except CarlascError as error:
-            if described:  # else it is the same error again
+            if described:  # otherwise it is the same error
                 yield Finding.from_error("params", sequence.path, file, error)
         if not isinstance(channels, int | float) or (classes is not None and channels < max(classes.names) + 1):
             expected = f"num_channels of at least {max(classes.names) + 1}" if classes else "a number in num_channels"
@@ -58,31 +58,31 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
             expected = f"a {sequence.coordinates} grid, as the folder says"
             yield Finding("warning", "params", sequence.path, file, expected, f"a {spec.coordinates} one")
         if f"{name}/counts" not in sequence.fields() and sequence.predicted_by(name) is None:
-            folder, advice = f"{where}/{name}", "every voxel will be taken for known"
+            folder, advice = f"{where}/{name}", "without counts, all voxels are taken to be known"
             yield Finding("warning", "frame-counts", sequence.path, folder, "counts beside the labels", "none", advice)
 
 
 def _check_grid_folders(sequence: FolderSequence, grids: set[str]) -> Iterator[Finding]:
-    """A folder of grids without its params.json is no field of a sequence, and would go unseen."""
+    """Check that each folder of grids has its params.json: a sequence does not list a folder without it."""
     for folder in sorted(Path(sequence.location).glob(f"{layout.EVALUATION}*/")):
         if folder.name not in grids and folder.is_dir():
-            file, advice = str(folder / layout.PARAMS), "readers pass the folder over: copy the file"
+            file, advice = str(folder / layout.PARAMS), "the grid is ignored without it: copy the file"
             yield Finding("error", "params", sequence.path, file, "the grid's geometry", "no file", advice)
 
 
 def check_frames(sequence: Sequence) -> Iterator[Finding]:
-    """Check that frames follow each other, and that every field has the frames that it must."""
+    """Check that frame numbers have no gaps, and that each field has the frames that it must have."""
     fields, frames = sequence.fields(), sequence.scan_frames()
     gaps = np.flatnonzero(np.diff(frames) > 1)
     if len(gaps):
         missing = int((np.diff(frames)[gaps] - 1).sum())
         first, then = int(frames[gaps[0]]), int(frames[gaps[0] + 1])
-        found = f"{len(gaps)} gaps, {missing} frames missing; the first after {first}, before {then}"
-        advice = "history does not cross a gap; if the frames were not left out on purpose, copy them again"
-        # a grid every fifth frame is a choice, a hole in the scans seldom is
+        found = f"{len(gaps)} gaps, {missing} frames missing; the first gap is between {first} and {then}"
+        advice = "histories of scans do not cross a gap; unless the frames were left out on purpose, copy them again"
+        # grids are often made for every fifth frame only, but gaps between scans are rarely wanted
         severity: Severity = "warning" if "points" in fields else "note"
         yield Finding(
-            severity, "frame-gaps", sequence.path, sequence.location, "frames that follow each other", found, advice
+            severity, "frame-gaps", sequence.path, sequence.location, "consecutive frame numbers", found, advice
         )
     if "points" in fields:
         for name in (*_PER_POINT, "bev"):
@@ -92,7 +92,9 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
         parts = [part for part in ("labels", "counts", "votes") if f"{grid}/{part}" in fields]
         if "labels" not in parts:
             where = f"{sequence.location}/{grid}"
-            yield Finding("error", "frame-counts", sequence.path, where, "labels of a grid", f"only {', '.join(parts)}")
+            yield Finding(
+                "error", "frame-counts", sequence.path, where, "labels of the grid", f"only {', '.join(parts)}"
+            )
             continue
         for part in parts[1:]:
             yield from _compare_frames(sequence, f"{grid}/{part}", f"{grid}/labels", "error")
@@ -101,7 +103,7 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
 
 
 def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Iterator[Finding]:
-    """Check that each of a frame's files has a size that fits params.json and the others; values are left alone."""
+    """Check that the size of each file of a frame fits params.json and the other files. Values are not checked."""
     fields = [name for name in sequence.fields() if _has(sequence, name, frame) and (with_grids or "/" not in name)]
     count: int | None = None
     for name in sorted(fields, key=lambda name: (name != "points", name)):
@@ -109,27 +111,33 @@ def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Ite
         try:
             array = sequence.read(name, frame)
         except CarlascError as error:
-            yield Finding.from_error("file-size", sequence.path, where, error, "copy or make the file again")
+            yield Finding.from_error("file-size", sequence.path, where, error, "copy the file again, or make it again")
             continue
         if name == "points":
             count = len(array)
             if count == 0:
                 yield Finding("warning", "empty-scan", sequence.path, where, "points", "an empty scan")
         elif name in _PER_POINT and count is not None and len(array) != count:
-            expected = f"{count} rows, one a point of {_file(sequence, 'points', frame)}"
+            expected = f"{count} rows, one per point of {_file(sequence, 'points', frame)}"
             yield Finding(
-                "error", "point-counts", sequence.path, where, expected, f"{len(array)}", "copy or make both again"
+                "error",
+                "point-counts",
+                sequence.path,
+                where,
+                expected,
+                f"{len(array)} rows",
+                "copy both files again, or make them again",
             )
 
 
 def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
-    """Check what is in a frame's files; those that cannot be read are `check_shapes`'s to report."""
+    """Check the values in the files of a frame. Files that cannot be read are skipped: `check_shapes` reports them."""
     arrays = _read_all(sequence, frame)
     for name in ("points", "flow"):
         if name in arrays:
             rows = np.isfinite(arrays[name]).all(axis=1)
             if not rows.all():
-                found = f"NaN or infinity in {int((~rows).sum())} rows, the first {int(np.argmin(rows))}"
+                found = f"NaN or infinity in {int((~rows).sum())} rows, first in row {int(np.argmin(rows))}"
                 yield Finding(
                     "error", "not-finite", sequence.path, _file(sequence, name, frame), "finite numbers", found
                 )
@@ -158,19 +166,19 @@ def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, 
     counts, file = arrays[f"{grid}/counts"], _file(sequence, f"{grid}/counts", frame)
     whole = (counts >= 0) & (counts == np.floor(counts)) & np.isfinite(counts)
     if not whole.all():
-        found = f"{counts[~whole][0]:g} and {int((~whole).sum()) - 1} more such"
+        found = f"{counts[~whole][0]:g}, and {int((~whole).sum()) - 1} other such values"
         yield Finding("error", "counts", sequence.path, file, "whole numbers of votes, 0 or more", found)
-    unfounded = int(np.count_nonzero((labels != 0) & ~(counts > 0)))
-    if unfounded:
-        found = f"{unfounded} voxels with a label and no vote"
-        advice = "labels and counts are of different frames or runs: make the grid again"
-        yield Finding("error", "counts", sequence.path, file, "a vote in each voxel that has a label", found, advice)
+    without_vote = int(np.count_nonzero((labels != 0) & ~(counts > 0)))
+    if without_vote:
+        found = f"{without_vote} voxels with a label but no vote"
+        advice = "labels and counts belong to different frames or runs: make the grid again"
+        yield Finding("error", "counts", sequence.path, file, "a vote in each voxel with a label", found, advice)
     if not (counts > 0).any():
-        yield Finding("warning", "counts", sequence.path, file, "known voxels", "a grid without any vote")
+        yield Finding("warning", "counts", sequence.path, file, "known voxels", "no vote in the whole grid")
 
 
 def _classes_of(sequence: Sequence, grid: str) -> ClassTable | None:
-    """The classes of a grid's labels; None where its params.json names unknown ones, which `check_documents` reports."""
+    """Return the class table of a grid's labels; None if params.json names an unknown one, which `check_documents` reports."""
     try:
         return sequence.classes_of(grid)
     except CarlascError:
@@ -188,26 +196,31 @@ def _check_classes(
     ids, counts = np.unique(labels, return_counts=True)
     unknown = [(int(i), int(n)) for i, n in zip(ids, counts, strict=True) if int(i) not in classes.names]
     found = ", ".join(f"{i} ({n} times)" for i, n in unknown[:5]) + (" and more" if len(unknown) > 5 else "")
-    advice = f"wrong file, or wrong `classes` in {layout.METADATA}"
-    yield Finding("error", "class-ids", sequence.path, where, f"ids of the classes of {classes.name}", found, advice)
+    advice = f"the file or the classes in {layout.METADATA} are wrong"
+    yield Finding("error", "class-ids", sequence.path, where, f"class ids of {classes.name}", found, advice)
 
 
 def _compare_frames(
     sequence: Sequence, field: str, reference: str, severity: Severity, orphans: Severity | None = None
 ) -> Iterator[Finding]:
-    """Compare the frames of a field with those of the one that it belongs to."""
+    """Compare the frames of a field with those of the field that it belongs to.
+
+    Missing frames are findings of `severity`; frames that the other field lacks are of severity `orphans`, by default the same.
+    """
     have, wanted = _frame_set(sequence, field), _frame_set(sequence, reference)
     missing, extra = sorted(wanted - have), sorted(have - wanted)
     where = f"{sequence.location}/{layout.field_named(field).folder}"
     if missing:
         expected = f"{field} for each of the {len(wanted)} frames of {reference}"
-        yield Finding(severity, "frame-counts", sequence.path, where, expected, f"none for {_some(missing)}")
+        yield Finding(severity, "frame-counts", sequence.path, where, expected, f"none for {_first_of(missing)}")
     if extra:
-        found = f"{len(extra)} more: {_some(extra)}"
-        yield Finding(orphans or severity, "frame-counts", sequence.path, where, f"only frames of {reference}", found)
+        found = f"{len(extra)} more: {_first_of(extra)}"
+        yield Finding(
+            orphans or severity, "frame-counts", sequence.path, where, f"only the frames of {reference}", found
+        )
 
 
-def _some(frames: list[int]) -> str:
+def _first_of(frames: list[int]) -> str:
     shown = ", ".join(f"{frame:06d}" for frame in frames[:3])
     return f"{shown}{f' and {len(frames) - 3} more' if len(frames) > 3 else ''}"
 

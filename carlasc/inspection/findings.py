@@ -1,16 +1,15 @@
-"""What the checks have to say: a finding is one fault, in one place, with what to do about it."""
+"""The results of the checks: a finding is one fault in one place, with advice."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+from carlasc.errors import CarlascError
 
-_HOUSE_FORM = re.compile(r"(?P<where>.*?): expected (?P<expected>.*?), found (?P<found>.*)", re.DOTALL)
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
 
 
 @dataclass(frozen=True)
@@ -18,13 +17,13 @@ class Finding:
     """One fault.
 
     Attributes:
-        severity: "error": a reader fails on it or learns something wrong; "warning": likely a mistake; "note": good to know.
-        check: the check that found it, a short name such as "file-size"; findings are grouped by it.
+        severity: "error": reading fails or gives wrong values; "warning": probably a mistake; "note": not a fault, but worth knowing.
+        check: short name of the check that found it, such as "file-size"; findings are grouped by it.
         sequence: path of the sequence in its Source.
         location: the file or the folder.
-        expected: what should be there.
-        found: what is.
-        advice: what to do about it; empty where nothing better than looking at the file can be said.
+        expected: what the file should hold.
+        found: what it holds.
+        advice: what to do about it; may be empty.
     """
 
     severity: Severity
@@ -36,13 +35,23 @@ class Finding:
     advice: str = ""
 
     @classmethod
-    def from_error(cls, check: str, sequence: str, location: str, error: Exception, advice: str = "") -> Finding:
-        """Turn an error of the library, "<where>: expected <this>, found <that>", into a finding of severity "error"."""
-        text = str(error)
-        match = _HOUSE_FORM.fullmatch(text)
-        if match is None:
-            return cls("error", check, sequence, location, "something that can be read", text, advice)
-        return cls("error", check, sequence, match["where"], match["expected"], match["found"], advice)
+    def from_error(cls, check: str, sequence: str, location: str, error: CarlascError, advice: str = "") -> Finding:
+        """Turn an error of the library into a finding of severity "error".
+
+        Args:
+            check: short name of the check.
+            sequence: path of the sequence in its Source.
+            location: the file or the folder, for an error that is only a sentence.
+            error: its parts become those of the finding.
+            advice: for an error without advice.
+        """
+        advice = error.advice or advice
+        if error.expected:
+            found = f"{error.problem}: {error.found}" if error.problem else error.found
+            return cls("error", check, sequence, error.where, error.expected, found, advice)
+        if error.problem:
+            return cls("error", check, sequence, error.where, "data that can be read", error.problem, advice)
+        return cls("error", check, sequence, location, "data that can be read", error.where, advice)
 
     def __str__(self) -> str:
         text = f"{self.location}: expected {self.expected}, found {self.found}"
@@ -51,15 +60,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class SequenceReport:
-    """What was looked at in a sequence, and the figures that came out of it.
+    """What was read of a sequence, and the shares that were measured.
 
     Attributes:
         path: the sequence's path in its Source.
         frames: number of frames.
         sampled: number of frames whose contents were read.
-        voxel_share: by grid, the mean share of the points in known space that lie in a voxel of their class (of any class where
-            points carry no labels); absent where it could not be measured.
-        pose_share: mean share of a scan's structure that the poses put on the structure of an earlier scan; None where not measured.
+        voxel_share: by grid, the mean share of the points in known voxels whose voxel has their class (any class but free if the points
+            have no labels). A grid for which it could not be measured is left out.
+        pose_share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses; None if it could not
+            be measured.
     """
 
     path: str
@@ -75,8 +85,8 @@ class ValidationResult:
 
     Attributes:
         location: what was validated.
-        findings: in the order of the sequences; worst first within a sequence.
-        sequences: what was looked at.
+        findings: in the order of the sequences; errors first within a sequence.
+        sequences: what was read of each sequence.
     """
 
     location: str
@@ -85,7 +95,7 @@ class ValidationResult:
 
     @property
     def ok(self) -> bool:
-        """Whether there is no error; warnings and notes may stand."""
+        """Whether there is no error; there may be warnings and notes."""
         return self.count("error") == 0
 
     def count(self, severity: Severity) -> int:
@@ -93,7 +103,7 @@ class ValidationResult:
         return sum(finding.severity == severity for finding in self.findings)
 
     def grouped(self) -> dict[tuple[Severity, str], list[Finding]]:
-        """Return the findings by severity and check, worst first."""
+        """Return the findings by severity and check, errors first."""
         groups: dict[tuple[Severity, str], list[Finding]] = {}
         for severity in SEVERITIES:
             for finding in self.findings:

@@ -1,4 +1,4 @@
-"""What is there: splits, sequences, frames, fields and grids, from listings and text files alone."""
+"""What a data set holds: splits, sequences, frames, fields and grids, from listings and text files alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Metadata, Sequence, Source
 
-_SIZED = 3  # files of a field whose sizes stand for those of all
+_SIZED = 3  # files of a field from which the size of all of them is estimated
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class GridOverview:
     Attributes:
         name: its folder.
         coordinates: "cartesian" or "cylindrical".
-        size: cells an axis.
-        lower: lower bound an axis; metres, radians for azimuth.
-        upper: upper bound an axis.
-        voxel_size: size of a cell an axis.
+        size: number of cells per axis.
+        lower: lower bound per axis; metres, radians for azimuth.
+        upper: upper bound per axis.
+        voxel_size: size of a cell per axis.
         frames: number of frames.
-        parts: what there is of it: labels, counts, votes.
-        made: the record of how it was made; None for published data.
+        parts: which of labels, counts and votes exist.
+        made: the record of how the grid was made; None for published data.
     """
 
     name: str
@@ -52,23 +52,23 @@ class SequenceOverview:
     """One sequence.
 
     Attributes:
-        path: where it stands in its Source.
+        path: its path in the Source.
         split: "Train", "Val", "Test", or None.
-        name: what it is called.
+        name: its name.
         coordinates: "cartesian" or "cylindrical".
         frames: number of frames.
-        first: number of the first one; None where there is none.
-        last: number of the last one.
-        gaps: places where frame numbers are missing.
-        fields: number of frames by field; grids apart.
-        documents: text files.
+        first: number of the first frame; None if there is no frame.
+        last: number of the last frame.
+        gaps: number of places where frame numbers are missing.
+        fields: number of frames by field, without the fields of grids.
+        documents: names of its text files.
         grids: its grids.
         frame: "carlasc" (y right) or "kitti" (y left).
         classes: class table of its labels.
-        sensor: what took the scans, where known.
-        source: what the sequence was made from, where known.
-        bytes: about how much it takes; None where that is not cheap to say.
-        problem: why it could not be looked at whole; None if it could.
+        sensor: the sensor that recorded the scans; None if it is not known.
+        source: what the sequence was made from; None if it is not known.
+        bytes: estimated size; None where it would take long to find.
+        problem: the error that kept a part of it from being read; None if there was none.
     """
 
     path: str
@@ -92,7 +92,7 @@ class SequenceOverview:
 
 @dataclass(frozen=True)
 class CaptureOverview:
-    """One raw capture: path below the place looked at, number of sensors, frames as in SequenceOverview."""
+    """One raw capture: its path below the source, its number of sensors, and its frames as in SequenceOverview."""
 
     path: str
     sensors: int
@@ -107,12 +107,12 @@ class Overview:
     """What `info` found.
 
     Attributes:
-        location: what was looked at.
-        level: what it is: "data set", "split", "sequences", "sequence", "coordinates" (one `<coordinates>` folder), "capture".
-        store: how it is kept: "folder", "published" (a zip or a remote folder), or a kind of packed store.
+        location: the source.
+        level: what it is: "data set", "split", "sequences", "sequence", "coordinates" (one `<coordinates>` folder) or "capture".
+        store: how it is stored: "folder", "published" (a zip or a remote folder), or a kind of packed store.
         sequences: in sorted order.
         captures: in sorted order.
-        bytes: size of the file it is all in; None for folders.
+        bytes: size of the file, if the source is one file; None for folders.
     """
 
     location: str
@@ -124,7 +124,7 @@ class Overview:
 
     @property
     def splits(self) -> dict[str, int]:
-        """Number of sequences by split; "none" where the path names none."""
+        """Number of sequences by split; "none" counts those whose path names no split."""
         found: dict[str, int] = {}
         for sequence in self.sequences:
             found[sequence.split or "none"] = found.get(sequence.split or "none", 0) + 1
@@ -136,33 +136,33 @@ class Overview:
 
 
 def info(source: str | os.PathLike[str] | Source) -> Overview:
-    """Say what is there: no frame is read.
+    """List what a data set holds. No frame is read.
 
     Args:
         source: a path or URL that `carlasc.open` knows, a raw capture, or a Source.
 
     Raises:
-        MissingDataError: there is neither a sequence nor a capture.
+        MissingDataError: the source holds neither a sequence nor a capture.
     """
     captures = _captures_in(source)
     try:
         opened = as_source(source)
-        # raw/ itself has a bev/ folder, as a sequence has
+        # raw/ has a bev/ folder, as a sequence has: it is a capture all the same
         sequences = {path: s for path, s in opened.sequences().items() if s.fields() or path not in captures}
     except MissingDataError:
         if not captures:
             raise
         sequences = {}
     if not sequences:
-        found = tuple(_look_at_capture(path, capture) for path, capture in captures.items())
+        found = tuple(_describe_capture(path, capture) for path, capture in captures.items())
         return Overview(str(source), "capture", "folder", (), found, None)
     location = Path(opened.location)
     return Overview(
         opened.location,
         _level(opened.location, list(sequences)),
         type(opened).__name__.removesuffix("Source").lower(),
-        tuple(_look_at(sequence) for sequence in sequences.values()),
-        tuple(_look_at_capture(path, capture) for path, capture in captures.items()),
+        tuple(_describe(sequence) for sequence in sequences.values()),
+        tuple(_describe_capture(path, capture) for path, capture in captures.items()),
         location.stat().st_size if location.is_file() else None,
     )
 
@@ -177,7 +177,7 @@ def _captures_in(source: str | os.PathLike[str] | Source) -> dict[str, Capture]:
 
 
 def _level(location: str, paths: list[str]) -> str:
-    """Tell what was given from how far below it the sequences lie."""
+    """Return what kind of folder was given: the paths of its sequences tell."""
     parts = [path.split("/") for path in paths]
     if paths == [""]:
         return "coordinates"
@@ -189,14 +189,14 @@ def _level(location: str, paths: list[str]) -> str:
     return "split" if Path(location).name.lower() in names else "sequences"
 
 
-def _look_at(sequence: Sequence) -> SequenceOverview:
+def _describe(sequence: Sequence) -> SequenceOverview:
     fields = {name: len(sequence.frames(name)) for name in sorted(sequence.fields())}
     frames = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in fields)]))
     metadata, problem = Metadata(), None
     grids: tuple[GridOverview, ...] = ()
     try:
         metadata = sequence.metadata
-        grids = tuple(_look_at_grid(sequence, name, fields) for name in sequence.grids)
+        grids = tuple(_describe_grid(sequence, name, fields) for name in sequence.grids)
     except CarlascError as error:
         problem = str(error)
     return SequenceOverview(
@@ -215,12 +215,12 @@ def _look_at(sequence: Sequence) -> SequenceOverview:
         metadata.classes.name,
         metadata.sensor,
         metadata.source,
-        _about_bytes(sequence, fields),
+        _estimate_bytes(sequence, fields),
         problem,
     )
 
 
-def _look_at_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> GridOverview:
+def _describe_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> GridOverview:
     spec = sequence.grids[name]
     parts = tuple(part for part in layout.GRID_FIELDS if f"{name}/{part}" in fields)
     x, y, z = spec.voxel_size.tolist()
@@ -237,8 +237,8 @@ def _look_at_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> G
     )
 
 
-def _about_bytes(sequence: Sequence, fields: Mapping[str, int]) -> int | None:
-    """Files of a field are much of a size: a few of them stand for all."""
+def _estimate_bytes(sequence: Sequence, fields: Mapping[str, int]) -> int | None:
+    """Return the size of a sequence, estimated from a few files of each field; None for stores other than folders."""
     if not isinstance(sequence, FolderSequence):
         return None
     total = 0.0
@@ -250,7 +250,7 @@ def _about_bytes(sequence: Sequence, fields: Mapping[str, int]) -> int | None:
     return round(total)
 
 
-def _look_at_capture(path: str, capture: Capture) -> CaptureOverview:
+def _describe_capture(path: str, capture: Capture) -> CaptureOverview:
     frames = capture.frames
     return CaptureOverview(path, len(capture.sensors), len(frames), int(frames[0]), int(frames[-1]), _gaps(frames))
 

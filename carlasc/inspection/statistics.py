@@ -1,4 +1,4 @@
-"""How much of each class there is, in points and in voxels, and the weights that follow from it."""
+"""How many points and voxels there are of each class, and the class weights computed from them."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ from carlasc.storage.protocol import Sequence, Source
 
 Kind = Literal["points", "voxels"]
 KINDS: tuple[Kind, ...] = ("points", "voxels")
-_CHUNK = 32  # frames that a worker counts at a time
+_COUNT_APART = "count the sequences of each table separately"
+_CHUNK = 32  # frames per task of a worker
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """How often each class stands in some frames.
+    """The number of points and voxels of each class in some frames.
 
     Attributes:
-        points: (K,) int64 points of each class, by id; class 0 is unlabelled.
-        voxels: (K,) int64 known voxels of each class; class 0 is free.
+        points: (K,) int64 number of points of each class, by id; class 0 is unlabelled.
+        voxels: (K,) int64 number of known voxels of each class; class 0 is free.
         unknown: number of unknown voxels (count 0).
         scans: number of scans counted.
         grids: number of grids counted.
@@ -66,7 +67,7 @@ class Histogram:
 
     @property
     def known_share(self) -> float:
-        """Share of voxels that are known; NaN where there are no grids."""
+        """Share of the voxels that are known; NaN if there are no grids."""
         total = int(self.voxels.sum()) + self.unknown
         return int(self.voxels.sum()) / total if total else float("nan")
 
@@ -76,11 +77,11 @@ class Statistics:
     """What `stats` counted.
 
     Attributes:
-        location: what was looked at.
-        classes: the labels' table.
-        remap: what the classes are summed to for the second table; None where there is none.
-        sequences: a histogram by the sequence's path.
-        splits: the split of each sequence, "none" where its path names none.
+        location: the source.
+        classes: the class table of the labels.
+        remap: the remap to the classes of the second table; None if there is no second table.
+        sequences: the histogram of each sequence, by its path.
+        splits: the split of each sequence, by its path; "none" if the path names no split.
         failures: (file, message) of the frames that could not be read.
     """
 
@@ -102,7 +103,7 @@ class Statistics:
         return self.total.scans + self.total.grids
 
     def by_split(self) -> dict[str, Histogram]:
-        """Return the sequences summed up by split."""
+        """Return the sums of the histograms of each split."""
         found: dict[str, Histogram] = {}
         for path, histogram in self.sequences.items():
             split = self.splits[path]
@@ -110,7 +111,7 @@ class Statistics:
         return found
 
     def summed(self, counts: NDArray[np.int64]) -> dict[str, int]:
-        """Return counts by the names of the classes that the remap sums them to."""
+        """Return counts by the names of the remapped classes."""
         if self.remap is None:
             return self.named(counts)
         summed = dict.fromkeys(self.remap.target.names.values(), 0)
@@ -119,7 +120,7 @@ class Statistics:
         return summed
 
     def named(self, counts: NDArray[np.int64]) -> dict[str, int]:
-        """Return counts by the classes' names."""
+        """Return counts by the names of the classes."""
         return {name: int(counts[index]) for index, name in self.classes.names.items()}
 
     def weights(self) -> dict[str, float]:
@@ -164,23 +165,24 @@ def stats(
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
-        grid: the grid whose voxels are counted, in the sequences that have it; where one has a single other grid, that.
-        remap: what classes are summed to beside their own: a remap or its name, None, or "auto": the paper's 11 or SemanticKITTI's 19.
-        every: count every so many frames.
-        workers: processes that count side by side; None takes all cores.
-        executor: counts instead of processes of our own.
-        progress: called with the frames counted and their total.
+        grid: the grid whose voxels are counted. In a sequence that has only one grid, of another name, that one is counted.
+        remap: the remap to the classes of a second table: a remap or its name, None for no second table, or "auto", which takes the
+            paper's 11 classes or SemanticKITTI's 19.
+        every: count every N-th frame.
+        workers: processes that count side by side; None for one per core.
+        executor: an executor that counts instead of new processes.
+        progress: called with (frames counted, frames in total).
 
     Returns:
-        The histograms; a frame that cannot be read is among the `failures`.
+        The histograms. Frames that could not be read are listed in `failures`.
 
     Raises:
         ArgumentError: `every` is less than 1, or the remap is unknown.
-        FormatError: sequences of several class tables, or a remap of another one.
-        MissingDataError: there is no data set, or nothing in it that has classes.
+        FormatError: the sequences have different class tables, or the remap is of another table.
+        MissingDataError: there is no data set, or it has no labels.
     """
     if every < 1:
-        raise ArgumentError("every", expected="1 or more", found=f"{every}")
+        raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
     sequences = opened.sequences()
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
@@ -251,20 +253,20 @@ def _table_of(sequence: Sequence, field: str) -> ClassTable:
 
 
 def _common_table(tasks: Iterable[_Task]) -> ClassTable:
-    """The grids' table, or the points' where there are no grids: points beside a prediction are counted in its classes."""
+    """Return the grids' table, or the points' if there are no grids: points beside a prediction are counted in its classes."""
     fields = {(sequence.path, field): _table_of(sequence, field) for sequence, field, _ in tasks}
     grids = [table for (_, field), table in fields.items() if field != "labels"]
     tables = {table.name: table for table in grids or fields.values()}
     if len(tables) > 1:
-        raise FormatError(
-            "classes", expected="one table", found=f"{', '.join(sorted(tables))}", advice="count the sequences apart"
-        )
+        raise FormatError("classes", expected="one table", found=", ".join(sorted(tables)), advice=_COUNT_APART)
     (classes,) = tables.values()
-    try:
-        for table in fields.values():
+    for table in fields.values():
+        try:
             remaps_between(table, classes)
-    except ArgumentError as error:
-        raise FormatError(f"{error}: count the sequences apart") from error
+        except ArgumentError as error:
+            raise FormatError(
+                "classes", expected=f"classes that remap to {classes.name}", found=table.name, advice=_COUNT_APART
+            ) from error
     return classes
 
 
@@ -277,5 +279,5 @@ def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | Non
         )
     chosen = remap_named(remap) if isinstance(remap, str) else remap
     if chosen.source.name != classes.name:
-        raise FormatError(f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=f"{classes.name}")
+        raise FormatError(f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=classes.name)
     return chosen

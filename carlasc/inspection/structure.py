@@ -1,7 +1,7 @@
-"""The points of a scan that tell where the sensor is: things that stand still and stand up.
+"""The structure of a scan: points on static, upright objects, from which the motion of the sensor can be seen.
 
-Ground is left out because its rings move with the sensor: they look the same from everywhere, and would speak for a sensor
-that never moved. So is what moves by itself, and what is so near that it may be the own car.
+Points on the ground are left out: the rings of a LiDAR on flat ground move with the sensor, so that they would match best under
+the poses of a sensor that does not move. Points on moving objects, and points so near that they may be on the own vehicle, are left out too.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from carlasc.storage.protocol import Sequence
 MIN_RANGE_M = 3.0
 MAX_RANGE_M = 30.0
 _COLUMN_M = 0.4
-_UPRIGHT_M = 0.6  # a column of points that spans less is ground
-_FOOT_M = 0.3  # the lowest part of an upright column, where it stands in the ground
+_UPRIGHT_M = 0.6  # points in a column that spans less height are ground
+_FOOT_M = 0.3  # height of the lowest part of an upright column, which is ground too
 
 _GROUND = frozenset(
     "free unlabeled outlier sky road roadline sidewalk ground terrain water bridge parking other-ground lane-marking railtrack".split()
@@ -29,11 +29,11 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     """Read the structure of a scan.
 
     Args:
-        sequence: has the field `points`; `labels` and `flow` are used where they are there and fit.
+        sequence: has the field `points`; `labels` and `flow` are used if the sequence has them and they fit.
         frame: frame number.
 
     Returns:
-        (M, 3) float64 metres, sensor frame.
+        (M, 3) float64 points, metres, in the frame of the sensor.
 
     Raises:
         CarlascError: the points cannot be read.
@@ -45,7 +45,7 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     labels = _per_point(sequence, "labels", frame, len(points))
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(sequence.metadata.classes)[
-            np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)  # packed stores keep them in uint8
+            np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)  # packed stores keep labels in uint8
         ]
     else:
         keep[keep] = _upright(points[keep])
@@ -56,7 +56,7 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
 
 
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[np.generic] | None:
-    """A field of the points, or None where it is missing or broken: the check of the files reports that, not this one."""
+    """Return a field of the points; None if it is missing or cannot be read, which other checks report."""
     if field not in sequence.fields():
         return None
     try:
@@ -74,7 +74,7 @@ def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
 
 
 def _upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which points belong to something that stands up, found from the heights in columns of 0.4 m."""
+    """Return (N,) which points are on upright objects, from the range of heights in columns of 0.4 m."""
     columns = np.floor((points[:, :2] + MAX_RANGE_M) / _COLUMN_M).astype(np.int64)
     width = int(2 * MAX_RANGE_M / _COLUMN_M) + 1
     column = columns[:, 0] * width + columns[:, 1]

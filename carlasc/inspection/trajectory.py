@@ -1,4 +1,4 @@
-"""Checks of poses and times: is every pose rigid, does the sensor move as a thing with mass does, do the times rise?"""
+"""Checks of poses and times: poses are rigid and change as those of a vehicle, times increase."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
 _SPEED_M_S = 70.0  # 250 km/h
-_SPEED_CHANGE_M_S = 15.0  # from one step to the next ones; a collision in CARLA takes off as much
+_SPEED_CHANGE_M_S = 15.0  # between neighbouring steps; a collision in CARLA changes the speed as much
 _TURN_RAD_S = np.deg2rad(250.0)
 _TOLERANCE = 1e-3
 
 
 def check_poses(sequence: Sequence) -> Iterator[Finding]:
-    """Check that poses.txt is there, has a line for each frame, and holds rigid transforms that change smoothly."""
+    """Check that poses.txt exists, has a line for each frame, and holds rigid transforms that change smoothly."""
     where, frames = f"{sequence.location}/{layout.POSES}", sequence.scan_frames()
     if layout.POSES not in sequence.documents():
         if "points" in sequence.fields():
-            advice = "scans cannot be put on each other without poses: copy the file, or estimate it with KISS-ICP"
+            advice = "scans cannot be merged without poses: copy the file, or estimate poses with KISS-ICP"
             yield Finding("error", "poses", sequence.path, where, "a pose for each scan", "no file", advice)
         return
     try:
@@ -33,19 +33,21 @@ def check_poses(sequence: Sequence) -> Iterator[Finding]:
         yield Finding.from_error("poses", sequence.path, where, error)
         return
     yield from _check_lines(sequence, layout.POSES, len(poses))
-    bad = [line for line, pose in enumerate(poses) if not _is_rigid(pose)]
-    if bad:
-        yield Finding.from_error("poses", sequence.path, where, _why_not_rigid(poses[bad[0]], where, bad))
+    errors = [_rigid_error(pose, f"{where}: line {line}") for line, pose in enumerate(poses, 1)]
+    if wrong := [error for error in errors if error is not None]:
+        if len(wrong) > 1:
+            wrong[0].found += f" (and {len(wrong) - 1} more such lines)"
+        yield Finding.from_error("poses", sequence.path, where, wrong[0])
     elif len(frames) and _has_lines(sequence, len(poses)):
         yield from _check_steps(sequence, frames, where)
 
 
 def check_times(sequence: Sequence) -> Iterator[Finding]:
-    """Check that times.txt is there, has a line for each frame, and that the times rise."""
+    """Check that times.txt exists, has a line for each frame, and that times increase."""
     where = f"{sequence.location}/{layout.TIMES}"
     if layout.TIMES not in sequence.documents():
         if "points" in sequence.fields():
-            advice = "readers that need times take 10 Hz"
+            advice = "10 Hz is assumed where times are needed"
             yield Finding("warning", "times", sequence.path, where, "a time for each scan", "no file", advice)
         return
     try:
@@ -58,28 +60,30 @@ def check_times(sequence: Sequence) -> Iterator[Finding]:
     if len(wrong):
         line = int(wrong[0]) + 1
         found = f"{times[line]:g} s in line {line + 1} after {times[line - 1]:g} s ({len(wrong)} such lines)"
-        yield Finding("error", "times", sequence.path, where, "seconds that rise from line to line", found)
+        yield Finding("error", "times", sequence.path, where, "seconds that increase from line to line", found)
 
 
 def _check_lines(sequence: Sequence, document: str, lines: int) -> Iterator[Finding]:
-    """Check that each frame has its line, and that there are no lines beyond the last."""
+    """Check that each frame has a line, and that there are no lines after that of the last frame."""
     frames, where = sequence.scan_frames(), f"{sequence.location}/{document}"
     if not len(frames):
         return
     last, kind = int(frames[-1]), "poses" if document == layout.POSES else "times"
     if not _has_lines(sequence, lines):
-        needed = f"{last + 1} lines, up to frame {last}"
+        expected = f"{last + 1} lines, up to frame {last}"
         if last + 1 != len(frames):
-            needed += f" (or {len(frames)}, one a frame that is there)"
-        missing = f"{lines} lines: the file is shorter than the scans"
-        yield Finding("error", kind, sequence.path, where, needed, missing, "copy the file whole")
+            expected += f" (or {len(frames)}, one per frame that exists)"
+        advice = "lines are missing: copy the file again"
+        yield Finding("error", kind, sequence.path, where, expected, f"{lines} lines", advice)
     elif lines > last + 1:
-        found = f"{lines} lines: scans are missing at the end, or the file is of another sequence"
-        yield Finding("warning", kind, sequence.path, where, f"{last + 1} lines, up to frame {last}", found)
+        advice = "scans are missing at the end, or the file belongs to another sequence"
+        yield Finding(
+            "warning", kind, sequence.path, where, f"{last + 1} lines, up to frame {last}", f"{lines} lines", advice
+        )
 
 
 def _has_lines(sequence: Sequence, lines: int) -> bool:
-    """Whether each frame has a line in a file of so many; the rule is the reader's own."""
+    """Return whether each frame has a line in a file of `lines` lines, by the rule of the reader."""
     try:
         for frame in sequence.scan_frames().tolist():
             sequence.line_of(frame, lines, layout.POSES)
@@ -88,29 +92,21 @@ def _has_lines(sequence: Sequence, lines: int) -> bool:
     return True
 
 
-def _is_rigid(pose: NDArray[np.float64]) -> bool:
+def _rigid_error(pose: NDArray[np.float64], where: str) -> FormatError | None:
+    """Return the error that says why a pose is not rigid; None if it is."""
     try:
-        check_rigid(pose, "", _TOLERANCE)
-    except FormatError:
-        return False
-    return True
-
-
-def _why_not_rigid(pose: NDArray[np.float64], where: str, bad: list[int]) -> FormatError:
-    """The reason why the first bad pose is not rigid, and how many more there are."""
-    try:
-        check_rigid(pose, f"{where}: line {bad[0] + 1}", _TOLERANCE)
+        check_rigid(pose, where, _TOLERANCE)
     except FormatError as error:
-        return FormatError(f"{error}{f' (and {len(bad) - 1} more lines)' if len(bad) > 1 else ''}")
-    raise ValueError("the pose is rigid")
+        return error
+    return None
 
 
 def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> Iterator[Finding]:
-    """Check the first pose, and that no step is longer or sharper than a vehicle can make it."""
+    """Check the first pose, and that the sensor moves and turns between frames as a vehicle can."""
     poses = np.stack([sequence.read_pose(frame) for frame in frames.tolist()])
     if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > 1e-3:
-        found = "another: the poses are relative to something else, which history and merging do not mind"
-        yield Finding("note", "poses", sequence.path, where, "the identity as the first frame's pose", found)
+        advice = "the poses are relative to another frame, which is allowed: only relative poses are used"
+        yield Finding("note", "poses", sequence.path, where, "the identity as the first pose", "another pose", advice)
     if len(frames) < 2:
         return
     steps = invert(poses[:-1]) @ poses[1:]
@@ -124,7 +120,7 @@ def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> I
         step = int(jumps[np.argmax(np.abs(speed - usual)[jumps] + turn[jumps])])
         moved, turned = float(np.linalg.norm(steps[step, :3, 3])), float(np.rad2deg(turn[step] * period_s[step]))
         usually = float(usual[step] * period_s[step])
-        found = f"{moved:.2f} m and {turned:.1f} degrees from frame {frames[step]} to {frames[step + 1]}, where {usually:.2f} m is usual"
+        found = f"{moved:.2f} m and {turned:.1f} degrees from frame {frames[step]} to {frames[step + 1]}, {usually:.2f} m between other frames"
         found += f" ({len(jumps)} such steps)" if len(jumps) > 1 else ""
-        advice = "look whether frames are missing or sequences were joined there"
-        yield Finding("error", "pose-jump", sequence.path, where, "a drive without jumps", found, advice)
+        advice = "check whether frames are missing there, or sequences were joined"
+        yield Finding("error", "pose-jump", sequence.path, where, "poses without jumps", found, advice)

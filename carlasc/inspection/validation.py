@@ -1,4 +1,4 @@
-"""The doctor: looks at everything that can be wrong with a data set, and says what it looks like."""
+"""Checking a data set for everything that is known to go wrong, and naming the likely cause."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
-_SAMPLES = 40  # frames of a sequence whose contents are read, if not told otherwise
-_POOR_SHARE = 0.5
-_DOUBTFUL_SHARE = 0.7
-_NO_OVERLAP = 0.3
+_SAMPLES = 40  # frames per sequence whose contents are read by default
+_POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error
+_DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
+_NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning
 
 Progress = Callable[[int, int], None]
 
@@ -35,23 +35,23 @@ def validate(
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and grids.
 
-    Names, numbers of frames, poses and times are always checked whole, and so are the sizes of local files. What has to be read is sampled.
-    A bad file is a finding, and the rest is looked at all the same.
+    Names, numbers of frames, poses, times and the sizes of local files are checked for all frames; contents are read for some frames. A
+    file that cannot be read is a finding, and the other files are checked all the same.
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
-        every: read the contents of every so many frames; 1 reads all, None about forty of each sequence.
-        progress: called with the steps done and their total.
+        every: read the contents of every N-th frame; 1 reads all, None about forty frames per sequence.
+        progress: called with (steps done, steps in total).
 
     Returns:
-        What was found; `ok` says whether there is no error among it.
+        The findings; `ok` is True if none of them is an error.
 
     Raises:
         ArgumentError: `every` is less than 1.
-        MissingDataError: there is no data set to look at.
+        MissingDataError: there is no data set.
     """
     if every is not None and every < 1:
-        raise ArgumentError("every", expected="1 or more", found=f"{every}")
+        raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
     plans = [_plan(sequence, every) for sequence in opened.sequences().values()]
     total, done = sum(plan.steps for plan in plans), 0
@@ -74,12 +74,12 @@ def validate(
 
 @dataclass(frozen=True)
 class _Plan:
-    """Which frames of a sequence are looked at, and how closely."""
+    """Which frames of a sequence are checked, and how thoroughly."""
 
     sequence: Sequence
-    frames: tuple[int, ...]  # those of any field
-    opened: tuple[int, ...]  # those whose files are opened, for their sizes
-    read: tuple[int, ...]  # those whose contents are read
+    frames: tuple[int, ...]  # the frames of any field
+    opened: tuple[int, ...]  # the frames whose files are opened to check their sizes
+    read: tuple[int, ...]  # the frames whose contents are read
 
     @property
     def steps(self) -> int:
@@ -90,7 +90,7 @@ def _plan(sequence: Sequence, every: int | None) -> _Plan:
     found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
     frames = tuple(found.tolist())
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
-    # a local file is mapped, and opening it costs nothing; a packed one is decoded, and its size cannot be wrong
+    # opening a local file is cheap; a frame of a packed store has to be decoded, and cannot have a wrong size
     return _Plan(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
 
 
@@ -102,7 +102,7 @@ def _fields(sequence: Sequence) -> list[str]:
 
 
 def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, SequenceReport]:
-    """Run all checks of a sequence; yields after each step."""
+    """Run all checks of a sequence; yields after each step, and adds findings to `found`."""
     sequence = plan.sequence
     found.extend(check_documents(sequence))
     described = _is_described(sequence)
@@ -116,7 +116,7 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
     for frame in plan.read:
         if described:
             found.extend(check_values(sequence, frame))
-            _gather(sequence, frame, evidence)
+            _measure_grids(sequence, frame, evidence)
         yield
     diagnoses = {name: grid.diagnose() for name, grid in evidence.items()}
     for name, diagnosis in diagnoses.items():
@@ -131,15 +131,15 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
 
 
 def _is_described(sequence: Sequence) -> bool:
-    """Whether classes and geometry are known, without which values mean nothing."""
+    """Return whether classes and geometry can be read; without them values cannot be checked."""
     try:
         return sequence.metadata is not None and sequence.grids is not None
     except CarlascError:
         return False
 
 
-def _gather(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -> None:
-    """Look a frame's points up in its grids; what cannot be read has been reported already."""
+def _measure_grids(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -> None:
+    """Compare the points of a frame with its grids. Files that cannot be read are skipped: other checks report them."""
     if "points" not in sequence.fields():
         return
     try:
@@ -147,7 +147,7 @@ def _gather(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -
     except CarlascError:
         return
     for name in sequence.grids:
-        if sequence.predicted_by(name) is not None:  # a network may be wrong, and its classes others than the points'
+        if sequence.predicted_by(name) is not None:  # a network makes mistakes, and may have other classes
             continue
         try:
             grid = sequence.grid(name, frame)
@@ -157,7 +157,7 @@ def _gather(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -
 
 
 def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
-    """Read the points that a grid may know of: finite, and within the ranges of carlasc.json."""
+    """Read the points that a grid is made from: finite, and within the ranges given in carlasc.json."""
     scan = sequence.scan(frame, ("labels",))
     distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
     keep = np.isfinite(distance) & (distance >= (sequence.metadata.min_range_m or 0.0))
@@ -167,7 +167,7 @@ def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArra
 
 
 def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
-    """Align scans under their poses; None where there are no scans, or no poses that could be used."""
+    """Measure the overlap of scans under their poses; None if there are no scans, or no valid poses."""
     if "points" not in sequence.fields() or layout.POSES not in sequence.documents():
         return None
     frames = sequence.frames("points").tolist()
@@ -187,37 +187,37 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
 
 def _judge_grid(sequence: Sequence, grid: str, diagnosis: GridDiagnosis) -> Iterator[Finding]:
     where = f"{sequence.location}/{grid}"
-    expected = "scans that lie in voxels of their class"
-    share = f"{diagnosis.share:.1%} of the points in known space do, over {diagnosis.frames} frames"
+    expected = "points in voxels of their class"
+    share = f"{diagnosis.share:.1%} of the points in known voxels, over {diagnosis.frames} frames"
     if not diagnosis.frames:
         return
     other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2)
     if diagnosis.mistake is not None and not (other_classes and diagnosis.corrected_share < _POOR_SHARE):
-        found = f"{share}; this looks like {diagnosis.mistake}: with it undone, {diagnosis.corrected_share:.1%}"
-        advice = "mend what writes the points or the grid, or make the grid again (carlasc regrid)"
+        found = f"{share}; the likely cause is {diagnosis.mistake}: with it undone, {diagnosis.corrected_share:.1%}"
+        advice = "correct what writes the points or the grid, or make the grid again with `carlasc regrid`"
         yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
     elif diagnosis.share < _DOUBTFUL_SHARE:
         if other_classes:
-            found = f"{share}, but {diagnosis.occupied_share:.1%} in voxels of some class: this looks like labels of another class table, or out of order"
+            found = f"{share}, but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is labels of another class table, or in another order"
         else:
-            found = f"{share}, and no known mistake undone makes it better: this looks like scans and grids of different frames"
+            found = f"{share}, and undoing no known mistake raises it; the likely cause is scans and grids of different frames"
         severity: Severity = "error" if diagnosis.share < _POOR_SHARE else "warning"
-        advice = "look at both with `carlasc render`, or make the grid again"
+        advice = "draw both with `carlasc render`, or make the grid again with `carlasc regrid`"
         yield Finding(severity, "scan-in-voxels", sequence.path, where, expected, found, advice)
 
 
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
     where = f"{sequence.location}/{layout.POSES}"
-    expected = "poses that put scans on each other"
+    expected = "scans that overlap under the poses"
     if diagnosis.correction is not None:
-        found = f"{diagnosis.share_there:.1%} of a scan's structure on an earlier scan's; they look like {diagnosis.correction.name}: with that undone, {diagnosis.corrected_share:.1%}"
+        found = f"{diagnosis.share_there:.1%} of a scan's structure on that of an earlier scan; the likely cause is {diagnosis.correction.name}: with it undone, {diagnosis.corrected_share:.1%}"
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, diagnosis.correction.advice)
     elif diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
-        found = f"{diagnosis.share:.1%} of a scan's structure on an earlier scan's; they put scans about ({x:.1f}, {y:.1f}, {z:.1f}) m beside their place"
-        advice = "are the poses of this sequence, and of these frames?"
+        found = f"{diagnosis.share:.1%} of a scan's structure on that of an earlier scan; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from where the poses put them"
+        advice = "check that the poses belong to this sequence and to these frames"
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, advice)
     elif diagnosis.pairs and diagnosis.share < _NO_OVERLAP:
-        found = f"{diagnosis.share:.1%} of a scan's structure on an earlier scan's, and no known mistake undone makes it better"
-        advice = "are the poses of this sequence? `carlasc convert --poses kiss-icp` estimates them from the scans"
+        found = f"{diagnosis.share:.1%} of a scan's structure on that of an earlier scan, and undoing no known mistake raises it"
+        advice = "check that the poses belong to this sequence; `carlasc convert --poses kiss-icp` estimates poses from scans"
         yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from click.testing import Result
 from typer.testing import CliRunner
 
 from carlasc.cli import app
 from carlasc.storage import layout
 
 
-def run(*arguments: object) -> Result:
+def run(*arguments: object) -> Any:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
@@ -87,6 +88,21 @@ def test_stats_prints_both_tables_and_draws_the_plot(sequence: Path, tmp_path: P
     assert "Barrier" in result.output
     assert "% of voxels known (3 grids)" in result.output
     assert plot.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("plot", "missing", "code"), [("a.png", True, 1), ("a.doc", False, 2)])
+def test_stats_refuses_a_plot_that_it_cannot_draw_before_it_counts(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plot: str, missing: bool, code: int
+) -> None:
+    monkeypatch.delattr("carlasc.storage.folders.published.PublishedSequence.read")  # reading a frame would fail
+    if missing:
+        for module in ("matplotlib", "matplotlib.figure"):
+            monkeypatch.setitem(sys.modules, module, None)
+    result = run("stats", sequence, "--plot", tmp_path / plot)
+    assert result.exit_code == code
+    assert result.output.count("\n") == 1
+    assert ("carlasc[plots]" if missing else "--plot: expected a file that ends in .png") in result.output
+    assert not (tmp_path / plot).exists()
 
 
 def test_stats_by_sequence_has_a_row_a_sequence(sequence: Path) -> None:

@@ -133,7 +133,7 @@ def test_a_prediction_beside_the_data_is_judged_by_its_own_classes_and_not_as_tr
         path.write_bytes(np.where(np.fromfile(path, np.uint32) > 0, 9, 0).astype(np.uint32).tobytes())
     assert not validate(copy).findings
     path.write_bytes(np.full(128 * 128 * 8, 11, np.uint32).tobytes())
-    assert "ids of the classes of carlasc11" in found(validate(copy, every=1))["class-ids"]
+    assert "class ids of carlasc11" in found(validate(copy, every=1))["class-ids"]
 
 
 @pytest.mark.parametrize("ending", ["zarr", "h5"])
@@ -156,14 +156,14 @@ def test_a_zip_is_validated_in_place(turning: Path, tmp_path: Path) -> None:
 def test_mirrored_points_are_told_from_the_grid_and_from_the_poses(copy: Path) -> None:
     change_files(copy / "velodyne", "<f4", lambda a: a.reshape(-1, 4) * np.float32([1, -1, 1, 1]))
     errors = found(validate(copy))
-    assert "looks like points with y mirrored" in errors["scan-in-voxels"]
+    assert "the likely cause is points with y mirrored" in errors["scan-in-voxels"]
     assert "y mirrored against the scans" in errors["poses-on-scans"]
 
 
 def test_mirrored_points_are_told_in_a_converted_sequence(copy_kitti: Path) -> None:
     change_files(copy_kitti / "velodyne", "<f4", lambda a: a.reshape(-1, 4) * np.float32([1, -1, 1, 1]))
     errors = found(validate(copy_kitti))
-    assert "looks like points with y mirrored" in errors["scan-in-voxels"]
+    assert "the likely cause is points with y mirrored" in errors["scan-in-voxels"]
     assert "y mirrored against the scans" in errors["poses-on-scans"]
 
 
@@ -183,13 +183,13 @@ def test_a_fault_of_poses_is_named_and_nothing_else_is(
     change_poses(folder, FAULTS[fault])
     errors = found(validate(folder))
     assert list(errors) == ["poses-on-scans"]
-    assert f"look like {fault}" in errors["poses-on-scans"]
+    assert f"likely cause is {fault}" in errors["poses-on-scans"]
 
 
 def test_camera_frame_poses_of_a_converted_sequence_are_named_with_the_remedy(copy_kitti: Path) -> None:
     change_poses(copy_kitti, camera_poses)
     errors = found(validate(copy_kitti))
-    assert "look like camera-frame poses (x right, y down, z forward)" in errors["poses-on-scans"]
+    assert "likely cause is camera-frame poses (x right, y down, z forward)" in errors["poses-on-scans"]
     assert "inv(Tr) @ P @ Tr" in errors["poses-on-scans"]
 
 
@@ -214,7 +214,7 @@ def test_camera_frame_poses_show_on_a_straight_drive_where_a_mirrored_y_cannot(t
 
 def test_poses_that_stand_while_the_sensor_moves_are_told_with_the_offset(copy: Path) -> None:
     change_poses(copy, lambda p: np.tile(np.eye(4), (len(p), 1, 1)))
-    assert "m beside their place" in found(validate(copy))["poses-on-scans"]
+    assert "m away from where the poses put them" in found(validate(copy))["poses-on-scans"]
 
 
 def test_scans_that_are_in_one_common_frame_are_told(copy: Path) -> None:
@@ -224,7 +224,7 @@ def test_scans_that_are_in_one_common_frame_are_told(copy: Path) -> None:
         points = np.frombuffer(path.read_bytes(), "<f4").reshape(-1, 4).copy()
         points[:, :3] = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
         path.write_bytes(points.tobytes())
-    assert "scans that do not" in found(validate(copy))["poses-on-scans"]
+    assert "scans that are all in one frame" in found(validate(copy))["poses-on-scans"]
 
 
 @pytest.mark.parametrize("shift", [(1, 0, 0), (0, -1, 0), (-1, 1, 0), (0, 0, 1)])
@@ -301,7 +301,7 @@ def test_a_label_without_votes_and_votes_that_are_no_numbers_are_counted(copy: P
     counts[np.flatnonzero(labels == 0)[:2]] = [np.nan, -1]
     path.write_bytes(counts.tobytes())
     errors = found(validate(copy))
-    assert "7 voxels with a label and no vote" in errors["counts"]
+    assert "7 voxels with a label but no vote" in errors["counts"]
     assert "whole numbers of votes" in errors["counts"]
 
 
@@ -322,7 +322,7 @@ def test_nan_points_and_impossible_flow_are_found(copy: Path) -> None:
     velocities[0] = 400
     flow.write_bytes(velocities.tobytes())
     result = validate(copy)
-    assert "1 rows, the first 17" in found(result)["not-finite"]
+    assert "1 rows, first in row 17" in found(result)["not-finite"]
     assert "400 m/s" in found(result, "warning")["flow"]
 
 
@@ -348,7 +348,7 @@ def test_a_gap_in_all_fields_is_a_lesser_finding(copy: Path) -> None:
         path.unlink()
     result = validate(copy)
     assert result.ok
-    assert "1 gaps, 2 frames missing; the first after 5, before 8" in found(result, "warning")["frame-gaps"]
+    assert "1 gaps, 2 frames missing; the first gap is between 5 and 8" in found(result, "warning")["frame-gaps"]
 
 
 def test_grids_on_some_frames_only_are_a_note(copy: Path) -> None:
