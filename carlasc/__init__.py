@@ -45,6 +45,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.inspection import stats as stats
     from carlasc.inspection import validate as validate
     from carlasc.metrics import evaluate as evaluate
+    from carlasc.metrics import scores as scores
     from carlasc.storage import Sink as Sink
     from carlasc.storage import Source as Source
     from carlasc.storage import download as download
@@ -112,7 +113,7 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
         "Flip",
         "collate",
     ),
-    "metrics": ("evaluate",),
+    "metrics": ("evaluate", "scores"),
     "inspection": (
         "info",
         "stats",

@@ -22,6 +22,7 @@ from carlasc import cli
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, REMAPS
+from carlasc.metrics import CONVENTIONS
 from carlasc.storage import layout
 
 LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
@@ -159,6 +160,30 @@ def _remaps() -> str:
     return "\n".join(rows)
 
 
+def _conventions() -> str:
+    rows = ["| name | benchmark | mean over | an absent class | an unknown voxel | |", "|---|---|---|---|---|---|"]
+    absent = {
+        "zero": "counts 0",
+        "skip": "is left out",
+        "skip-truth": "is left out if it is absent from the truth",
+        "nan": "makes the mean NaN",
+    }
+    for convention in CONVENTIONS.values():
+        free = " with free" if convention.free in convention.averaged else ""
+        epsilon = f"; {convention.epsilon:g} is added to each divisor" if convention.epsilon else ""
+        unknown = "does not count" if convention.unknown == "left out" else "is free"
+        cells = (
+            f"`{convention.name}`",
+            convention.title,
+            f"{len(convention.averaged)} classes{free}",
+            absent[convention.absent] + epsilon,
+            unknown,
+            convention.notes,
+        )
+        rows.append(f"| {' | '.join(map(_escape, cells))} |")
+    return "\n".join(rows)
+
+
 def _swatch(table: ClassTable, index: int) -> str:
     color = "#{:02x}{:02x}{:02x}".format(*table.colors[index])
     return f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span>'
@@ -169,6 +194,7 @@ _TABLES: dict[str, Callable[[], str]] = {
     "grids": _grids,
     "classes": _classes,
     "remaps": _remaps,
+    "conventions": _conventions,
 }
 
 

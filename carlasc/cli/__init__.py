@@ -23,6 +23,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "stats",
     "validate",
     "evaluate",
+    "scores",
     "render",
     "view",
     "download",

@@ -1,15 +1,17 @@
-"""Class histograms drawn as a picture."""
+"""Charts: the histograms of classes, the scores of frames."""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.inspection.statistics import KINDS, Kind, Statistics
+from carlasc.metrics.scores import Evaluation
 from carlasc.storage.files import write_atomic
 
 _SUFFIXES = (".png", ".svg", ".pdf")
@@ -80,6 +82,43 @@ def draw_histograms(statistics: Statistics, plot: Path) -> None:
     if len(splits) > 1:
         title += f" (darkest first: {', '.join(splits)})"
     figure.suptitle(title if np.isnan(known) else f"{title}, {known:.1%} of voxels known")
+    _write(figure, plot)
+
+
+def draw_frame_scores(evaluation: Evaluation, plot: Path) -> None:
+    """Draw mIoU, IoU and the share of false free voxels over the frames of each sequence.
+
+    Args:
+        evaluation: as `evaluate` returns it.
+        plot: a .png, .svg or .pdf file.
+
+    Raises:
+        ArgumentError: the name has another ending.
+        DependencyError: Matplotlib is not installed.
+    """
+    figures = check_plot(plot)
+    sequences = list(evaluation.sequences)
+    figure = figures.Figure(figsize=(11, 1 + 2.2 * len(sequences)), layout="constrained")
+    for axes, path in zip(figure.subplots(len(sequences), 1, squeeze=False)[:, 0], sequences, strict=True):
+        scores = [frame for frame in evaluation.frame_scores if frame.sequence == path]
+        numbers = [int(s.frame) if s.frame.isdigit() else place for place, s in enumerate(scores)]
+        for name, color, values in (
+            ("mIoU", "#3566a8", [s.score.miou for s in scores]),
+            ("IoU of occupied", "#4d9a5b", [s.score.iou for s in scores]),
+            ("false free", "#c2452d", [s.score.false_free for s in scores]),
+        ):
+            axes.plot(numbers, np.array(values) * 100, ".-", color=color, label=name, linewidth=1)
+        axes.set_ylim(0, 100)
+        axes.set_ylabel("percent")
+        axes.set_title(path or evaluation.name, loc="left", fontsize=10)
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(loc="upper right", fontsize=8, ncols=3)
+    figure.axes[-1].set_xlabel("frame")
+    figure.suptitle(f"{evaluation.name}, by {evaluation.convention.title}")
+    _write(figure, plot)
+
+
+def _write(figure: Any, plot: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=plot.suffix[1:].lower(), dpi=150)
     write_atomic(plot, buffer.getvalue())

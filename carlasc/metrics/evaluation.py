@@ -1,55 +1,67 @@
-"""Scoring the predicted grids of a whole data set, one frame in memory at a time."""
+"""Scoring the predicted grids of a whole data set, one frame in memory at a time, by one convention or by all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI, remap_named, table_named
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLA, table_named
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.metrics.confusion import Absent, ConfusionMatrix, check_absent
-from carlasc.metrics.masks import semantickitti
+from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
+from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
-from carlasc.metrics.scores import Evaluation, Mask
+from carlasc.metrics.rays import RayIoU, ray_origins
+from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_bands, motion, visibility
+from carlasc.metrics.scores import Evaluation, FrameScore
 
 Region = Callable[[GridSpec], NDArray[np.bool_]]
+Voxels = Literal["known", "all"]
+BREAKDOWNS = ("distance", "height", "visibility", "motion")
+_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
 
 
 def evaluate(
     source: Place,
     truth: Place,
     *,
+    convention: str | Convention | None = None,
     grid: str | None = None,
     truth_grid: str | None = None,
-    remap: str | Remap | None = "auto",
     source_classes: str | None = None,
-    mask: Mask = "known",
+    voxels: Voxels = "known",
     region: Region | None = None,
+    by: Collection[str] = (),
+    rays: bool = False,
     frames: Frames = None,
-    absent: Absent = "zero",
     name: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Score predicted grids against the ground truth, one frame in memory at a time.
 
     Args:
-        source: the predictions: anything that `carlasc.open` opens, the folder of one grid, or a folder of `.label` files.
+        source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a folder of `.label` files, or files of
+            SemanticKITTI, SSCBench, Occ3D or OpenOccupancy.
         truth: the ground truth, likewise.
+        convention: the benchmark whose rules say which voxels count, in which classes, and how the mean is taken: a name in
+            `carlasc.metrics.CONVENTIONS`; "own" scores the data's own classes as they are. None: "carlasc" for class tables that it
+            has a map for, else "own".
         grid: the grid that holds the predictions; None takes the name of the true grid, or the only grid of a sequence.
         truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
-        remap: the remap to the classes that are scored, or its name; None scores ids as they are; "auto" takes the paper's 11
-            classes for CARLA's ids and the benchmark's 19 for SemanticKITTI's. A side that has these classes already is not remapped.
-        source_classes: name of the class table of the predictions, for data that do not name one. None takes the scored classes, or,
-            with SemanticKITTI's mask, its raw ids, as its benchmark does.
-        mask: which voxels count: "known" (votes > 0, or not invalid), "semantickitti" (the rule of its benchmark), or "all".
+        source_classes: name of the class table of the predictions, for data that do not name one. None takes what the convention's own
+            files hold.
+        voxels: "known" scores what the convention scores; "all" scores voxels that the truth never evaluated, too.
         region: makes a mask of a GridSpec, such as `lambda spec: distance_band(spec, 0, 10)`: only voxels in it count.
+        by: break the score down by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
+        rays: also cast the rays of RayIoU; needs poses and a Cartesian grid.
         frames: the frames that are scored; None scores all frames of the ground truth.
-        absent: how a class counts in the mean that is in neither the prediction nor the truth: "zero" (the paper), or "skip".
         name: what to call the predictions in tables.
         progress: called with (frames done, frames in total).
 
@@ -57,144 +69,295 @@ def evaluate(
         The scores. Frames that could not be scored are listed in `failures`.
 
     Raises:
-        ArgumentError: `mask`, `absent`, `frames`, `remap` or `source_classes` has no such value, or `region` is given for grids of
-            unknown geometry.
+        ArgumentError: an argument has no such value, or `region`, `by` or `rays` needs what the data do not have.
         MissingDataError: there is no grid, a sequence has no ground truth, or there is no frame to score.
         FormatError: the grids or the classes of the two sides cannot be compared.
     """
-    if mask not in ("known", "semantickitti", "all"):
-        raise ArgumentError("mask", expected="known, semantickitti or all", found=repr(mask))
-    check_absent(absent)
+    (result,) = _score_all(
+        [convention], source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
+        progress=progress, options=_Options(voxels, region, tuple(by), rays),
+    )  # fmt: skip
+    if isinstance(result, CarlascError):
+        raise result
+    return result
+
+
+def evaluate_by_all_conventions(
+    source: Place,
+    truth: Place,
+    *,
+    grid: str | None = None,
+    truth_grid: str | None = None,
+    source_classes: str | None = None,
+    frames: Frames = None,
+    name: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Mapping[str, Evaluation | CarlascError]:
+    """Score predictions by every convention, reading each frame once: so that the numbers of two papers can be compared.
+
+    Args:
+        source: the predictions, as for `evaluate`.
+        truth: the ground truth.
+        grid: as for `evaluate`.
+        truth_grid: as for `evaluate`.
+        source_classes: as for `evaluate`.
+        frames: as for `evaluate`.
+        name: as for `evaluate`.
+        progress: as for `evaluate`.
+
+    Returns:
+        By the name of the convention: the scores, or the error that says why these data cannot have such a score.
+    """
+    results = _score_all(
+        list(CONVENTIONS), source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
+        progress=progress, options=_Options(),
+    )  # fmt: skip
+    return dict(zip(CONVENTIONS, results, strict=True))
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What is scored of each frame."""
+
+    voxels: Voxels = "known"
+    region: Region | None = None
+    by: tuple[str, ...] = ()
+    rays: bool = False
+
+    def __post_init__(self) -> None:
+        if self.voxels not in ("known", "all"):
+            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
+        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
+            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
+
+
+def _score_all(
+    conventions: Sequence[str | Convention | None],
+    source: Place,
+    truth: Place,
+    *,
+    grid: str | None,
+    truth_grid: str | None,
+    source_classes: str | None,
+    frames: Frames,
+    name: str | None,
+    progress: Callable[[int, int], None] | None,
+    options: _Options,
+) -> list[Evaluation | CarlascError]:
+    """Read each frame once and score it by each convention."""
     chosen = FrameRange.of(frames)
-    pairs = pair_grids(source, truth, grid, truth_grid)
+    pairs, notes = pair_grids(source, truth, grid, truth_grid)
     jobs = [(pair, chosen.select(pair.truth.frames())) for pair in pairs]
     total = sum(len(numbers) for _, numbers in jobs)
     if total == 0:
         raise MissingDataError(
             pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
         )
-
-    classes: ClassTable | None = None
-    sequences: dict[str, ConfusionMatrix] = {}
-    failures: list[tuple[str, str]] = []
+    label = name or getattr(source, "location", None) or str(source)
+    scorers = [_Scorer(convention, pairs, source_classes, options) for convention in conventions]
     done = 0
     for pair, numbers in jobs:
-        scorer = _Scorer(pair, remap, source_classes, mask, region)
-        if classes is not None and scorer.classes.name != classes.name:
-            raise FormatError(pair.truth.location, expected=f"the classes {classes.name}", found=scorer.classes.name)
-        classes = scorer.classes
         predicted = set(pair.prediction.frames().tolist())
-        matrix = sequences.setdefault(pair.truth.path, ConfusionMatrix(max(classes.names) + 1))
         for frame in numbers.tolist():
+            content: tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]] | CarlascError
             try:
-                if frame not in predicted:
-                    raise MissingDataError(
-                        pair.prediction.location, expected=f"a prediction for frame {frame}", found="none"
-                    )
-                matrix += scorer.score(frame)
+                content = _read(pair, frame, predicted)
             except CarlascError as error:
-                failures.append((f"{pair.truth.path}:{frame}", str(error)))
+                content = error
+            for scorer in scorers:
+                scorer.add(pair, frame, content)
             done += 1
             if progress:
                 progress(done, total)
-    assert classes is not None  # there is at least one pair
-    summed = sum(sequences.values(), ConfusionMatrix(max(classes.names) + 1))
-    label = name or getattr(source, "location", None) or str(source)
-    return Evaluation(label, classes, summed, sequences, total - len(failures), mask, absent, failures)
+    return [scorer.result(label, notes) for scorer in scorers]
+
+
+def _read(
+    pair: Pair, frame: int, predicted: set[int]
+) -> tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]:
+    """Return a frame's predicted and true labels, of one shape."""
+    if frame not in predicted:
+        raise MissingDataError(
+            pair.prediction.location, expected=f"a prediction for frame {pair.truth.name_of(frame)}", found="none"
+        )
+    prediction, truth = pair.prediction.labels(frame), pair.truth.labels(frame)
+    if prediction.size != truth.size:
+        where = f"{pair.prediction.location}: frame {pair.truth.name_of(frame)}"
+        raise FormatError(where, expected=f"the truth's shape {truth.shape}", found=str(prediction.shape))
+    return prediction.reshape(truth.shape), truth
 
 
 class _Scorer:
-    """Scores the frames of one pair of grids."""
+    """Adds up the frames of all sequences by one convention."""
 
     def __init__(
-        self, pair: Pair, remap: str | Remap | None, source_classes: str | None, mask: Mask, region: Region | None
+        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, options: _Options
     ) -> None:
-        self.pair, self.mask = pair, mask
-        usual = SEMANTICKITTI if mask == "semantickitti" else CARLA
-        self.remap = _choose_remap(remap, pair, usual)
-        self.classes = self.remap.target if self.remap else (pair.truth.classes or pair.prediction.classes or usual)
-        self.truth_classes = pair.truth.classes or (self.remap.source if self.remap else self.classes)
-        if mask == "semantickitti" and self.truth_classes != SEMANTICKITTI:
-            raise FormatError(
+        self.options = options
+        self.impossible: CarlascError | None = None
+        self.convention = _resolve(convention, pairs)
+        given = None if source_classes is None else table_named(source_classes)
+        self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
+        self.matrices: dict[str, ConfusionMatrix] = {}
+        self.failures: list[tuple[str, str]] = []
+        self.frames: list[FrameScore] = []
+        self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
+        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if options.rays else None
+        try:
+            for pair in pairs:
+                self.tables[pair.truth.path] = self._check(pair, given)
+                self.matrices[pair.truth.path] = self._matrix()
+        except CarlascError as error:
+            self.impossible = error
+
+    def add(
+        self,
+        pair: Pair,
+        frame: int,
+        content: tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]] | CarlascError,
+    ) -> None:
+        """Score a frame, or note why it could not be scored."""
+        if self.impossible is not None:
+            return
+        path, frame_name = pair.truth.path, pair.truth.name_of(frame)
+        try:
+            if isinstance(content, CarlascError):
+                raise content
+            matrix = self._score(pair, frame, *content)
+        except ArgumentError:
+            raise  # every frame would meet the same
+        except CarlascError as error:
+            self.failures.append((f"{path}:{frame_name}", str(error)))
+            return
+        self.matrices[path] += matrix
+        self.frames.append(FrameScore(path, frame_name, self.convention.score(matrix)))
+
+    def result(self, name: str, notes: tuple[str, ...]) -> Evaluation | CarlascError:
+        """Return the scores of everything that was added, or why there are none."""
+        if self.impossible is not None:
+            return self.impossible
+        summed = sum(self.matrices.values(), self._matrix())
+        return Evaluation(
+            name, self.convention, summed, self.matrices, tuple(self.frames), self.options.voxels, self.failures, notes,
+            self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
+        )  # fmt: skip
+
+    def _matrix(self) -> ConfusionMatrix:
+        return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
+
+    def _check(self, pair: Pair, given: ClassTable | None) -> tuple[ClassTable, ClassTable]:
+        """Return the class tables of a pair's sides, after checking that the convention can score them."""
+        truth = pair.truth.classes or self.convention.usual_truth
+        prediction = given or pair.prediction.classes or self.convention.usual_prediction
+        self.convention.check(truth, pair.truth.location)
+        self.convention.check(prediction, pair.prediction.location)
+        if self.convention.seen_by == "camera" and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
+            raise MissingDataError(
                 pair.truth.location,
-                expected="SemanticKITTI's raw ids for its mask",
-                found=self.truth_classes.name,
-                advice="give `mask=known`",
+                expected="which voxels a camera observed",
+                found="data without cameras",
+                advice=f"score by another convention than {self.convention.name}",
             )
-        self.source_classes = pair.prediction.classes or (SEMANTICKITTI if mask == "semantickitti" else self.classes)
-        if source_classes is not None:
-            self.source_classes = table_named(source_classes)
-        spec = pair.truth.spec or pair.prediction.spec
-        if pair.truth.spec and pair.prediction.spec and pair.truth.spec != pair.prediction.spec:
+        true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
+        if true_spec and predicted_spec and true_spec != predicted_spec:
             raise FormatError(
                 pair.prediction.location,
-                expected=f"the truth's grid {pair.truth.spec} {pair.truth.spec.lower} .. {pair.truth.spec.upper}",
-                found=f"{pair.prediction.spec} {pair.prediction.spec.lower} .. {pair.prediction.spec.upper}",
+                expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
+                found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
             )
-        if region is not None and spec is None:
-            raise ArgumentError(
-                "region",
-                expected="None for grids without geometry",
-                found="a region",
-                advice=f"add params.json to {pair.truth.location}",
-            )
-        self.region = None if region is None or spec is None else region(spec)
-
-    def score(self, frame: int) -> ConfusionMatrix:
-        """Return the confusion matrix of a frame."""
-        sides = self.pair.prediction, self.pair.truth
-        prediction, truth = (side.labels(frame) for side in sides)
-        source_place, truth_place = (f"{side.location}: frame {frame}" for side in sides)
-        counted = self._counted(truth, frame)
-        prediction = self._to_scored(prediction, self.source_classes, source_place).reshape(-1)
-        truth = self._to_scored(truth, self.truth_classes, truth_place).reshape(-1)
-        try:
-            return ConfusionMatrix(max(self.classes.names) + 1).update(
-                prediction, truth, None if counted is None else counted.reshape(-1)
-            )
-        except FormatError as error:  # it says which side it is about
-            raise error.within(source_place if error.where == "prediction" else truth_place) from error
-
-    def _counted(self, truth: NDArray[np.unsignedinteger], frame: int) -> NDArray[np.bool_] | None:
-        """Return the voxels that count; None for all."""
-        counted: NDArray[np.bool_] | None = None
-        if self.mask != "all":
-            counted = self.pair.truth.known(frame)
-            if counted is None and self.mask == "known":
-                raise MissingDataError(
-                    f"{self.pair.truth.location}: frame {frame}",
-                    expected="counts, which say what is known",
-                    found="none",
-                    advice="give `mask=all` to score all voxels",
+        for argument, asked in (("region", self.options.region), ("by", self.options.by), ("rays", self.options.rays)):
+            if asked and _spec_of(pair) is None:
+                raise ArgumentError(
+                    argument,
+                    expected="nothing for grids without geometry",
+                    found=str(argument),
+                    advice=f"add params.json to {pair.truth.location}",
                 )
-        if self.mask == "semantickitti":
-            scored = semantickitti(truth).reshape(-1)
-            counted = scored if counted is None else scored & counted.reshape(-1)
-        if self.region is not None:
-            counted = self.region.reshape(-1) if counted is None else counted.reshape(-1) & self.region.reshape(-1)
-        return counted
-
-    def _to_scored(
-        self, labels: NDArray[np.unsignedinteger], table: ClassTable, where: str
-    ) -> NDArray[np.unsignedinteger]:
-        if self.remap is None or table.name == self.remap.target.name:
-            return labels
-        return self.remap(labels, where)
-
-
-def _choose_remap(remap: str | Remap | None, pair: Pair, usual: ClassTable) -> Remap | None:
-    """Return the remap to the scored classes, after checking that each side has ids of its source or of its target."""
-    if remap == "auto":
-        table = pair.truth.classes or pair.prediction.classes or usual
-        candidates = [REMAPS["carlasc11"], REMAPS["semantickitti19"]]
-        remap = next((r for r in candidates if table.name in (r.source.name, r.target.name)), None)
-    elif isinstance(remap, str):
-        remap = remap_named(remap)
-    for side in (pair.truth, pair.prediction):
-        if remap and side.classes and side.classes.name not in (remap.source.name, remap.target.name):
-            raise FormatError(
-                side.location,
-                expected=f"classes of {remap.source.name} or {remap.target.name} (remap {remap.name})",
-                found=side.classes.name,
+        if (self.options.rays or "motion" in self.options.by) and not isinstance(pair.truth, SequenceGrid):
+            raise ArgumentError(
+                "rays" if self.options.rays else "by",
+                expected="a data set with poses and scans as the truth",
+                found="files of grids",
             )
-    return remap
+        return prediction, truth
+
+    def _score(
+        self, pair: Pair, frame: int, prediction: NDArray[np.unsignedinteger], truth: NDArray[np.unsignedinteger]
+    ) -> ConfusionMatrix:
+        tables = self.tables[pair.truth.path]
+        known, spec = self._known(pair, frame, truth.shape), _spec_of(pair)
+        region = None
+        if self.options.region is not None and spec is not None:
+            region = self.options.region(spec).reshape(truth.shape)
+        try:
+            matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
+            if (self.options.by or self.rays is not None) and spec is not None:
+                pred, true, counted = self.convention.prepare(
+                    (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
+                )
+                for masks in self._masks(pair, frame, spec, true, known, tables[1]):
+                    self.breakdown.update(pred, true, masks, counted)
+                if self.rays is not None and isinstance(pair.truth, SequenceGrid):
+                    self.rays.update(pred, true, spec, _origins(pair.truth, frame, spec))
+        except FormatError as error:  # it says which side it is about
+            side = pair.prediction if error.where == "prediction" else pair.truth
+            raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
+        return matrix
+
+    def _known(self, pair: Pair, frame: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """Return which voxels the truth evaluated; None: all of them."""
+        if self.options.voxels == "all":
+            return None
+        known = pair.truth.known(frame, self.convention.seen_by)
+        if known is not None:
+            return known.reshape(shape)
+        if pair.truth.spec is not None and self.convention.unknown == "left out":
+            raise MissingDataError(
+                f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
+                expected="counts, which say what is known",
+                found="none",
+                advice="give `voxels=all` to score all voxels",
+            )
+        return None
+
+    def _masks(
+        self,
+        pair: Pair,
+        frame: int,
+        spec: GridSpec,
+        truth: NDArray[np.unsignedinteger],
+        known: NDArray[np.bool_] | None,
+        table: ClassTable,
+    ) -> Iterator[Masks]:
+        """Yield the masks of each breakdown that was asked for."""
+        counts = None if known is None else known.astype(np.float32).reshape(spec.size)
+        if "distance" in self.options.by:
+            yield distance_bands(spec, _DISTANCES_M)
+        if "height" in self.options.by:
+            yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
+        if "visibility" in self.options.by:
+            yield visibility(Grid(spec, truth, counts), free=self.convention.free)
+        if "motion" in self.options.by and isinstance(pair.truth, SequenceGrid):
+            labels = pair.truth.labels(frame).reshape(spec.size)
+            yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))
+
+
+def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Convention:
+    if isinstance(convention, Convention):
+        return convention
+    tables = [side.classes for pair in pairs for side in (pair.truth, pair.prediction) if side.classes is not None]
+    table = tables[0] if tables else CARLA
+    if convention is None:
+        convention = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
+    return own_convention(table) if convention == "own" else convention_named(convention)
+
+
+def _spec_of(pair: Pair) -> GridSpec | None:
+    return pair.truth.spec or pair.prediction.spec
+
+
+def _origins(truth: SequenceGrid, frame: int, spec: GridSpec) -> NDArray[np.float64]:
+    """Return where the rays of a frame start: the places of the sensor at the frames that have a true grid."""
+    numbers = truth.frames().tolist()
+    poses = np.stack([truth.sequence.read_pose(number) for number in numbers])
+    return ray_origins(poses, numbers.index(frame), spec)

@@ -9,33 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import remap_named
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError
 
 
 def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
     """Return the voxels that have votes (count > 0): the data set's own rule."""
     return counts > 0
-
-
-def semantickitti(labels: NDArray[np.integer], invalid: NDArray[Any] | None = None) -> NDArray[np.bool_]:
-    """Return the voxels that SemanticKITTI's completion benchmark scores (see the format page, `docs/format.md#semantickitti`).
-
-    Voxels with the raw id 0 are empty and count. Voxels of a class outside the benchmark's 19 and invalid voxels do not.
-
-    Args:
-        labels: (X, Y, Z) raw SemanticKITTI ids.
-        invalid: (X, Y, Z), non-zero for voxels that no merged scan observed.
-
-    Raises:
-        FormatError: an id is not one of SemanticKITTI's, or shapes differ.
-    """
-    scored = (labels == 0) | (remap_named("semantickitti19")(labels) != 0)
-    if invalid is None:
-        return scored
-    if invalid.shape != labels.shape:
-        raise FormatError("invalid", expected=f"the labels' shape {labels.shape}", found=str(invalid.shape))
-    return scored & (invalid == 0)
 
 
 def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) -> NDArray[np.bool_]:

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
-
-import numpy as np
 
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError
-from carlasc.metrics.confusion import Absent, ConfusionMatrix
+from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.conventions import Convention, ConventionScore
+from carlasc.metrics.rays import RayScore
+from carlasc.metrics.sampling import FEWEST_SEQUENCES, Comparison, Interval, bootstrap, compare
 from carlasc.metrics.tables import Cell, Table
 
-Mask = Literal["known", "semantickitti", "all"]
+
+@dataclass(frozen=True)
+class FrameScore:
+    """The scores of one frame.
+
+    Attributes:
+        sequence: path of its sequence.
+        frame: its number, or its token.
+        score: its figures.
+    """
+
+    sequence: str
+    frame: str
+    score: ConventionScore
 
 
 @dataclass(frozen=True)
@@ -22,100 +39,168 @@ class Evaluation:
 
     Attributes:
         name: of the predictions: a network's name, or where they are stored.
-        classes: the classes that are scored.
-        matrix: the confusion matrix over all frames.
+        convention: the rules by which they were scored.
+        matrix: the confusion matrix over all frames, in the convention's classes.
         sequences: the confusion matrix of each sequence, by path.
-        frames: number of frames scored.
-        mask: which voxels counted.
-        absent: how a class counts in the mean that is in neither the prediction nor the truth: "zero", or "skip".
+        frame_scores: the scores of each frame alone.
+        voxels: "known" voxels of the truth were scored, or "all".
         failures: (frame, message) of the frames that could not be scored.
+        notes: what a reader of the scores must know.
+        breakdown: the confusion matrix of each region that was asked for, by name.
+        rays: RayIoU, if it was asked for.
     """
 
     name: str
-    classes: ClassTable
+    convention: Convention
     matrix: ConfusionMatrix
     sequences: Mapping[str, ConfusionMatrix]
-    frames: int
-    mask: Mask
-    absent: Absent
+    frame_scores: tuple[FrameScore, ...]
+    voxels: Literal["known", "all"]
     failures: list[tuple[str, str]]
+    notes: tuple[str, ...] = ()
+    breakdown: Mapping[str, ConfusionMatrix] = field(default_factory=dict)
+    rays: RayScore | None = None
+
+    @property
+    def classes(self) -> ClassTable:
+        """The classes that are scored."""
+        return self.convention.classes
+
+    @property
+    def frames(self) -> int:
+        """Number of frames scored."""
+        return len(self.frame_scores)
+
+    @property
+    def score(self) -> ConventionScore:
+        """The figures of the convention."""
+        return self.convention.score(self.matrix)
 
     @property
     def class_iou(self) -> dict[str, float]:
-        """IoU of each class by name; NaN for a class that is in neither the prediction nor the truth."""
-        return {name: float(self.matrix.iou[index]) for index, name in sorted(self.classes.names.items())}
+        """IoU of each class of the mean by name; NaN for a class that is in neither the prediction nor the truth."""
+        return dict(self.score.class_iou)
 
     @property
     def miou(self) -> float:
-        """Mean IoU over all classes, including free: the paper's figure."""
-        return self._mean_iou(with_free=True)
+        """Mean IoU, taken as the convention says."""
+        return self.score.miou
 
     @property
     def miou_without_free(self) -> float:
-        """Mean IoU over all classes except free: SemanticKITTI's figure."""
-        return self._mean_iou(with_free=False)
+        """Mean IoU over the convention's classes except free; absent classes count as zero, as in the paper."""
+        free = self.classes.names[self.convention.free]
+        values = [0.0 if math.isnan(v) else v for name, v in self.class_iou.items() if name != free]
+        return sum(values) / len(values) if values else math.nan
 
-    def _mean_iou(self, *, with_free: bool) -> float:
-        """Average over the ids that are classes: a table such as SemanticKITTI's has gaps, the matrix has none."""
-        values = [v for i, v in enumerate(self.matrix.iou) if i in self.classes.names and (with_free or i)]
-        present = [v for v in values if not np.isnan(v)]
-        count = len(values) if self.absent == "zero" else len(present)
-        return sum(present) / count if count else float("nan")
+    def interval(self, level: float = 0.95) -> Interval | None:
+        """Return the confidence interval of `miou` by bootstrap over sequences; None with fewer than five of them."""
+        if len(self.sequences) < FEWEST_SEQUENCES:
+            return None
+        return bootstrap(list(self.sequences.values()), lambda m: self.convention.score(m).miou, level=level)
 
-    def tables(self) -> tuple[Table, Table]:
-        """Return the paper's two tables: IoU of each class, and completeness."""
-        return semantic_table([self]), geometric_table([self])
+    def compare(self, other: Evaluation) -> Comparison:
+        """Compare with other predictions of the same sequences by a paired test.
+
+        Raises:
+            ArgumentError: they were scored by another convention, or have fewer than five sequences in common.
+        """
+        if other.convention.name != self.convention.name:
+            raise ArgumentError("other", expected=f"scores by {self.convention.name}", found=other.convention.name)
+        return compare(self.sequences, other.sequences, lambda m: self.convention.score(m).miou)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the paper's two tables, IoU of each class and completeness, and one of the regions if there are any."""
+        tables = [semantic_table([self]), geometric_table([self])]
+        return (*tables, self._breakdown_table()) if self.breakdown else tuple(tables)
+
+    def to_csv(self) -> str:
+        """Return the scores of each frame as CSV."""
+        buffer = io.StringIO()
+        writer = csv.writer(buffer, lineterminator="\n")
+        names = list(self.class_iou)
+        writer.writerow(["sequence", "frame", "miou", "iou", "precision", "recall", "false_free", *names])
+        for frame in self.frame_scores:
+            score = frame.score
+            figures = [score.miou, score.iou, score.precision, score.recall, score.false_free]
+            cells = ["" if math.isnan(v) else f"{v:.6f}" for v in (*figures, *score.class_iou.values())]
+            writer.writerow([frame.sequence, frame.frame, *cells])
+        return buffer.getvalue()
 
     def to_dict(self) -> dict[str, Any]:
         """Return every figure by name, as fractions, for JSON; None for a figure that is not defined."""
-        completeness = self.matrix.completeness()
+        score, interval = self.score, self.interval()
         figures = {
-            "miou": self.miou,
+            "miou": score.miou,
             "miou_without_free": self.miou_without_free,
             "accuracy": self.matrix.accuracy,
-            "precision": completeness.precision,
-            "recall": completeness.recall,
-            "iou": completeness.iou,
+            "precision": score.precision,
+            "recall": score.recall,
+            "iou": score.iou,
+            "false_free": score.false_free,
         }
         return {
             "name": self.name,
+            "convention": self.convention.name,
             "classes": self.classes.name,
             "frames": self.frames,
-            "voxels": self.matrix.total,
-            "mask": self.mask,
-            "absent": self.absent,
+            "voxels": self.voxels,
+            "scored_voxels": self.matrix.total,
             **{name: _number(value) for name, value in figures.items()},
+            "miou_interval": None if interval is None else [interval.low, interval.high],
             "class_iou": {name: _number(value) for name, value in self.class_iou.items()},
+            "rayiou": None if self.rays is None else _number(self.rays.rayiou),
+            "breakdown": {
+                name: {"miou": _number(part.miou), "iou": _number(part.iou), "false_free": _number(part.false_free)}
+                for name, part in ((name, self.convention.score(matrix)) for name, matrix in self.breakdown.items())
+            },
             "confusion": self.matrix.counts.tolist(),
+            "notes": list(self.notes),
             "failures": [list(failure) for failure in self.failures],
         }
 
+    def _breakdown_table(self) -> Table:
+        rows: list[tuple[Cell, ...]] = []
+        for name, matrix in self.breakdown.items():
+            score = self.convention.score(matrix)
+            rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
+        header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
+        return Table("By region", header, tuple(rows))
+
 
 def semantic_table(evaluations: Sequence[Evaluation]) -> Table:
-    """Return the table of the IoU of each class, both means of them, and accuracy; one row per evaluation.
+    """Return the table of the IoU of each class, the mean of them, and accuracy; one row per evaluation.
 
     Raises:
-        ArgumentError: there is no evaluation, or they score different classes.
+        ArgumentError: there is no evaluation, or they follow different conventions.
     """
-    classes = {evaluation.classes.name for evaluation in evaluations}
-    if len(classes) != 1:
+    conventions = {evaluation.convention.name for evaluation in evaluations}
+    if len(conventions) != 1:
         raise ArgumentError(
-            "evaluations", expected="evaluations of one class table", found=", ".join(sorted(classes)) or "none"
+            "evaluations", expected="evaluations by one convention", found=", ".join(sorted(conventions)) or "none"
         )
-    header = ("Network", *evaluations[0].class_iou, "mIoU", "mIoU w/o free", "Accuracy")
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (e.name, *_percent(*e.class_iou.values(), e.miou, e.miou_without_free, e.matrix.accuracy)) for e in evaluations
-    )
-    return Table("Semantic scene completion: IoU of each class", header, rows)
+    first = evaluations[0].convention
+    with_free = first.free in first.averaged
+    rayed = any(e.rays is not None for e in evaluations)
+    header = (
+        "Network", *evaluations[0].class_iou, "mIoU", *(["mIoU w/o free"] if with_free else []), "Accuracy", *(["RayIoU"] if rayed else []),
+    )  # fmt: skip
+    rows: list[tuple[Cell, ...]] = []
+    for e in evaluations:
+        means = [e.miou, *([e.miou_without_free] if with_free else []), e.matrix.accuracy]
+        means += [math.nan if e.rays is None else e.rays.rayiou] if rayed else []
+        rows.append((e.name, *_percent(*e.class_iou.values(), *means)))
+    return Table(f"Semantic scene completion, IoU of each class, by {first.title}", header, tuple(rows))
 
 
 def geometric_table(evaluations: Sequence[Evaluation]) -> Table:
     """Return the table of completeness: precision, recall and IoU of occupied against free space; one row per evaluation."""
     rows: list[tuple[Cell, ...]] = []
     for evaluation in evaluations:
-        found = evaluation.matrix.completeness()
-        rows.append((evaluation.name, *_percent(found.precision, found.recall, found.iou)))
-    return Table("Scene completion: occupied against free", ("Network", "Precision", "Recall", "IoU"), tuple(rows))
+        score = evaluation.score
+        rows.append((evaluation.name, *_percent(score.precision, score.recall, score.iou, score.false_free)))
+    header = ("Network", "Precision", "Recall", "IoU", "False free")
+    return Table("Scene completion: all classes other than free count as one", header, tuple(rows))
 
 
 def _percent(*values: float) -> tuple[float, ...]:
@@ -123,4 +208,4 @@ def _percent(*values: float) -> tuple[float, ...]:
 
 
 def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
+    return None if math.isnan(value) else float(value)

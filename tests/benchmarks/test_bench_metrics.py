@@ -1,15 +1,17 @@
-"""A frame's confusion matrix against the loop over classes, masks included."""
+"""One frame's metrics, compiled and in plain NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.plain_metrics import panoptic_quality, rayiou
 
-from carlasc.metrics import ConfusionMatrix, known
+from carlasc import GridSpec
+from carlasc.metrics import ConfusionMatrix, PanopticQuality, RayIoU, known, rayiou_directions
 
 pytestmark = pytest.mark.slow
 
-K = 11
+K, THINGS = 11, frozenset({4, 10})
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +51,49 @@ def test_bench_per_class_loop(benchmark, frame):
     matrix = ConfusionMatrix(K).update(frame[0], frame[1], known(frame[2]))
     found = np.stack([matrix.true_positives, matrix.false_positives, matrix.false_negatives], 1)
     np.testing.assert_array_equal(found, figures)
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A street of 128 x 128 x 8 voxels: ground, walls, cars with instance ids; a prediction that errs here and there; 8 origins."""
+    rng = np.random.default_rng(1)
+    spec = GridSpec.published("cartesian")
+    truth, ids = np.zeros(spec.size, np.uint8), np.zeros(spec.size, np.uint32)
+    truth[..., 0] = 6
+    truth[:30, :, :6], truth[98:, :, :6] = 1, 1
+    for number in range(1, 40):
+        x, y = rng.integers(32, 92), rng.integers(0, 118)
+        truth[x : x + 5, y : y + 10, 1:4], ids[x : x + 5, y : y + 10, 1:4] = 10, number
+    pred = np.where(rng.random(spec.size) < 0.03, rng.integers(0, K, spec.size), np.roll(truth, 1, axis=0)).astype(
+        np.uint8
+    )
+    pred_ids = np.where(pred == 10, np.roll(ids, 1, axis=0), 0)
+    origins = np.column_stack([np.zeros(8), np.linspace(-20, 20, 8), np.zeros(8)])
+    return spec, (pred, pred_ids), (truth, ids), origins
+
+
+@pytest.mark.benchmark(group="rays")
+def test_bench_rayiou(benchmark, street):
+    spec, (pred, _), (truth, _), origins = street
+    score = benchmark(lambda: RayIoU(K).update(pred, truth, spec, origins).compute().rayiou)
+    assert 0 < score < 1
+
+
+@pytest.mark.benchmark(group="rays")
+def test_bench_rayiou_in_numpy(benchmark, street):
+    spec, (pred, _), (truth, _), origins = street
+    score = benchmark.pedantic(rayiou, (pred, truth, spec, origins, rayiou_directions(), K), rounds=2)
+    assert score == pytest.approx(RayIoU(K).update(pred, truth, spec, origins).compute().rayiou, abs=1e-9)
+
+
+@pytest.mark.benchmark(group="segments")
+def test_bench_panoptic_quality(benchmark, street):
+    _, pred, truth, _ = street
+    assert 0 < benchmark(lambda: PanopticQuality(K, THINGS).update(pred, truth).compute().mean()) < 1
+
+
+@pytest.mark.benchmark(group="segments")
+def test_bench_panoptic_quality_in_numpy(benchmark, street):
+    _, pred, truth, _ = street
+    found = benchmark(panoptic_quality, pred, truth, K, THINGS)
+    assert found == pytest.approx(PanopticQuality(K, THINGS).update(pred, truth).compute().mean())

@@ -46,9 +46,9 @@ def test_json_csv_and_latex_hold_the_same_figures(data):
 
 
 def test_bands_and_views_leave_voxels_out(data):
-    whole = json.loads(run(*data, "--json").output)["voxels"]
-    near = json.loads(run(*data, "--json", "--far", "1").output)["voxels"]
-    ahead = json.loads(run(*data, "--json", "--fov", "90").output)["voxels"]
+    whole = json.loads(run(*data, "--json").output)["scored_voxels"]
+    near = json.loads(run(*data, "--json", "--far", "1").output)["scored_voxels"]
+    ahead = json.loads(run(*data, "--json", "--fov", "90").output)["scored_voxels"]
     assert (whole, near, ahead) == (64, 16, 24)
 
 
@@ -64,6 +64,36 @@ def test_a_missing_prediction_is_named_and_exits_1_after_the_tables(data):
 def test_mistakes_are_one_line(data):
     result = run(data[0], data[1] / "nothing")
     assert (result.exit_code, result.output.count("\n")) == (1, 1)
-    result = run(*data, "--remap", "nonsense")
+    result = run(*data, "--convention", "nonsense")
     assert (result.exit_code, result.output.count("\n")) == (2, 1)
     assert run(*data, "--far", "0").exit_code == 2
+
+
+def test_all_conventions_are_printed_a_row_each_with_the_reason_where_there_is_none(data):
+    result = run(*data, "--all-conventions")
+    assert result.exit_code == 0, result.output
+    for name in ("carlasc", "semantickitti", "sscbench", "occ3d-lidar", "openoccupancy"):
+        assert name in result.output
+    assert "no score: occ3d-camera" in result.output
+    assert "without cameras" in result.output
+    figures = json.loads(run(*data, "--all-conventions", "--json").output)
+    assert "impossible" in figures["occ3d-camera"]
+    assert figures["sscbench"]["miou"] != figures["carlasc"]["miou"]
+
+
+def test_frames_are_written_drawn_and_broken_down(data, tmp_path):
+    pytest.importorskip("matplotlib")
+    csv, plot = tmp_path / "frames.csv", tmp_path / "frames.png"
+    result = run(*data, "--per-frame", csv, "--plot", plot, "--by", "distance", "--by", "visibility")
+    assert result.exit_code == 0, result.output
+    assert csv.read_text().startswith("sequence,frame,miou")
+    assert len(csv.read_text().splitlines()) == 3
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert "visible" in result.output and "0-10 m" in result.output
+    assert run(*data, "--plot", tmp_path / "frames.txt").exit_code == 2
+
+
+def test_too_few_sequences_to_compare_are_said_in_one_line(data):
+    result = run(*data, "--compare", data[0])
+    assert (result.exit_code, result.output.count("\n")) == (2, 1)
+    assert "at least 5" in result.output

@@ -8,7 +8,16 @@ import pytest
 from carlasc import ClassTable, GridSpec
 from carlasc.core.tables import CARLASC11, REMAPS
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.metrics import ConfusionMatrix, Evaluation, distance_band, evaluate, geometric_table, semantic_table
+from carlasc.metrics import (
+    CONVENTIONS,
+    ConfusionMatrix,
+    Evaluation,
+    distance_band,
+    evaluate,
+    evaluate_by_all_conventions,
+    geometric_table,
+    semantic_table,
+)
 from carlasc.storage import FolderSink, layout
 
 SPEC = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -2.0), (4.0, 4.0, 1.0))
@@ -70,6 +79,8 @@ def test_a_data_set_is_scored_as_the_sum_of_its_frames(folders, world):
     assert seen == [(i, 6) for i in range(1, 7)]
     assert result.miou == pytest.approx(result.matrix.miou)
     assert result.miou_without_free == pytest.approx(result.matrix.mean_iou(with_free=False))
+    assert [(f.sequence, f.frame) for f in result.frame_scores] == [(p, str(i)) for p in SEQUENCES for i in range(3)]
+    assert len(result.to_csv().splitlines()) == 7
 
 
 def test_frames_regions_and_masks_choose_what_counts(folders, world):
@@ -77,7 +88,7 @@ def test_frames_regions_and_masks_choose_what_counts(folders, world):
     assert result.matrix == expected_matrix(world, keep=lambda key: key[1] == 1)
     near = distance_band(SPEC, 0, 2)
     assert evaluate(*folders, region=lambda spec: distance_band(spec, 0, 2)).matrix == expected_matrix(world, mask=near)
-    assert evaluate(*folders, mask="all").matrix.total == 6 * np.prod(SHAPE)
+    assert evaluate(*folders, voxels="all").matrix.total == 6 * np.prod(SHAPE)
 
 
 def test_predictions_beside_the_data_are_found_by_the_name_of_their_grid(folders, world):
@@ -114,7 +125,7 @@ def test_semantickittis_own_files_are_scored_by_its_rule(tmp_path):
     truth.tofile(tmp_path / "voxels" / "000005.label")
     np.packbits(invalid).tofile(tmp_path / "voxels" / "000005.invalid")
     pred.tofile(tmp_path / "predictions" / "000005.label")
-    result = evaluate(tmp_path / "predictions", tmp_path / "voxels", mask="semantickitti")
+    result = evaluate(tmp_path / "predictions", tmp_path / "voxels", convention="semantickitti")
 
     counted = ~invalid & ~np.isin(truth, [1, 52])
     lookup = {0: 0, 10: 1, 252: 1, 40: 9, 70: 15, 1: 0, 52: 0}
@@ -123,7 +134,7 @@ def test_semantickittis_own_files_are_scored_by_its_rule(tmp_path):
     )
     assert result.matrix == expected
     assert result.classes.name == "semantickitti19"
-    assert result.miou_without_free == pytest.approx(expected.mean_iou(with_free=False))
+    assert result.miou == pytest.approx(expected.mean_iou(with_free=False))
 
 
 def test_frames_that_cannot_be_scored_are_listed_and_the_others_done(folders, world):
@@ -138,7 +149,7 @@ def test_frames_that_cannot_be_scored_are_listed_and_the_others_done(folders, wo
     messages = dict(result.failures)
     assert "prediction for frame 1" in messages[f"{heavy}:1"]
     assert "000002.label" in messages[f"{heavy}:2"]
-    assert "class ids 0..10, found 11" in messages[f"{SEQUENCES[1]}:0"]
+    assert "class ids of carlasc11, found 11 (128 times)" in messages[f"{SEQUENCES[1]}:0"]
     keep = {(heavy, 0), (SEQUENCES[1], 1), (SEQUENCES[1], 2)}
     assert result.matrix == expected_matrix(world, keep=lambda key: key in keep)
 
@@ -157,8 +168,8 @@ def test_a_prediction_of_another_grid_is_refused(folders, world, tmp_path):
 
 def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, tmp_path):
     pred, truth = folders
-    with pytest.raises(FormatError, match="expected classes of semantickitti"):
-        evaluate(pred, truth, remap="semantickitti19")
+    with pytest.raises(ArgumentError, match="convention: expected one of carlasc, semantickitti"):
+        evaluate(pred, truth, convention="nuscenes")
     found = "found Town10_Heavy/cartesian, Town10_Light/cartesian: give both sides from the same level"
     with pytest.raises(MissingDataError, match=f"expected ground truth for the sequence '{SEQUENCES[0]}', {found}"):
         evaluate(pred, truth / "Test")
@@ -166,24 +177,75 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
         evaluate(pred, truth, grid="nothing")
     with pytest.raises(MissingDataError, match="none in the range"):
         evaluate(pred, truth, frames=(7, 9))
-    with pytest.raises(ArgumentError, match="mask: expected known, semantickitti or all, found 'some'"):
-        evaluate(pred, truth, mask="some")
-    with pytest.raises(ArgumentError, match="absent: expected zero or skip"):
-        evaluate(pred, truth, absent="maybe")
+    with pytest.raises(ArgumentError, match="voxels: expected known or all, found 'some'"):
+        evaluate(pred, truth, voxels="some")
     with pytest.raises(ArgumentError, match="frames: expected a range that holds a frame"):
         evaluate(pred, truth, frames=(2, 1))
     write_grids(tmp_path / "without_counts", world[0])
     assert "expected counts" in evaluate(pred, tmp_path / "without_counts").failures[0][1]
 
 
-def test_absent_classes_count_zero_or_are_left_out(folders, world, tmp_path):
-    only_road = {key: np.where(array == 7, 7, 0) for key, array in world[0].items()}
-    write_grids(tmp_path / "road", only_road, world[1])
-    zero = evaluate(tmp_path / "road", tmp_path / "road")
-    skip = evaluate(tmp_path / "road", tmp_path / "road", absent="skip")
-    assert zero.miou == pytest.approx(2 / 11)
-    assert skip.miou == 1.0
-    assert skip.miou_without_free == 1.0
+def test_the_datas_own_classes_can_be_scored_as_they_are(folders, world):
+    result = evaluate(folders[1], folders[1], convention="own")
+    assert (result.classes.name, result.convention.name) == ("carla", "own")
+    assert result.miou == 1.0
+
+
+def test_every_convention_scores_the_same_frames_or_says_why_not(folders, world):
+    found = evaluate_by_all_conventions(*folders)
+    assert list(found) == list(CONVENTIONS)
+    impossible = found.pop("occ3d-camera")
+    assert "which voxels a camera observed" in str(impossible)
+    known = sum(int((counts > 0).sum()) for counts in world[1].values())
+    for name, result in found.items():
+        assert result.frames == 6, name
+        alone = evaluate(*folders, convention=name)
+        assert alone.matrix == result.matrix
+        assert result.matrix.total <= (6 * np.prod(SHAPE) if name == "openoccupancy" else known)
+    assert len({round(r.miou, 6) for r in found.values() if not np.isnan(r.miou)}) > 3
+
+
+def test_a_sequence_without_prediction_is_named_in_a_note(folders):
+    assert evaluate(*folders).notes == ()
+    write_grids(
+        folders[1],
+        {("Test/Town10_New/cartesian", 0): np.zeros(SHAPE)},
+        {("Test/Town10_New/cartesian", 0): np.ones(SHAPE)},
+    )
+    result = evaluate(*folders)
+    assert set(result.sequences) == set(SEQUENCES)
+    assert result.notes == (
+        "1 of 3 sequences of the truth have no prediction and were not scored: Test/Town10_New/cartesian",
+    )
+
+
+def test_five_sequences_have_an_interval_and_can_be_compared(tmp_path, world):
+    rng = np.random.default_rng(3)
+    paths = [f"Test/Town{n}/cartesian" for n in range(6)]
+    truth = {(path, 0): rng.integers(0, 11, SHAPE) for path in paths}
+    for name, share in (("good", 0.8), ("bad", 0.5)):
+        labels = {k: np.where(rng.random(SHAPE) < share, t, rng.integers(0, 11, SHAPE)) for k, t in truth.items()}
+        write_grids(tmp_path / name, labels, classes="carlasc11")
+    write_grids(tmp_path / "truth", truth, {k: np.ones(SHAPE) for k in truth}, classes="carlasc11")
+    good, bad = (evaluate(tmp_path / name, tmp_path / "truth") for name in ("good", "bad"))
+    interval = good.interval()
+    assert interval.low < good.miou < interval.high
+    comparison = good.compare(bad)
+    assert comparison.p_value < 0.05 and comparison.difference.low > 0
+    assert evaluate(tmp_path / "good", tmp_path / "truth", frames=(0, 1)).to_dict()["miou_interval"] is not None
+    with pytest.raises(ArgumentError, match="other: expected scores by carlasc, found sscbench"):
+        good.compare(evaluate(tmp_path / "bad", tmp_path / "truth", convention="sscbench"))
+
+
+def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world):
+    result = evaluate(*folders, by=("distance", "height", "visibility"))
+    parts = result.breakdown
+    assert sum(parts[name].total for name in ("visible", "hidden")) == result.matrix.total
+    assert sum(m.total for name, m in parts.items() if name.endswith("up")) == result.matrix.total
+    assert parts["0-10 m"].total == result.matrix.total
+    assert result.tables()[-1].rows[0][0] == "0-10 m"
+    with pytest.raises(ArgumentError, match="by: expected any of distance, height, visibility, motion, found 'colour'"):
+        evaluate(*folders, by=("colour",))
 
 
 def test_tables_hold_the_figures_in_percent(folders):
@@ -193,10 +255,12 @@ def test_tables_hold_the_figures_in_percent(folders):
     assert len(semantic.rows) == 2
     assert semantic.rows[0][-1] == pytest.approx(100 * result.matrix.accuracy)
     found = result.matrix.completeness()
-    assert geometric.rows[0] == pytest.approx(("Net_1", 100 * found.precision, 100 * found.recall, 100 * found.iou))
+    assert geometric.rows[0][1:] == pytest.approx(
+        (100 * found.precision, 100 * found.recall, 100 * found.iou, 100 - 100 * found.recall)
+    )
     assert (
         geometric.to_csv().splitlines()[1]
-        == f"Net_1,{100 * found.precision:.2f},{100 * found.recall:.2f},{100 * found.iou:.2f}"
+        == f"Net_1,{100 * found.precision:.2f},{100 * found.recall:.2f},{100 * found.iou:.2f},{100 - 100 * found.recall:.2f}"
     )
     latex = geometric.to_latex()
     assert r"Net\_1 & " in latex

@@ -7,7 +7,7 @@ import pytest
 
 from carlasc import Grid, GridSpec
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics import distance_band, field_of_view, known, score_truth, semantickitti
+from carlasc.metrics import distance_band, field_of_view, known, score_truth
 
 SPEC = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -1.0), (4.0, 4.0, 1.0))
 
@@ -54,15 +54,6 @@ def test_a_vertical_field_of_view_includes_both_ends_and_is_measured_from_the_ho
     corner = GridSpec("cartesian", (1, 1, 1), (0.5, 0.5, 0.5), (1.5, 1.5, 1.5))  # elevation of (1, 1, 1): 35.3 degrees
     assert field_of_view(corner, vertical_rad=(0.0, math.radians(36))).all()
     assert not field_of_view(corner, vertical_rad=(0.0, math.radians(35))).any()
-
-
-def test_semantickitti_scores_empty_voxels_but_neither_ignored_classes_nor_invalid_ones():
-    labels = np.array([0, 0, 1, 52, 99, 10, 252, 40], np.uint16)
-    invalid = np.array([0, 1, 0, 0, 0, 0, 0, 1])
-    np.testing.assert_array_equal(semantickitti(labels), [1, 1, 0, 0, 0, 1, 1, 1])
-    np.testing.assert_array_equal(semantickitti(labels, invalid), [1, 0, 0, 0, 0, 1, 1, 0])
-    with pytest.raises(FormatError):
-        semantickitti(labels, invalid[:3])
 
 
 def test_masks_that_can_hold_nothing_are_refused():

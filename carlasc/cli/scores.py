@@ -1,0 +1,51 @@
+"""`carlasc scores`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from carlasc.cli.common import Overwrite, console
+
+
+def scores(
+    files: Annotated[list[Path], typer.Argument(help="Results of `carlasc evaluate --json`.")],
+    format: Annotated[
+        Literal["text", "markdown", "latex", "html"] | None,
+        typer.Option(help="How to write the table; by the ending of OUT, or text, if not given."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write; standard output if not given.")
+    ] = None,
+    mixed: Annotated[
+        bool, typer.Option("--mixed", help="Allow results by different conventions, which cannot be compared.")
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Put the results of several evaluations into one table."""
+    from carlasc.errors import ConflictError
+    from carlasc.metrics.leaderboard import scores as read
+
+    table = read(files, mixed=mixed)
+    if format is None and out is not None:
+        endings = {".md": "markdown", ".tex": "latex", ".html": "html", ".htm": "html"}
+        format = endings.get(out.suffix.lower(), "text")  # type: ignore[assignment]
+    if format in (None, "text") and out is None:
+        from carlasc.cli.tables import print_table
+
+        found = table.table()
+        print_table(console(), found.header, found.texts(), title=found.title)
+        return
+    text = {
+        "markdown": table.to_markdown, "latex": table.to_latex, "html": table.to_html, "text": table.table().to_csv,
+    }[format or "text"]()  # fmt: skip
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    if out.exists() and not overwrite:
+        raise ConflictError(out, problem="exists already", advice="choose another name, or give `overwrite=True`")
+    from carlasc.storage.files import write_atomic
+
+    write_atomic(out, text.encode())

@@ -1,0 +1,385 @@
+"""What a score means: which voxels count, in which classes, over which of them the mean is taken. One convention per benchmark.
+
+Papers differ in all of these, and a score without the name of its convention cannot be compared with another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics.confusion import ConfusionMatrix
+
+IGNORED = -1
+"""Target of the classes that a convention leaves out: such a voxel of the truth does not count; predicted, it is free."""
+
+_LEFT_OUT, _UNKNOWN = 254, 255  # of the look-up tables; scored ids are below
+
+Absent = Literal["zero", "skip", "skip-truth", "nan"]
+
+
+@dataclass(frozen=True)
+class ConventionScore:
+    """The figures of a convention, as fractions.
+
+    Attributes:
+        miou: mean IoU over the convention's classes.
+        class_iou: IoU of each class of the mean by name; NaN for a class in neither the prediction nor the truth.
+        precision: share of the voxels predicted as occupied that are.
+        recall: share of the occupied voxels that were predicted so.
+        iou: intersection over union of occupied voxels.
+        false_free: share of the occupied voxels that were predicted free: 1 - recall, the number that a planner asks for.
+    """
+
+    miou: float
+    class_iou: Mapping[str, float]
+    precision: float
+    recall: float
+    iou: float
+    false_free: float
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How a benchmark scores grids.
+
+    Attributes:
+        name: what the command line and results call it.
+        title: the benchmark, for people.
+        classes: the scored classes.
+        free: id of free space among them.
+        averaged: ids over which the mean is taken.
+        maps: name of a class table -> id -> scored id, or IGNORED.
+        usual_truth: the class table of true labels that do not name one: what the benchmark's own files hold.
+        usual_prediction: likewise of predictions.
+        seen_by: which of the data's masks says what is known: "lidar" or "camera".
+        unknown: what a voxel is that the truth never evaluated (count 0): "left out", or "free" where the benchmark cannot tell.
+        absent: what a class in neither the prediction nor the truth adds to the mean: "zero"; "skip": it is left out; "skip-truth": a
+            class absent from the truth is left out even where it was predicted; "nan": the mean is NaN.
+        epsilon: added to the denominator of each IoU.
+        notes: what else a reader must know, in one sentence.
+    """
+
+    name: str
+    title: str
+    classes: ClassTable
+    free: int
+    averaged: tuple[int, ...]
+    maps: Mapping[str, Mapping[int, int]] = field(repr=False)
+    usual_truth: ClassTable
+    usual_prediction: ClassTable
+    seen_by: Literal["lidar", "camera"] = "lidar"
+    unknown: Literal["left out", "free"] = "left out"
+    absent: Absent = "zero"
+    epsilon: float = 0.0
+    notes: str = ""
+
+    @property
+    def num_classes(self) -> int:
+        """Size of the confusion matrix."""
+        return max(self.classes.names) + 1
+
+    def check(self, table: ClassTable, where: str) -> None:
+        """Check that labels of a class table can be scored.
+
+        Raises:
+            FormatError: the convention has no map from these classes.
+        """
+        if table.name not in self.maps:
+            raise FormatError(
+                where,
+                expected=f"classes that the convention {self.name} has a map for ({', '.join(self.maps)})",
+                found=table.name,
+            )
+
+    def prepare(
+        self,
+        prediction: tuple[NDArray[Any], ClassTable],
+        truth: tuple[NDArray[Any], ClassTable],
+        known: NDArray[np.bool_] | None,
+        region: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+        """Bring a frame into the scored classes.
+
+        Args:
+            prediction: labels of any shape, and the table of their ids.
+            truth: labels of the same shape, and the table of their ids.
+            known: voxels of the truth that were evaluated, of as many elements; None: all of them.
+            region: voxels that count, of as many elements; None: all of them.
+
+        Returns:
+            Predicted and true labels in the scored classes, and the voxels that count.
+
+        Raises:
+            FormatError: an id has no target.
+        """
+        pred, true = (
+            self._map(labels, table, name) for (labels, table), name in ((prediction, "prediction"), (truth, "truth"))
+        )
+        counted = true != _LEFT_OUT
+        if known is not None:
+            seen = known.reshape(true.shape)
+            if self.unknown == "free":
+                true = np.where(seen, true, self.free)
+                counted |= ~seen
+            else:
+                counted &= seen
+        if region is not None:
+            counted &= region.reshape(true.shape)
+        pred[pred == _LEFT_OUT] = self.free
+        true[true == _LEFT_OUT] = self.free
+        return pred, true, counted
+
+    def count(
+        self,
+        prediction: tuple[NDArray[Any], ClassTable],
+        truth: tuple[NDArray[Any], ClassTable],
+        known: NDArray[np.bool_] | None,
+        region: NDArray[np.bool_] | None = None,
+    ) -> ConfusionMatrix:
+        """Return the confusion matrix of a frame in the scored classes; arguments and errors as for `prepare`."""
+        return ConfusionMatrix(self.num_classes, free=self.free).update(*self.prepare(prediction, truth, known, region))
+
+    def score(self, matrix: ConfusionMatrix) -> ConventionScore:
+        """Return the figures of a confusion matrix, which may be a sum over many frames."""
+        union = matrix.true_positives + matrix.false_positives + matrix.false_negatives
+        iou = np.divide(matrix.true_positives, union + self.epsilon, out=np.full(len(union), np.nan), where=union > 0)[
+            list(self.averaged)
+        ]
+        in_truth = matrix.counts.sum(axis=1)[list(self.averaged)] > 0
+        if self.absent == "zero":
+            values = np.nan_to_num(iou)
+        elif self.absent == "nan":
+            values = iou
+        else:
+            values = iou[in_truth] if self.absent == "skip-truth" else iou[~np.isnan(iou)]
+        found = matrix.completeness()
+        names = [self.classes.names[index] for index in self.averaged]
+        return ConventionScore(
+            float(values.mean()) if len(values) else float("nan"),
+            dict(zip(names, iou.tolist(), strict=True)),
+            found.precision,
+            found.recall,
+            found.iou,
+            1 - found.recall,
+        )
+
+    def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
+        lookup = self._lookups[table.name]
+        beyond = len(lookup) - 1  # the last entry stands for every id beyond the table's
+        found = lookup[labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)]
+        if (unknown := found == _UNKNOWN).any():
+            bad = int(labels[unknown][0])
+            raise FormatError(
+                where,
+                expected=f"class ids of {table.name}",
+                found=f"{bad} ({int(np.count_nonzero(labels == bad))} times)",
+                advice=f"the convention {self.name} has no class for it",
+            )
+        return found
+
+    @cached_property
+    def _lookups(self) -> dict[str, NDArray[np.uint8]]:
+        lookups = {}
+        for name, mapping in self.maps.items():
+            lookups[name] = np.full(max(mapping) + 2, _UNKNOWN, np.uint8)  # one more: for all ids beyond the last
+            for old, new in mapping.items():
+                lookups[name][old] = _LEFT_OUT if new == IGNORED else new
+        return lookups
+
+
+def convention_named(name: str) -> Convention:
+    """Return a convention by name.
+
+    Raises:
+        ArgumentError: no convention has that name.
+    """
+    if name not in CONVENTIONS:
+        raise ArgumentError("convention", expected=f"one of {', '.join(CONVENTIONS)}", found=repr(name))
+    return CONVENTIONS[name]
+
+
+def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
+    """Return a convention that scores the ids of a class table as they are: known voxels, the mean over all classes, free among them."""
+    return Convention(
+        "own", f"the data's own classes ({table.name})", table, free, tuple(sorted(table.names)), {table.name: _identity(table)},
+        table, table, notes="Scores of other data sets cannot be compared with this one.",
+    )  # fmt: skip
+
+
+def _table(name: str, names: str, free: int) -> ClassTable:
+    words = names.split()
+    grey = {i: (110 + 13 * i % 120, 90 + 29 * i % 130, 80 + 47 * i % 140) for i in range(len(words))}
+    return ClassTable(name, dict(enumerate(words)), grey | {free: (255, 255, 255)})
+
+
+SSCBENCH = _table(
+    "sscbench",
+    "empty car bicycle motorcycle truck other-vehicle person road parking sidewalk other-ground building fence vegetation terrain pole"
+    " traffic-sign other-structure other-object",
+    0,
+)
+_NUSCENES = (
+    "barrier bicycle bus car construction-vehicle motorcycle pedestrian traffic-cone trailer truck driveable-surface other-flat sidewalk"
+    " terrain manmade vegetation"
+)
+OCC3D = _table("occ3d", f"others {_NUSCENES} free", 17)
+OPENOCCUPANCY = _table("openoccupancy", f"empty {_NUSCENES}", 0)
+
+# CARLA class -> (Occ3D, SSCBench), as CarlaOcc publishes the map; the 23 old tags have one Vehicle, a car.
+_CARLA = {
+    0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (11, 7), 8: (13, 9), 9: (16, 13), 10: (4, 1),
+    11: (15, 17), 12: (0, 16), 13: (17, 0), 14: (14, 10), 15: (15, 17), 16: (12, 10), 17: (1, 12), 18: (0, 16), 19: (0, 18), 20: (0, 18),
+    21: (12, 10), 22: (14, 14),
+}  # fmt: skip
+# The paper's 11 classes do not tell these apart: Barrier is fence, wall and guard rail; Pole holds signs and lights; Ground is terrain too.
+_CARLASC11 = {
+    0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (14, 14), 8: (13, 9), 9: (16, 13), 10: (4, 1),
+}  # fmt: skip
+_CARLASC11_TO_19 = {0: 0, 1: 13, 2: 14, 3: IGNORED, 4: 6, 5: 18, 6: 9, 7: 17, 8: 11, 9: 15, 10: 1}
+_SEMANTICKITTI_TO_SSCBENCH = {
+    0: 0, 1: IGNORED, 10: 1, 11: 2, 13: 5, 15: 3, 16: 5, 18: 4, 20: 5, 30: 6, 31: IGNORED, 32: IGNORED, 40: 7, 44: 8, 48: 9, 49: 10,
+    50: 11, 51: 12, 52: 17, 60: 7, 70: 13, 71: IGNORED, 72: 14, 80: 15, 81: 16, 99: 18, 252: 1, 253: IGNORED, 254: 6, 255: IGNORED,
+    256: 5, 257: 5, 258: 4, 259: 5,
+}  # fmt: skip
+
+
+def _identity(table: ClassTable) -> dict[int, int]:
+    return {i: i for i in table.names}
+
+
+def _without_zero(mapping: Mapping[int, int]) -> dict[int, int]:
+    """Return a map to SemanticKITTI's 19 classes in which every id but 0 that maps to 0 is left out: raw 0 is empty space."""
+    return {old: IGNORED if new == 0 and old != 0 else new for old, new in mapping.items()}
+
+
+def _via(first: Mapping[int, int], second: Mapping[int, int]) -> dict[int, int]:
+    return {old: IGNORED if new == IGNORED else second[new] for old, new in first.items()}
+
+
+_RAW_TO_19 = _without_zero(REMAPS["semantickitti19"].mapping)
+_CARLA_TO_RAW = REMAPS["carla_to_semantickitti"].mapping
+_SSCBENCH_MAPS = {
+    "carla": {old: new for old, (_, new) in _CARLA.items()},
+    "carlasc11": {old: new for old, (_, new) in _CARLASC11.items()},
+    "semantickitti": _SEMANTICKITTI_TO_SSCBENCH,
+    "sscbench": _identity(SSCBENCH),
+}
+_OCC3D_MAPS = {
+    "carla": {old: new for old, (new, _) in _CARLA.items()},
+    "carlasc11": {old: new for old, (new, _) in _CARLASC11.items()},
+    "occ3d": _identity(OCC3D),
+}
+_TO_OPENOCCUPANCY = {0: IGNORED, 17: 0} | {i: i for i in range(1, 17)}
+_THINGS_AND_STUFF = tuple(range(17))
+
+CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
+    {
+        convention.name: convention
+        for convention in (
+            Convention(
+                "carlasc",
+                "CarlaSC (MotionSC, RA-L 2022)",
+                CARLASC11,
+                0,
+                tuple(range(11)),
+                {
+                    "carla": REMAPS["carlasc11"].mapping,
+                    "carlasc11": _identity(CARLASC11),
+                    "semantickitti": _via(REMAPS["semantickitti_to_carla"].mapping, REMAPS["carlasc11"].mapping),
+                },
+                CARLA,
+                CARLASC11,
+                notes="Free space is one of the classes of the mean.",
+            ),
+            Convention(
+                "semantickitti",
+                "SemanticKITTI, semantic scene completion",
+                SEMANTICKITTI19,
+                0,
+                tuple(range(1, 20)),
+                {
+                    "semantickitti": _RAW_TO_19,
+                    "semantickitti19": _identity(SEMANTICKITTI19),
+                    "carla": _without_zero(_via(_CARLA_TO_RAW, _RAW_TO_19)) | {13: 0, 21: 0},
+                    "carlasc11": _CARLASC11_TO_19,
+                },
+                SEMANTICKITTI,
+                SEMANTICKITTI,
+                notes="Classes outside the 19 do not count in the truth; predicted, they are empty (the official script stops there).",
+            ),
+            Convention(
+                "sscbench",
+                "SSCBench and MonoScene",
+                SSCBENCH,
+                0,
+                tuple(range(1, 19)),
+                _SSCBENCH_MAPS,
+                SEMANTICKITTI,
+                SEMANTICKITTI,
+                epsilon=1e-5,
+                notes="An unknown voxel is left out only where its label is 0; ours always are.",
+            ),
+            Convention(
+                "occ3d-lidar",
+                "Occ3D-nuScenes, voxels that the LiDAR observed",
+                OCC3D,
+                17,
+                _THINGS_AND_STUFF,
+                _OCC3D_MAPS,
+                OCC3D,
+                OCC3D,
+                absent="skip",
+                notes='"others" is one of the classes of the mean; SparseOcc\'s script is occ3d-lidar-sparseocc.',
+            ),
+            Convention(
+                "occ3d-lidar-sparseocc",
+                "Occ3D-nuScenes as SparseOcc's script takes the mean",
+                OCC3D,
+                17,
+                _THINGS_AND_STUFF,
+                _OCC3D_MAPS,
+                OCC3D,
+                OCC3D,
+                absent="skip-truth",
+                notes="A class absent from the truth is left out of the mean even where it was predicted.",
+            ),
+            Convention(
+                "occ3d-camera",
+                "Occ3D-nuScenes, voxels that a camera observed",
+                OCC3D,
+                17,
+                _THINGS_AND_STUFF,
+                _OCC3D_MAPS,
+                OCC3D,
+                OCC3D,
+                absent="skip",
+                seen_by="camera",
+                notes="Data without cameras do not know which voxels one would see: there is no such score for them.",
+            ),
+            Convention(
+                "openoccupancy",
+                "OpenOccupancy-nuScenes",
+                OPENOCCUPANCY,
+                0,
+                tuple(range(1, 17)),
+                {name: _via(mapping, _TO_OPENOCCUPANCY) for name, mapping in _OCC3D_MAPS.items()}
+                | {"openoccupancy": _identity(OPENOCCUPANCY) | {255: IGNORED}},
+                OPENOCCUPANCY,
+                OPENOCCUPANCY,
+                unknown="free",
+                absent="nan",
+                notes="The benchmark has no mask: a voxel that nobody saw counts as empty, and a class that is absent makes the mean NaN.",
+            ),
+        )
+    }
+)

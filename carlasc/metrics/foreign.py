@@ -1,0 +1,134 @@
+"""Grids in the files of other benchmarks: Occ3D's `.npz`, OpenOccupancy's `.npy`, SemanticKITTI's folders."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.metrics.conventions import OCC3D, OPENOCCUPANCY
+from carlasc.metrics.grids import GridFrames, LabelFolder
+
+OCC3D_SPEC = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
+OPENOCCUPANCY_SPEC = GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0))
+_LABELS = (
+    "semantics",
+    "pred",
+    "occ_pred",
+)  # arrays of an .npz that hold classes: the benchmark's own, and what people write
+_NOISE = 255
+
+
+class TokenFrames(GridFrames):
+    """A scene whose frames have tokens for names. They are numbered in the order of their names, predictions in that of the truth.
+
+    Attributes:
+        files: file of each frame, by token.
+        tokens: names of the frames in order.
+    """
+
+    def __init__(self, folder: Path, path: str, files: dict[str, Path]) -> None:
+        self.path, self.location, self.files = path, str(folder), files
+        self.tokens = sorted(files)
+
+    def follow(self, truth: GridFrames) -> None:
+        """Number the frames as the ground truth does."""
+        if isinstance(truth, TokenFrames):
+            self.tokens = truth.tokens
+
+    def frames(self) -> NDArray[np.int64]:
+        """Return the numbers of the frames that have a file."""
+        return np.array([i for i, token in enumerate(self.tokens) if token in self.files], np.int64)
+
+    def name_of(self, frame: int) -> str:
+        """Return a frame's token."""
+        return self.tokens[frame]
+
+    def _file(self, frame: int) -> Path:
+        return self.files[self.tokens[frame]]
+
+
+class Occ3dScene(TokenFrames):
+    """A scene of Occ3D-nuScenes: `{scene}/{token}/labels.npz`."""
+
+    spec, classes = OCC3D_SPEC, OCC3D
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (200, 200, 16) labels."""
+        file = self._file(frame)
+        arrays = _load_npz(file)
+        name = next((name for name in _LABELS if name in arrays), None)
+        if name is None and len(arrays) == 1:
+            (name,) = arrays
+        if name is None or arrays[name].shape != self.spec.size:
+            found = ", ".join(f"{key} {array.shape}" for key, array in arrays.items()) or "nothing"
+            raise FormatError(file, expected=f"an array {_LABELS[0]} of shape {self.spec.size}", found=found)
+        return arrays[name]
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
+        """Return (200, 200, 16) which voxels the LiDAR, or a camera, observed; None where the file does not say."""
+        mask = _load_npz(self._file(frame)).get(f"mask_{seen_by}")
+        return None if mask is None else mask.astype(np.bool_)
+
+
+class OpenOccupancyScene(TokenFrames):
+    """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy`, rows z, y, x, ..., class of occupied voxels."""
+
+    spec, classes = OPENOCCUPANCY_SPEC, OPENOCCUPANCY
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (512, 512, 40) labels; a stored 0 is noise, 255 here."""
+        file = self._file(frame)
+        try:
+            rows = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise FormatError(file, problem=f"cannot be read: {error}") from error
+        if rows.ndim != 2 or rows.shape[1] not in (4, 7):
+            raise FormatError(file, expected="rows of 4 or 7 columns (z, y, x, ..., class)", found=str(rows.shape))
+        z, y, x = rows[:, :3].astype(np.int64).T
+        classes = rows[:, -1].astype(np.int64)
+        size = np.array(self.spec.size)[:, None]
+        if (np.array([x, y, z]) >= size).any() or rows[:, :3].min(initial=0) < 0:
+            raise FormatError(file, expected=f"voxels inside {self.spec}", found=f"({x.max()}, {y.max()}, {z.max()})")
+        if len(classes) and not (classes.min() >= 0 and classes.max() <= _NOISE):
+            raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=f"{classes.min()} to {classes.max()}")
+        labels = np.zeros(self.spec.size, np.uint8)
+        labels[x, y, z] = np.where(classes == 0, _NOISE, classes)
+        return labels
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> None:
+        """Return None: the benchmark does not say what was observed."""
+        return None
+
+
+def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
+    """Yield the grids of a folder in the layout of another benchmark; nothing if it has none of these layouts."""
+    for scene in sorted(path for path in folder.glob("*") if path.is_dir()):
+        if files := {file.parent.name: file for file in scene.glob("*/labels.npz")}:
+            yield Occ3dScene(scene, scene.name, files)
+        elif scene.name.startswith("scene_") and (files := {f.stem: f for f in scene.glob("occupancy/*.npy")}):
+            yield OpenOccupancyScene(scene, scene.name, files)
+    if (folder / "gts").is_dir():
+        yield from foreign_grids(folder / "gts", grid, role)
+    if (sequences := folder / "sequences").is_dir():
+        name = grid or {"prediction": "predictions", "truth": "voxels"}[role]
+        for sequence in sorted(sequences.glob(f"*/{name}")):
+            grids = LabelFolder(sequence, sequence.parent.name)
+            if len(grids.frames()):
+                yield grids
+
+
+def _load_npz(file: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except FileNotFoundError as error:
+        raise MissingDataError(file, expected="a file", found="nothing") from error
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, AttributeError) as error:
+        raise FormatError(file, problem=f"cannot be read: {error}") from error

@@ -1,0 +1,159 @@
+"""The frames of a grid that can be scored: of a sequence of any Source, or of a plain folder of `.label` files."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError
+from carlasc.storage import Sequence, layout
+
+_BITS = 8  # voxels per byte of an .invalid file
+
+
+class GridFrames(ABC):
+    """The frames of one grid.
+
+    Attributes:
+        path: of the sequence; "" for a plain folder.
+        location: what to call the grid in errors.
+        spec: its geometry; None if it is not known.
+        classes: the class table of its ids; None if it is not known.
+    """
+
+    path: str
+    location: str
+    spec: GridSpec | None
+    classes: ClassTable | None
+
+    @abstractmethod
+    def frames(self) -> NDArray[np.int64]:
+        """Return the sorted frames that have labels."""
+
+    @abstractmethod
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return the labels of a frame: (X, Y, Z), or (X * Y * Z,) if the geometry is not known."""
+
+    @abstractmethod
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
+        """Return which voxels of a frame are known (counts > 0, or not invalid); None if the data do not say.
+
+        `seen_by` chooses between what the LiDAR and what a camera observed, where data have a mask for each.
+        """
+
+    def name_of(self, frame: int) -> str:
+        """Return what to call a frame in messages: its number, or its token."""
+        return str(frame)
+
+    def follow(self, truth: GridFrames) -> None:  # noqa: B027 (only some data need it)
+        """Learn from the ground truth what files of predictions do not say: how many voxels, which frame is which."""
+
+
+class SequenceGrid(GridFrames):
+    """A grid of a sequence of a Source."""
+
+    def __init__(self, sequence: Sequence, grid: str) -> None:
+        self.sequence, self.grid = sequence, grid
+        self.path, self.location = sequence.path, f"{sequence.location}/{grid}"
+        self.spec, self.classes = sequence.grids[grid], sequence.classes_of(grid)
+
+    def frames(self) -> NDArray[np.int64]:
+        """Return the sorted frames that have labels."""
+        return self.sequence.frames(f"{self.grid}/labels")
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (X, Y, Z) labels."""
+        return self.sequence.read(f"{self.grid}/labels", frame)
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
+        """Return (X, Y, Z) which voxels have votes; None for a grid without counts, and for cameras, which these data do not have."""
+        if seen_by == "camera":
+            return None
+        field = f"{self.grid}/counts"
+        return self.sequence.read(field, frame) > 0 if field in self.sequence.fields() else None
+
+
+class LabelFolder(GridFrames):
+    """A folder of `000000.label` files without params.json, as other tools write it.
+
+    The same folder may hold counts (`000000.bin`, float32), or SemanticKITTI's or SSCBench's masks (`000000.invalid`, one bit or one byte per
+    voxel). Labels are uint32, as in the layout, or uint16, as in these benchmarks: the number of voxels tells.
+
+    Attributes:
+        voxels: number of voxels per frame; None if it is not known.
+    """
+
+    spec = None
+    classes = None
+
+    def __init__(self, folder: Path, path: str = "") -> None:
+        self.folder, self.path, self.location = folder, path, str(folder)
+        self.voxels = self._count_voxels(int(self.frames()[0])) if len(self.frames()) else None
+
+    def _count_voxels(self, frame: int) -> int | None:
+        """Return the number of voxels by the sizes of a frame's files; None if only labels exist."""
+        if (counts := self._file(frame, ".bin")).is_file():
+            return counts.stat().st_size // 4
+        if (invalid := self._file(frame, ".invalid")).is_file():
+            size = invalid.stat().st_size
+            packed = self._file(frame, ".label").stat().st_size >= size * _BITS  # labels of two or four bytes per voxel
+            return size * _BITS if packed else size
+        return None
+
+    def follow(self, truth: GridFrames) -> None:
+        """Take the number of voxels from the ground truth."""
+        if truth.spec is not None:
+            self.voxels = truth.spec.num_voxels
+        elif isinstance(truth, LabelFolder):
+            self.voxels = truth.voxels
+
+    @cached_property
+    def _frames(self) -> NDArray[np.int64]:
+        numbers = [layout.frame_of(name, ".label") for name in os.listdir(self.folder)]
+        return np.array(sorted(number for number in numbers if number is not None), np.int64)
+
+    def frames(self) -> NDArray[np.int64]:
+        """Return the sorted frames that have a `.label` file."""
+        return self._frames
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (X * Y * Z,) labels.
+
+        Raises:
+            FormatError: the file does not have the size of a grid.
+        """
+        path = self._file(frame, ".label")
+        size = path.stat().st_size
+        types: dict[float, np.dtype[np.unsignedinteger]] = {2: np.dtype("<u2"), 4: np.dtype("<u4")}
+        width = 4 if self.voxels is None else size / max(self.voxels, 1)
+        if width not in types or size % width:
+            expected = "labels of 4 bytes" if self.voxels is None else f"{self.voxels} labels of 2 or 4 bytes"
+            raise FormatError(
+                path,
+                expected=expected,
+                found=f"{size} bytes",
+                advice="the file is truncated, of another grid, or of another type",
+            )
+        return np.fromfile(path, types[width])
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
+        """Return (X * Y * Z,) which voxels have votes, or are not invalid; None if there is no such file."""
+        if seen_by == "camera":
+            return None
+        if (counts := self._file(frame, ".bin")).is_file():
+            return np.fromfile(counts, "<f4") > 0
+        if (invalid := self._file(frame, ".invalid")).is_file():
+            found = np.fromfile(invalid, np.uint8)
+            return (found if found.size == self.voxels else np.unpackbits(found)) == 0
+        return None
+
+    def _file(self, frame: int, suffix: str) -> Path:
+        return self.folder / f"{frame:06d}{suffix}"

@@ -1,0 +1,148 @@
+"""Several results in one table: Markdown, LaTeX, or HTML with a small chart of the IoU of each class."""
+
+from __future__ import annotations
+
+import html
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.metrics.tables import Cell, Table
+from carlasc.storage.files import parse_json
+
+_FIGURES = {"miou": "mIoU", "iou": "IoU", "precision": "Precision", "recall": "Recall", "false_free": "False free"}
+_REQUIRED = ("name", "convention", "frames", "class_iou", *_FIGURES)
+_BAR, _HEIGHT = 7, 24  # pixels of a class's bar in the chart
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """Results by one convention, side by side.
+
+    Attributes:
+        convention: its name; several, joined by commas, where mixing was allowed.
+        results: what `Evaluation.to_dict` gave, one per set of predictions.
+    """
+
+    convention: str
+    results: tuple[Mapping[str, Any], ...]
+
+    @property
+    def class_names(self) -> list[str]:
+        """The classes of all results, in the order of the first one."""
+        return list(dict.fromkeys(name for result in self.results for name in result["class_iou"]))
+
+    def table(self, *, classes: bool = True) -> Table:
+        """Return the figures in percent, one row per result; `classes` adds a column per class."""
+        rayed = any(result.get("rayiou") is not None for result in self.results)
+        mixed = len({result["convention"] for result in self.results}) > 1
+        names = self.class_names if classes else []
+        header = (
+            "Network",
+            *(["Convention"] if mixed else []),
+            *names,
+            *_FIGURES.values(),
+            *(["RayIoU"] if rayed else []),
+        )
+        rows: list[tuple[Cell, ...]] = []
+        for result in self.results:
+            values = [result["class_iou"].get(name) for name in names] + [result[figure] for figure in _FIGURES]
+            values += [result.get("rayiou")] if rayed else []
+            cells = [math.nan if value is None else 100 * value for value in values]
+            rows.append((str(result["name"]), *([str(result["convention"])] if mixed else []), *cells))
+        return Table(f"Scores by the convention {self.convention} (percent)", header, tuple(rows))
+
+    def to_markdown(self) -> str:
+        """Return a Markdown table."""
+        table = self.table()
+        lines = [table.header, ["---"] + ["---:"] * (len(table.header) - 1), *table.texts()]
+        rows = ("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        return f"{table.title}\n\n" + "\n".join(rows) + "\n"
+
+    def to_latex(self) -> str:
+        """Return a LaTeX `tabular`."""
+        return self.table().to_latex()
+
+    def to_html(self) -> str:
+        """Return an HTML page: the figures, and for each result a bar per class. It names no other host."""
+        table = self.table(classes=False)
+        header = "".join(f"<th>{html.escape(name)}</th>" for name in (*table.header, "IoU of each class"))
+        rows = ""
+        for cells, result in zip(table.texts(), self.results, strict=True):
+            shown = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+            rows += f"<tr>{shown}<td>{self._chart(result)}</td></tr>\n"
+        return _PAGE.format(title=html.escape(table.title), header=header, rows=rows)
+
+    def _chart(self, result: Mapping[str, Any]) -> str:
+        bars = ""
+        for place, name in enumerate(self.class_names):
+            iou = result["class_iou"].get(name)
+            height = 0.0 if iou is None else iou * _HEIGHT
+            text = f"{name}: {'-' if iou is None else f'{100 * iou:.1f}'}"
+            bars += (
+                f'<rect x="{place * _BAR}" y="{_HEIGHT - height:.1f}" width="{_BAR - 2}" height="{max(height, 0.6):.1f}">'
+                f"<title>{html.escape(text)}</title></rect>"
+            )
+        width = len(self.class_names) * _BAR
+        return f'<svg width="{width}" height="{_HEIGHT}" role="img" aria-label="IoU of each class">{bars}</svg>'
+
+
+def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> ScoreTable:
+    """Read the results of several evaluations (`carlasc evaluate --json`) into one table.
+
+    Args:
+        files: JSON files.
+        mixed: allow results by different conventions, and name each one's.
+
+    Raises:
+        ArgumentError: results by different conventions, which cannot be compared, without `mixed`.
+        FormatError: a file does not hold a result.
+        MissingDataError: a file does not exist, or none was given.
+    """
+    results = tuple(_read(Path(file)) for file in files)
+    if not results:
+        raise MissingDataError("files", expected="results of `carlasc evaluate --json`", found="none")
+    conventions = sorted({str(result["convention"]) for result in results})
+    if len(conventions) > 1 and not mixed:
+        raise ArgumentError(
+            "files",
+            expected="results by one convention",
+            found=", ".join(conventions),
+            advice="score them by the same one, or give `mixed=True` to print them side by side",
+        )
+    return ScoreTable(", ".join(conventions), results)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        values = parse_json(file.read_bytes(), str(file))
+    except FileNotFoundError as error:
+        raise MissingDataError(file, expected="a result of `carlasc evaluate --json`", found="nothing") from error
+    except OSError as error:
+        raise FormatError(file, problem=f"cannot be read: {error.strerror}") from error
+    if missing := [key for key in _REQUIRED if key not in values]:
+        raise FormatError(
+            file,
+            expected="a result of `carlasc evaluate --json`",
+            found=f"JSON without {', '.join(missing[:3])}",
+        )
+    if not isinstance(values["class_iou"], dict) or not all(
+        value is None or isinstance(value, int | float)
+        for value in (*values["class_iou"].values(), *(values[figure] for figure in _FIGURES))
+    ):
+        raise FormatError(file, expected="numbers or null for every figure", found="something else")
+    return values
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
+body {{ font: 14px/1.4 sans-serif; margin: 2em; color: #222; background: #fff }}
+table {{ border-collapse: collapse }} th, td {{ padding: .35em .8em; border-bottom: 1px solid #ddd; text-align: right }}
+th:first-child, td:first-child {{ text-align: left }} rect {{ fill: #3566a8 }} caption {{ text-align: left; padding: .5em 0 }}
+</style></head><body><table><caption>{title}</caption><thead><tr>{header}</tr></thead><tbody>
+{rows}</tbody></table></body></html>
+"""

@@ -1,0 +1,282 @@
+"""Panoptic quality: how well segments (an object each, or all of a stuff class) are found and outlined (Kirillov et al., CVPR 2019)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.errors import ArgumentError, FormatError
+
+Variant = Literal["standard", "pasco"]
+_SLOTS = 256  # of the tables of latest segments and pairs; a power of two
+_MATCH = 0.5  # more than half of the union in common: at most one segment can have that, so matching needs no search
+
+
+@dataclass(frozen=True)
+class PanopticScore:
+    """Panoptic quality of every class.
+
+    Attributes:
+        pq: (K,) panoptic quality, `sq * rq`; NaN for a class without any segment, and for free space.
+        sq: (K,) segmentation quality: mean IoU of the matched segments.
+        rq: (K,) recognition quality: F1 score of finding segments.
+        iou: (K,) IoU of each class over elements, for PQ-dagger.
+        things: ids of the classes whose instances count one by one; the others are stuff.
+    """
+
+    pq: NDArray[np.float64]
+    sq: NDArray[np.float64]
+    rq: NDArray[np.float64]
+    iou: NDArray[np.float64]
+    things: frozenset[int]
+
+    def mean(self, what: Literal["pq", "sq", "rq"] = "pq", which: Literal["all", "things", "stuff"] = "all") -> float:
+        """Return the mean over the classes that occur: all of them, only things, or only stuff; NaN where none does."""
+        values = getattr(self, what)
+        is_thing = np.isin(np.arange(len(values)), sorted(self.things))
+        keep = {"all": np.ones_like(is_thing), "things": is_thing, "stuff": ~is_thing}[which] & ~np.isnan(self.pq)
+        return float(values[keep].mean()) if keep.any() else float("nan")
+
+    @property
+    def pq_dagger(self) -> float:
+        """PQ-dagger: the mean over classes of PQ for things and of the class's IoU for stuff (Porzi et al., CVPR 2019)."""
+        is_thing = np.isin(np.arange(len(self.pq)), sorted(self.things))
+        values = np.where(is_thing, self.pq, self.iou)[~np.isnan(self.pq)]
+        return float(values.mean()) if len(values) else float("nan")
+
+
+@dataclass(frozen=True)
+class Segments:
+    """The segments of a prediction and of the truth, and how they overlap.
+
+    Attributes:
+        pred_class: (P,) class of each predicted segment.
+        pred_size: (P,) its elements.
+        true_class: (T,) class of each true segment.
+        true_size: (T,) its elements.
+        overlaps: (M, 3) predicted segment, true segment, elements in common; of equal classes.
+    """
+
+    pred_class: NDArray[np.int64]
+    pred_size: NDArray[np.int64]
+    true_class: NDArray[np.int64]
+    true_size: NDArray[np.int64]
+    overlaps: NDArray[np.int64]
+
+
+class PanopticQuality:
+    """Adds up matched segments of predictions and truths.
+
+    A predicted and a true segment match where they have the same class and an IoU over 0.5. Free elements belong to no segment.
+
+    Attributes:
+        num_classes: K; ids are 0..K-1.
+        things: ids of the classes whose instances count one by one; all elements of another class are one segment per frame.
+        free: id of free space.
+        variant: "standard", or "pasco": a stuff segment that overlaps the true one of its class at all is a match, as in PaSCo's
+            evaluation script, so that stuff is never a false positive while its class occurs.
+    """
+
+    def __init__(
+        self, num_classes: int, things: frozenset[int], *, free: int = 0, variant: Variant = "standard"
+    ) -> None:
+        if variant not in ("standard", "pasco"):
+            raise ArgumentError("variant", expected="standard or pasco", found=repr(variant))
+        if not 0 <= free < num_classes or any(not 0 <= thing < num_classes or thing == free for thing in things):
+            raise ArgumentError(
+                "things", expected=f"class ids below {num_classes} other than free", found=str(sorted(things))
+            )
+        self.num_classes, self.things, self.free, self.variant = num_classes, frozenset(things), free, variant
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.counts = np.zeros((3, self.num_classes), np.int64)  # true positives, false positives, false negatives
+        self.iou_sum = np.zeros(self.num_classes)
+        self.elements = np.zeros((3, self.num_classes), np.int64)  # in common, predicted, true
+
+    def update(
+        self,
+        prediction: tuple[ArrayLike, ArrayLike],
+        truth: tuple[ArrayLike, ArrayLike],
+        mask: ArrayLike | None = None,
+    ) -> Self:
+        """Add a frame.
+
+        Args:
+            prediction: class ids and instance ids, of equal shape; instance ids of stuff do not matter.
+            truth: likewise.
+            mask: the same shape, bool: only these elements count.
+
+        Raises:
+            FormatError: shapes differ, or an id is not below `num_classes`.
+        """
+        sides = []
+        for name, side in (("prediction", prediction), ("truth", truth)):
+            classes, ids = (np.asarray(array).reshape(-1) for array in side)
+            if classes.shape != ids.shape or classes.shape != np.asarray(truth[0]).reshape(-1).shape:
+                raise FormatError(
+                    name,
+                    expected="classes and instances of the truth's shape",
+                    found=f"{classes.shape} and {ids.shape}",
+                )
+            sides.append((classes, ids))
+        counted = None if mask is None else np.asarray(mask, np.bool_).reshape(-1)
+        if counted is not None:
+            sides = [(classes[counted], ids[counted]) for classes, ids in sides]
+        for name, (classes, _) in zip(("prediction", "truth"), sides, strict=True):
+            if len(classes) and (classes.min() < 0 or classes.max() >= self.num_classes):
+                raise FormatError(
+                    name, expected=f"class ids 0..{self.num_classes - 1}", found=f"{classes.min()} to {classes.max()}"
+                )
+        self.add(match_segments(*sides, things=self.things, free=self.free))
+        return self
+
+    def add(self, segments: Segments, *, fewest: int = 0) -> None:
+        """Add the segments of a frame; unmatched ones of fewer than `fewest` elements are left out."""
+        pred, true, common = segments.overlaps.T
+        iou = common / (segments.pred_size[pred] + segments.true_size[true] - common)
+        is_stuff = ~np.isin(segments.true_class[true], sorted(self.things))
+        hit = (iou > _MATCH) | (is_stuff & (self.variant == "pasco"))
+        k = self.num_classes
+        self.counts[0] += np.bincount(segments.true_class[true[hit]], minlength=k)
+        self.iou_sum += np.bincount(segments.true_class[true[hit]], iou[hit], minlength=k)
+        for row, (classes, size, matched) in enumerate(
+            (
+                (segments.pred_class, segments.pred_size, pred[hit]),
+                (segments.true_class, segments.true_size, true[hit]),
+            ),
+            1,
+        ):
+            missed = size >= fewest
+            missed[matched] = False
+            self.counts[row] += np.bincount(classes[missed], minlength=k)
+        self.elements[0] += np.bincount(segments.true_class[true], common, minlength=k).astype(np.int64)
+        self.elements[1] += np.bincount(segments.pred_class, segments.pred_size, minlength=k).astype(np.int64)
+        self.elements[2] += np.bincount(segments.true_class, segments.true_size, minlength=k).astype(np.int64)
+
+    def compute(self) -> PanopticScore:
+        """Return the score of everything that was added."""
+        tp, fp, fn = self.counts
+        sq = _ratio(self.iou_sum, tp)
+        rq = _ratio(tp, tp + (fp + fn) / 2)
+        occurs = self.counts.sum(axis=0) > 0
+        pq = np.where(occurs, np.nan_to_num(sq) * np.nan_to_num(rq), np.nan)
+        common, predicted, true = self.elements
+        return PanopticScore(
+            pq, np.where(occurs, np.nan_to_num(sq), np.nan), rq, _ratio(common, predicted + true - common), self.things
+        )
+
+    def merge(self, other: PanopticQuality) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        mine = (self.num_classes, self.things, self.free, self.variant)
+        if (other.num_classes, other.things, other.free, other.variant) != mine:
+            raise ArgumentError(
+                "panoptic quality", expected="metrics of the same classes, things and variant", found="others"
+            )
+        self.counts += other.counts
+        self.iou_sum += other.iou_sum
+        self.elements += other.elements
+        return self
+
+
+def match_segments(
+    prediction: tuple[NDArray[Any], NDArray[Any]],
+    truth: tuple[NDArray[Any], NDArray[Any]],
+    *,
+    things: Collection[int] | None = None,
+    overlap: NDArray[np.bool_] | None = None,
+    free: int = 0,
+) -> Segments:
+    """Find the segments of a prediction and of the truth, and the elements that they have in common.
+
+    Args:
+        prediction: (N,) class ids and (N,) instance ids; equal pairs are one segment.
+        truth: likewise.
+        things: classes whose instances are apart; all elements of another class are one segment. None: all classes are things.
+        overlap: (N,) bool: elements that may be in common; all of them if None.
+        free: class of elements without a segment.
+
+    Returns:
+        The segments; those of the free class are left out.
+    """
+    sides = [np.ascontiguousarray(array).reshape(-1) for side in (prediction, truth) for array in side]
+    may_overlap = np.ones(1, np.bool_) if overlap is None else overlap
+    is_thing = np.ones(1, np.bool_)
+    if things is not None:
+        is_thing = np.zeros(1 + max((int(side.max(initial=0)) for side in sides[::2]), default=0), np.bool_)
+        is_thing[[thing for thing in things if thing < len(is_thing)]] = True
+    pred_keys, pred_size, true_keys, true_size, overlaps = _match(
+        sides[0], sides[1], sides[2], sides[3], is_thing, may_overlap, free
+    )
+    same = pred_keys[overlaps[:, 0]] >> 32 == true_keys[overlaps[:, 1]] >> 32
+    return Segments(pred_keys >> 32, pred_size, true_keys >> 32, true_size, overlaps[same])
+
+
+@numba.njit(cache=True, nogil=True)
+def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
+    """Number the segments of both sides in the order in which they occur, and count elements and overlaps, in one pass.
+
+    Few segments take turns along a row. Small tables of the latest ones, at a place that the key gives, spare most look-ups.
+    """
+    numbers = {np.int64(-1): np.int64(-1)}  # side and key -> number
+    keys = [[np.int64(0) for _ in range(0)] for _ in range(2)]
+    sizes = [[np.int64(0) for _ in range(0)] for _ in range(2)]
+    latest, latest_number = np.full((2, _SLOTS), -1, np.int64), np.zeros((2, _SLOTS), np.int64)
+    pairs = {np.int64(-1): np.int64(0)}
+    open_pairs, open_counts = np.full(_SLOTS, -1, np.int64), np.zeros(_SLOTS, np.int64)
+    number = np.zeros(2, np.int64)
+    everywhere, all_things = len(may_overlap) == 1, len(is_thing) == 1 and is_thing[0]
+    for n in range(len(pred_class)):
+        has_pred, has_true = pred_class[n] != free, true_class[n] != free
+        if not has_pred and not has_true:
+            continue  # most elements are free on both sides
+        for side in range(2):
+            if not (has_pred if side == 0 else has_true):
+                continue
+            one, other = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
+            key = np.int64(one) << 32
+            if all_things or is_thing[one]:
+                key |= np.int64(other)
+            slot = (key ^ key >> 32) & (_SLOTS - 1)
+            if latest[side, slot] != key:
+                place = key << 1 | side
+                if place not in numbers:
+                    numbers[place] = np.int64(len(keys[side]))
+                    keys[side].append(key)
+                    sizes[side].append(np.int64(0))
+                latest[side, slot], latest_number[side, slot] = key, numbers[place]
+            number[side] = latest_number[side, slot]
+            sizes[side][number[side]] += 1
+        if has_pred and has_true and (everywhere or may_overlap[n]):
+            pair = number[0] << 32 | number[1]
+            slot = (number[0] + 7 * number[1]) & (_SLOTS - 1)
+            if open_pairs[slot] != pair:
+                if open_pairs[slot] >= 0:
+                    pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
+                open_pairs[slot], open_counts[slot] = pair, np.int64(0)
+            open_counts[slot] += np.int64(1)
+    for slot in np.arange(_SLOTS):
+        if open_pairs[slot] >= 0:
+            pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
+    overlaps = np.empty((len(pairs) - 1, 3), np.int64)
+    row = 0
+    for pair, count in pairs.items():
+        if pair >= 0:
+            overlaps[row, 0], overlaps[row, 1], overlaps[row, 2] = pair >> 32, pair & 0xFFFFFFFF, count
+            row += 1
+    return np.array(keys[0]), np.array(sizes[0]), np.array(keys[1]), np.array(sizes[1]), overlaps
+
+
+def _ratio(numerator: ArrayLike, denominator: ArrayLike) -> NDArray[np.float64]:
+    numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
+    return np.divide(numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0)

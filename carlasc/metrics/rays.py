@@ -1,0 +1,266 @@
+"""RayIoU and RayPQ: grids compared by what rays meet in them, not voxel by voxel (SparseOcc).
+
+A wall that is predicted half a metre too thick costs voxel IoU much and a robot nothing. Rays from where the sensor was on its way see the
+first surface only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.core.geometry import Transform, invert
+from carlasc.core.grids import GridSpec
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics.casting import cast_rays, rayiou_directions
+from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
+
+THRESHOLDS_M = (1.0, 2.0, 4.0)
+_MOST_ORIGINS = 8
+_MARGIN_M = 1.0  # origins lie this far inside the grid's sides: 39 m for Occ3D's grid of 40 m
+_FEWEST_RAYS = 10  # a segment of fewer rays is neither missed nor invented
+
+
+def ray_origins(world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec) -> NDArray[np.float64]:
+    """Return where the rays of a frame start: the sensor's places along the sequence that lie in the frame's grid.
+
+    Args:
+        world_T_sensors: (F, 4, 4) poses of the sequence's (key) frames.
+        frame: row of the frame that is scored.
+        spec: its grid.
+
+    Returns:
+        (O, 3) metres in the frame's sensor frame, at most 8: taken evenly from the places within the grid's sides less 1 m in x and y.
+    """
+    here: Transform = invert(world_T_sensors[frame])
+    places = (here @ world_T_sensors)[:, :3, 3]
+    inside = (places[:, :2] > np.array(spec.lower[:2]) + _MARGIN_M) & (
+        places[:, :2] < np.array(spec.upper[:2]) - _MARGIN_M
+    )
+    near = places[inside.all(axis=1)]
+    chosen = np.round(np.linspace(0, len(near) - 1, min(len(near), _MOST_ORIGINS))).astype(int)
+    return near[chosen]
+
+
+@dataclass(frozen=True)
+class RayScore:
+    """RayIoU of all rays.
+
+    Attributes:
+        class_iou: (T, K) IoU of each class at each depth threshold; NaN for a class in neither prediction nor truth.
+        thresholds_m: (T,) metres.
+        free: id of free space, which has no IoU.
+    """
+
+    class_iou: NDArray[np.float64]
+    thresholds_m: tuple[float, ...]
+    free: int
+
+    @property
+    def by_threshold(self) -> dict[float, float]:
+        """RayIoU at each threshold: the mean over the classes that occur, free left out."""
+        things = np.delete(self.class_iou, self.free, axis=1)
+        return {t: _mean(row) for t, row in zip(self.thresholds_m, things, strict=True)}
+
+    @property
+    def rayiou(self) -> float:
+        """The mean of the thresholds' RayIoU."""
+        return _mean(np.delete(self.class_iou, self.free, axis=1))
+
+
+class RayIoU:
+    """Adds up what rays meet in predicted and true grids.
+
+    A ray is right where the prediction's first voxel has the class of the truth's and lies less than a threshold before or behind it.
+    Rays that meet nothing in the truth are dropped. Counts are summed over all frames before dividing.
+
+    Attributes:
+        num_classes: K; ids are 0..K-1.
+        free: id of free space.
+        skip_unknown: drop the rays that cross an unknown voxel before they meet something in the truth. The original has no unknown
+            voxels: there they count as free.
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        *,
+        free: int = 0,
+        thresholds_m: tuple[float, ...] = THRESHOLDS_M,
+        skip_unknown: bool = False,
+        directions: ArrayLike | None = None,
+    ) -> None:
+        """Start empty; `directions` are (R, 3) unit vectors of the rays, those of `rayiou_directions` if None."""
+        if not 0 <= free < num_classes:
+            raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
+        self.num_classes, self.free, self.thresholds_m = num_classes, free, tuple(thresholds_m)
+        self.skip_unknown = skip_unknown
+        self.directions = rayiou_directions() if directions is None else np.asarray(directions, np.float64)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.true = np.zeros(self.num_classes, np.int64)
+        self.predicted = np.zeros(self.num_classes, np.int64)
+        self.hits = np.zeros((len(self.thresholds_m), self.num_classes), np.int64)
+
+    def update(
+        self,
+        prediction: ArrayLike,
+        truth: ArrayLike,
+        spec: GridSpec,
+        origins: ArrayLike,
+        known: ArrayLike | None = None,
+    ) -> Self:
+        """Add a frame.
+
+        Args:
+            prediction: (X, Y, Z) class ids.
+            truth: (X, Y, Z) class ids.
+            spec: geometry of both, Cartesian.
+            origins: (O, 3) metres, where rays start (see `ray_origins`).
+            known: (X, Y, Z) bool, voxels of the truth that were evaluated; only used with `skip_unknown`.
+
+        Returns:
+            The metric itself.
+
+        Raises:
+            FormatError: shapes differ, or an id is not below `num_classes`.
+            ArgumentError: the grid is cylindrical, or `skip_unknown` was asked for and `known` is missing.
+        """
+        pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
+        grids = [pred, true]
+        if self.skip_unknown:
+            if known is None:
+                raise ArgumentError("known", expected="the truth's known voxels", found="None")
+            seen = np.asarray(known, np.bool_)
+            grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))  # unknown voxels stop a ray here
+        voxels, depths = cast_rays(np.stack(grids), spec, np.asarray(origins), self.directions, free=self.free)
+        valid = voxels[1] >= 0
+        if self.skip_unknown:
+            valid &= voxels[2] == voxels[1]
+        flat_pred, flat_true = pred.reshape(-1)[voxels[0]], true.reshape(-1)[voxels[1]]
+        valid &= flat_true != self.free
+        flat_pred, flat_true = flat_pred[valid], flat_true[valid]
+        off = np.abs(depths[0] - depths[1])[valid]
+        self.true += np.bincount(flat_true, minlength=self.num_classes)
+        self.predicted += np.bincount(flat_pred, minlength=self.num_classes)
+        same = flat_pred == flat_true
+        for row, threshold in enumerate(self.thresholds_m):
+            self.hits[row] += np.bincount(flat_true[same & (off < threshold)], minlength=self.num_classes)
+        return self
+
+    def compute(self) -> RayScore:
+        """Return the score of everything that was added."""
+        union = self.true + self.predicted - self.hits
+        iou = np.divide(self.hits, union, out=np.full(union.shape, np.nan), where=union > 0)
+        return RayScore(iou, self.thresholds_m, self.free)
+
+    def merge(self, other: RayIoU) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        if (other.num_classes, other.free, other.thresholds_m, other.skip_unknown) != (
+            self.num_classes,
+            self.free,
+            self.thresholds_m,
+            self.skip_unknown,
+        ):
+            raise ArgumentError("RayIoU", expected="metrics of the same classes and thresholds", found="others")
+        self.true += other.true
+        self.predicted += other.predicted
+        self.hits += other.hits
+        return self
+
+    def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> NDArray[Any]:
+        array = np.asarray(labels)
+        if array.shape != spec.size:
+            raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
+        if array.dtype.kind not in "ui" or (array.size and (array.min() < 0 or array.max() >= self.num_classes)):
+            raise FormatError(name, expected=f"class ids 0..{self.num_classes - 1}", found=_range_text(array))
+        return array.astype(np.uint16, copy=False)
+
+
+class RayPQ:
+    """Panoptic quality of rays: segments are sets of rays, which overlap only where the depths agree (SparseOcc).
+
+    Segments match at an IoU over 0.5. A stuff class of the truth is one segment. A segment of fewer than 10 rays is neither a false
+    negative nor a false positive.
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        things: frozenset[int],
+        *,
+        free: int = 0,
+        thresholds_m: tuple[float, ...] = THRESHOLDS_M,
+        directions: ArrayLike | None = None,
+    ) -> None:
+        """Start empty; `directions` are (R, 3) unit vectors of the rays, those of `rayiou_directions` if None."""
+        self.num_classes, self.things, self.free, self.thresholds_m = num_classes, things, free, tuple(thresholds_m)
+        self.directions = rayiou_directions() if directions is None else np.asarray(directions, np.float64)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.qualities = [PanopticQuality(self.num_classes, self.things, free=self.free) for _ in self.thresholds_m]
+
+    def update(
+        self,
+        prediction: tuple[ArrayLike, ArrayLike],
+        truth: tuple[ArrayLike, ArrayLike],
+        spec: GridSpec,
+        origins: ArrayLike,
+    ) -> Self:
+        """Add a frame.
+
+        Args:
+            prediction: (X, Y, Z) class ids, and (X, Y, Z) instance ids.
+            truth: likewise.
+            spec: geometry of both, Cartesian.
+            origins: (O, 3) metres, where rays start (see `ray_origins`).
+        """
+        (pred, pred_ids), (true, true_ids) = ([np.asarray(a) for a in side] for side in (prediction, truth))
+        voxels, depths = cast_rays(np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free)
+        valid = (voxels[1] >= 0) & (true.reshape(-1)[voxels[1]] != self.free)
+        near, far = voxels[0][valid], voxels[1][valid]
+        classes = pred.reshape(-1)[near], true.reshape(-1)[far]
+        is_thing = np.isin(classes[1], sorted(self.things))
+        ids = pred_ids.reshape(-1)[near], np.where(is_thing, true_ids.reshape(-1)[far], 0)
+        off = np.abs(depths[0] - depths[1])[valid]
+        for quality, threshold in zip(self.qualities, self.thresholds_m, strict=True):
+            segments = match_segments(
+                (classes[0], ids[0]), (classes[1], ids[1]), overlap=off < threshold, free=self.free
+            )
+            quality.add(segments, fewest=_FEWEST_RAYS)
+        return self
+
+    def compute(self) -> Mapping[float, PanopticScore]:
+        """Return the panoptic score at each depth threshold, metres; RayPQ is the mean of their `pq`."""
+        return {t: quality.compute() for t, quality in zip(self.thresholds_m, self.qualities, strict=True)}
+
+    def merge(self, other: RayPQ) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        for own, theirs in zip(self.qualities, other.qualities, strict=True):
+            own.merge(theirs)
+        return self
+
+
+def _range_text(array: NDArray[Any]) -> str:
+    return f"{array.dtype} from {array.min()} to {array.max()}" if array.size else str(array.dtype)
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    present = values[~np.isnan(values)]
+    return float(present.mean()) if present.size else float("nan")

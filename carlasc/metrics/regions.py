@@ -1,0 +1,120 @@
+"""Where a score is taken: masks that break a grid down by distance, height, visibility and motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
+from carlasc.errors import ArgumentError
+from carlasc.metrics.casting import cast_rays
+from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.masks import distance_band
+
+Masks = Mapping[str, NDArray[np.bool_]]
+
+
+def distance_bands(spec: GridSpec, edges_m: Sequence[float] = (0, 10, 20, 30)) -> Masks:
+    """Return a mask for each band of horizontal distance from the sensor, between consecutive edges, metres."""
+    return {f"{near:g}-{far:g} m": distance_band(spec, near, far) for near, far in pairwise(edges_m)}
+
+
+def height_bands(spec: GridSpec, edges_m: Sequence[float]) -> Masks:
+    """Return a mask for each band of height of the voxels' centres, between consecutive edges, metres in the sensor's frame.
+
+    Raises:
+        ArgumentError: edges that do not rise.
+    """
+    if len(edges_m) < 2 or any(low >= high for low, high in pairwise(edges_m)):
+        raise ArgumentError("edges_m", expected="two or more rising heights", found=str(list(edges_m)))
+    height = spec.centers()[..., 2]
+    return {f"{low:g}-{high:g} m up": (height >= low) & (height < high) for low, high in pairwise(edges_m)}
+
+
+def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 0) -> Masks:
+    """Return what the sensor could see at this instant, and what it could not, by the true grid.
+
+    A voxel is visible where no occupied voxel of the truth lies between the sensor and its centre. What stands behind something can only
+    be completed, not seen.
+
+    Args:
+        truth: the true grid, Cartesian.
+        origin: (3,) metres, the sensor's place in the grid's frame.
+        free: id of free space.
+
+    Returns:
+        Masks "visible" and "hidden", (X, Y, Z) bool.
+    """
+    start = np.asarray(origin, np.float64)
+    ways = truth.spec.centers().reshape(-1, 3) - start
+    distance = np.linalg.norm(ways, axis=1)
+    directions = ways / np.maximum(distance, 1e-9)[:, None]
+    labels = np.where(truth.known, truth.labels, free)
+    _, (depth,) = cast_rays(labels[None], truth.spec, start[None], directions, free=free)
+    visible = (distance <= depth + 1e-6).reshape(truth.spec.size)
+    return {"visible": visible, "hidden": ~visible}
+
+
+def motion(truth: Grid, scan: Scan, movable: Sequence[int], *, min_speed_m_s: float = 0.3) -> Masks:
+    """Return the voxels of things that move, and of things that could but stand, by the flow of the frame's own scan.
+
+    Args:
+        truth: the true grid.
+        scan: the frame's points with flow, in the grid's frame.
+        movable: ids of the classes that may move.
+        min_speed_m_s: slower points stand.
+
+    Returns:
+        Masks "moving" and "standing", (X, Y, Z) bool. Voxels of movable classes that hold no point are in neither.
+
+    Raises:
+        ArgumentError: the scan has no flow.
+    """
+    if scan.flow is None:
+        raise ArgumentError("scan", expected="points with flow", found="none")
+    fast = np.linalg.norm(scan.flow, axis=1) >= min_speed_m_s
+    voxel = truth.spec.flat_index(np.asarray(scan.points, np.float64))
+    holds_fast, holds_slow = np.zeros((2, truth.spec.num_voxels), np.bool_)
+    holds_fast[voxel[fast & (voxel >= 0)]] = True
+    holds_slow[voxel[~fast & (voxel >= 0)]] = True
+    may_move = np.isin(truth.labels, list(movable))
+    moving = holds_fast.reshape(truth.spec.size) & may_move
+    return {"moving": moving, "standing": holds_slow.reshape(truth.spec.size) & may_move & ~moving}
+
+
+class Breakdown:
+    """Adds up a confusion matrix for each of several regions."""
+
+    def __init__(self, num_classes: int, *, free: int = 0) -> None:
+        self.num_classes, self.free = num_classes, free
+        self.matrices: dict[str, ConfusionMatrix] = {}
+
+    def update(self, prediction: ArrayLike, truth: ArrayLike, masks: Masks, counted: ArrayLike | None = None) -> Self:
+        """Add a frame: to each region's matrix the voxels of its mask that count."""
+        for name, mask in masks.items():
+            inside = mask if counted is None else mask & np.asarray(counted, np.bool_)
+            self._matrix(name).update(np.asarray(prediction), np.asarray(truth), inside)
+        return self
+
+    def compute(self) -> Mapping[str, ConfusionMatrix]:
+        """Return the confusion of each region, by name."""
+        return dict(self.matrices)
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.matrices = {}
+
+    def merge(self, other: Breakdown) -> Self:
+        """Add what another breakdown has added up; regions that only one of them has are kept."""
+        for name, matrix in other.matrices.items():
+            own = self._matrix(name)
+            own += matrix
+        return self
+
+    def _matrix(self, name: str) -> ConfusionMatrix:
+        return self.matrices.setdefault(name, ConfusionMatrix(self.num_classes, free=self.free))

@@ -1,0 +1,194 @@
+"""Scores over time: does a map agree with itself from frame to frame, and is the future that it predicts the one that came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.grids import Grid
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics.confusion import ConfusionMatrix
+
+HORIZONS_S = (1.0, 2.0, 3.0)
+
+
+def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
+    """Return a grid as seen from another place: each voxel takes the label of the source voxel that holds its centre.
+
+    Args:
+        grid: labels and counts in the frame `src`.
+        dst_T_src: (4, 4) rigid transform.
+
+    Returns:
+        A grid of the same geometry in the frame `dst`; what lies outside the source is unknown (count 0).
+    """
+    spec = grid.spec
+    centers = transform_points(invert(dst_T_src), spec.from_axes(spec.centers()).reshape(-1, 3))
+    voxel = spec.flat_index(centers)
+    inside = voxel >= 0
+    labels = np.zeros(spec.num_voxels, grid.labels.dtype)
+    labels[inside] = grid.labels.reshape(-1)[voxel[inside]]
+    counts = np.zeros(spec.num_voxels, np.float32)
+    counts[inside] = grid.known.reshape(-1)[voxel[inside]]
+    return Grid(spec, labels.reshape(spec.size), counts.reshape(spec.size))
+
+
+class Consistency:
+    """Adds up how well consecutive frames agree about what does not move.
+
+    Voxels of frame t that hold a static class, or free space, are moved into frame t + 1 and compared there with what that frame says,
+    over the voxels that both know.
+
+    Attributes:
+        matrix: confusion of the later frame (columns) against the earlier one (rows).
+    """
+
+    def __init__(self, num_classes: int, moving: Iterable[int], *, free: int = 0) -> None:
+        """Start empty; `moving` are the ids of classes that may move and are left out."""
+        self.moving = frozenset(moving)
+        self.matrix = ConfusionMatrix(num_classes, free=free)
+
+    def update(self, earlier: Grid, later: Grid, later_T_earlier: Transform, ignored: ArrayLike | None = None) -> Self:
+        """Add a pair of consecutive frames.
+
+        Args:
+            earlier: grid of frame t.
+            later: grid of frame t + 1, of the same geometry.
+            later_T_earlier: (4, 4) how the sensor moved.
+            ignored: (X, Y, Z) bool voxels of the later frame that are left out (where something moves that no class tells).
+
+        Raises:
+            FormatError: the geometries differ.
+        """
+        if earlier.spec != later.spec:
+            raise FormatError("later", expected=f"the earlier frame's {earlier.spec}", found=str(later.spec))
+        before = moved_grid(earlier, later_T_earlier)
+        movable = sorted(self.moving)
+        counted = before.known & later.known & ~np.isin(before.labels, movable) & ~np.isin(later.labels, movable)
+        if ignored is not None:
+            counted &= ~np.asarray(ignored, np.bool_)
+        self.matrix.update(later.labels, before.labels, counted)
+        return self
+
+    def compute(self) -> float:
+        """Return the IoU of occupied voxels between consecutive frames; NaN where nothing was compared."""
+        return self.matrix.completeness().iou
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.matrix = ConfusionMatrix(self.matrix.num_classes, free=self.matrix.free)
+
+    def merge(self, other: Consistency) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        if other.moving != self.moving:
+            raise ArgumentError(
+                "consistency", expected=f"moving classes {sorted(self.moving)}", found=str(sorted(other.moving))
+            )
+        self.matrix += other.matrix
+        return self
+
+
+def shape_consistency(earlier: NDArray[np.bool_], later: NDArray[np.bool_]) -> float:
+    """Return the IoU of an actor's shape in two frames, both in the actor's own frame of reference.
+
+    Args:
+        earlier: (X, Y, Z) bool voxels of the actor.
+        later: likewise, of the same geometry.
+
+    Returns:
+        IoU from 0 to 1; NaN where the actor has no voxel in either.
+
+    Raises:
+        FormatError: shapes differ.
+    """
+    if earlier.shape != later.shape:
+        raise FormatError("later", expected=f"shape {earlier.shape}", found=str(later.shape))
+    union = int(np.count_nonzero(earlier | later))
+    return np.count_nonzero(earlier & later) / union if union else float("nan")
+
+
+@dataclass(frozen=True)
+class ForecastScore:
+    """Scores of one horizon.
+
+    Attributes:
+        miou: mean IoU over the classes, free left out.
+        iou: IoU of occupied against free.
+    """
+
+    miou: float
+    iou: float
+
+
+class Forecasting:
+    """Adds up how good predicted futures are, by how far ahead they look.
+
+    Attributes:
+        matrices: confusion of each horizon, seconds ahead.
+    """
+
+    def __init__(self, num_classes: int, *, free: int = 0, horizons_s: Iterable[float] = HORIZONS_S) -> None:
+        self.matrices = {float(horizon): ConfusionMatrix(num_classes, free=free) for horizon in horizons_s}
+
+    def update(self, horizon_s: float, prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
+        """Add the future of one frame: what was predicted for `horizon_s` later, and what was there then.
+
+        Raises:
+            ArgumentError: no such horizon.
+            FormatError: shapes or ids do not fit.
+        """
+        if float(horizon_s) not in self.matrices:
+            raise ArgumentError(
+                "horizon_s", expected=f"one of {', '.join(f'{h:g}' for h in self.matrices)}", found=f"{horizon_s:g}"
+            )
+        counted = None if mask is None else np.asarray(mask)
+        self.matrices[float(horizon_s)].update(np.asarray(prediction), np.asarray(truth), counted)
+        return self
+
+    def compute(self) -> Mapping[float, ForecastScore]:
+        """Return the scores of each horizon."""
+        return {
+            horizon: ForecastScore(matrix.mean_iou(with_free=False, absent="skip"), matrix.completeness().iou)
+            for horizon, matrix in self.matrices.items()
+        }
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.matrices = {h: ConfusionMatrix(m.num_classes, free=m.free) for h, m in self.matrices.items()}
+
+    def merge(self, other: Forecasting) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        if set(other.matrices) != set(self.matrices):
+            raise ArgumentError(
+                "forecasting", expected=f"horizons {sorted(self.matrices)}", found=str(sorted(other.matrices))
+            )
+        for horizon, matrix in other.matrices.items():
+            self.matrices[horizon] += matrix
+        return self
+
+
+def frames_ahead(horizon_s: float, period_s: float) -> int:
+    """Return how many frames a horizon is ahead.
+
+    Raises:
+        ArgumentError: it is no whole number of frames.
+    """
+    ahead = horizon_s / period_s
+    if abs(ahead - round(ahead)) > 1e-6:
+        raise ArgumentError(
+            "horizon_s", expected=f"a multiple of the frame period {period_s:g} s", found=f"{horizon_s:g} s"
+        )
+    return round(ahead)

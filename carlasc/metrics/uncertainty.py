@@ -1,0 +1,170 @@
+"""How far predicted probabilities can be believed: calibration error, likelihood, reliability diagrams (as PaSCo reports them)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from carlasc.errors import ArgumentError, FormatError
+
+_BINS = 15
+_TOLERANCE = 1e-3  # how far the probabilities of a voxel may be from summing to one: half precision gives 5e-4
+_EPSILON = 1e-12  # of the logarithm
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """A reliability diagram over bins of equal width of the predicted class's probability.
+
+    Attributes:
+        count: (B,) voxels in each bin.
+        confidence: (B,) mean probability in each bin; NaN in an empty one.
+        accuracy: (B,) share of the voxels of each bin that were predicted right.
+    """
+
+    count: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    accuracy: NDArray[np.float64]
+
+    @property
+    def ece(self) -> float:
+        """Expected calibration error: mean of |confidence - accuracy| over voxels; NaN without any voxel."""
+        if not self.count.sum():
+            return float("nan")
+        gap = np.nan_to_num(np.abs(self.confidence - self.accuracy))
+        return float((gap * self.count).sum() / self.count.sum())
+
+
+@dataclass(frozen=True)
+class UncertaintyScore:
+    """Calibration of everything that was added.
+
+    Attributes:
+        ece_empty: mean over frames of the calibration error of voxels that were predicted free.
+        ece_occupied: likewise of voxels that were predicted occupied.
+        nll_empty: negative log-likelihood of the true class, mean over all voxels that were predicted free.
+        nll_occupied: likewise of voxels that were predicted occupied.
+        empty: reliability of voxels that were predicted free, pooled over frames.
+        occupied: likewise of voxels that were predicted occupied.
+    """
+
+    ece_empty: float
+    ece_occupied: float
+    nll_empty: float
+    nll_occupied: float
+    empty: Reliability
+    occupied: Reliability
+
+
+class Uncertainty:
+    """Adds up how confident a network was, and how often it was right.
+
+    Calibration errors are taken per frame and averaged, likelihoods are pooled over voxels, both apart for voxels predicted free and
+    predicted occupied: PaSCo's convention.
+
+    Attributes:
+        num_classes: K.
+        free: id of free space.
+        bins: number of bins of equal width.
+    """
+
+    def __init__(self, num_classes: int, *, free: int = 0, bins: int = _BINS) -> None:
+        if not 0 <= free < num_classes:
+            raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
+        if bins < 1:
+            raise ArgumentError("bins", expected="at least 1", found=str(bins))
+        self.num_classes, self.free, self.bins = num_classes, free, bins
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was added."""
+        self.sums = np.zeros((2, 3, self.bins))  # predicted free or occupied; count, confidence, right; by bin
+        self.nll = np.zeros((2, 2))  # predicted free or occupied; sum, count
+        self.ece = np.zeros((2, 2))  # predicted free or occupied; sum of frames, number of frames
+
+    def update(self, probabilities: Any, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
+        """Add a frame.
+
+        Args:
+            probabilities: (..., K) float, summing to one per voxel; NumPy or a torch tensor.
+            truth: (...) class ids.
+            mask: (...) bool: only these voxels count.
+
+        Returns:
+            The metric itself.
+
+        Raises:
+            FormatError: shapes differ, or probabilities do not sum to one.
+        """
+        prob = np.asarray(probabilities.detach().cpu() if hasattr(probabilities, "detach") else probabilities)
+        target = np.asarray(truth)
+        if prob.shape != (*target.shape, self.num_classes):
+            raise FormatError(
+                "probabilities", expected=f"shape {(*target.shape, self.num_classes)}", found=str(prob.shape)
+            )
+        counted = np.ones(target.shape, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+        prob, target = prob[counted].astype(np.float64), target[counted]
+        off = np.abs(prob.sum(axis=1) - 1)
+        if not (off <= _TOLERANCE).all() or (prob < 0).any():
+            worst = int(np.nanargmax(np.where(np.isnan(off), np.inf, off))) if len(off) else 0
+            raise FormatError(
+                "probabilities",
+                expected="values of 0 or more that sum to one per voxel",
+                found=f"a sum of {prob[worst].sum():.4g} (lowest value {prob.min():.4g})",
+                advice="apply a softmax first",
+            )
+        if len(target) and (target.min() < 0 or target.max() >= self.num_classes):
+            raise FormatError(
+                "truth", expected=f"class ids 0..{self.num_classes - 1}", found=f"{target.min()} to {target.max()}"
+            )
+        predicted = prob.argmax(axis=1)
+        confidence, right = prob.max(axis=1, initial=0.0), predicted == target
+        loss = -np.log(prob[np.arange(len(target)), target] + _EPSILON)
+        occupied = predicted != self.free
+        for row, chosen in enumerate((~occupied, occupied)):
+            sums = self._bin(confidence[chosen], right[chosen])
+            self.sums[row] += sums
+            if chosen.any():
+                self.ece[row] += _reliability(sums).ece, 1
+                self.nll[row] += loss[chosen].sum(), chosen.sum()
+        return self
+
+    def compute(self) -> UncertaintyScore:
+        """Return the score of everything that was added; NaN where nothing was."""
+        with np.errstate(invalid="ignore"):
+            ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
+        return UncertaintyScore(
+            float(ece[0]),
+            float(ece[1]),
+            float(nll[0]),
+            float(nll[1]),
+            _reliability(self.sums[0]),
+            _reliability(self.sums[1]),
+        )
+
+    def merge(self, other: Uncertainty) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        if (other.num_classes, other.free, other.bins) != (self.num_classes, self.free, self.bins):
+            raise ArgumentError("uncertainty", expected="metrics of the same classes and bins", found="others")
+        self.sums += other.sums
+        self.nll += other.nll
+        self.ece += other.ece
+        return self
+
+    def _bin(self, confidence: NDArray[np.float64], right: NDArray[np.bool_]) -> NDArray[np.float64]:
+        # Bins are (low, high]: a confidence of exactly 1 is in the last one.
+        number = np.clip(np.ceil(confidence * self.bins).astype(int) - 1, 0, self.bins - 1)
+        return np.stack([np.bincount(number, weights, self.bins) for weights in (None, confidence, right)])
+
+
+def _reliability(sums: NDArray[np.float64]) -> Reliability:
+    count = sums[0]
+    confidence, accuracy = np.divide(sums[1:], count, out=np.full((2, len(count)), np.nan), where=count > 0)
+    return Reliability(count.astype(np.int64), confidence, accuracy)

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.metrics import ConfusionMatrix, bootstrap, compare
+
+
+def matrices(accuracies, seed=0, size=4000):
+    rng = np.random.default_rng(seed)
+    found = {}
+    for number, accuracy in enumerate(accuracies):
+        truth = rng.integers(0, 3, size)
+        pred = np.where(rng.random(size) < accuracy, truth, rng.integers(0, 3, size))
+        found[f"s{number}"] = ConfusionMatrix(3).update(pred, truth)
+    return found
+
+
+def accuracy(matrix):
+    return matrix.accuracy
+
+
+def test_an_interval_holds_the_score_and_is_wide_where_sequences_differ():
+    alike = bootstrap(list(matrices([0.6] * 8).values()), accuracy)
+    apart = bootstrap(list(matrices(np.linspace(0.2, 0.9, 8)).values()), accuracy)
+    for interval in (alike, apart):
+        assert interval.low <= interval.value <= interval.high
+    assert alike.high - alike.low < 0.03 < apart.high - apart.low
+    assert bootstrap(list(matrices([0.6] * 8).values()), accuracy) == alike  # the same draws each time
+
+
+def test_95_percent_of_intervals_hold_the_true_value():
+    rng = np.random.default_rng(1)
+    held = 0
+    for trial in range(60):
+        interval = bootstrap(list(matrices(rng.normal(0.6, 0.1, 12), trial, 600).values()), accuracy)
+        held += interval.low <= 0.6 + 0.4 / 3 <= interval.high
+    assert held >= 50
+
+
+def test_a_clear_difference_is_seen():
+    rng = np.random.default_rng(2)
+    hard = rng.uniform(0.3, 0.8, 7)  # sequences differ much more than the two predictions
+    base, better = matrices(hard, 3), matrices(hard + 0.05, 4)
+    found = compare(better, base, accuracy)
+    assert found.p_value < 0.05
+    assert 0 < found.difference.low < found.difference.value < found.difference.high
+    assert compare(base, base, accuracy).p_value == 1.0
+    assert compare(base, better, accuracy).difference.value == pytest.approx(-found.difference.value)
+    assert found.sequences == tuple(sorted(base))
+
+
+def test_the_test_of_equals_is_wrong_as_often_as_it_says():
+    rng = np.random.default_rng(6)
+    p_values = []
+    for trial in range(60):
+        hard = rng.uniform(0.3, 0.8, 6)
+        p_values.append(compare(matrices(hard, trial, 400), matrices(hard, 1000 + trial, 400), accuracy).p_value)
+    assert np.mean(np.array(p_values) < 0.1) < 0.25
+    assert np.mean(np.array(p_values) < 0.5) > 0.25
+
+
+def test_fewer_than_five_sequences_say_nothing():
+    few = matrices([0.5] * 4)
+    with pytest.raises(ArgumentError, match="at least 5 to draw from, found 4"):
+        bootstrap(list(few.values()), accuracy)
+    with pytest.raises(ArgumentError, match="at least 5"):
+        compare(few, few, accuracy)
+    with pytest.raises(MissingDataError, match="sequences of the first"):
+        compare(matrices([0.5] * 6), {"other": few["s0"]}, accuracy)
+
+
+def test_only_sequences_that_both_have_are_compared():
+    first, second = matrices([0.7] * 7), matrices([0.5] * 7)
+    del second["s3"]
+    assert compare(first, second, accuracy).sequences == ("s0", "s1", "s2", "s4", "s5", "s6")
