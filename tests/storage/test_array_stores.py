@@ -106,7 +106,7 @@ def test_what_an_interrupted_run_left_of_a_sequence_is_removed(tmp_path: Path, k
 @pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])
 def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> None:
     pytest.importorskip(package)
-    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(BARE)
+    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
     writer.write("labels", 3, np.arange(3, dtype=np.uint32))
     with pytest.raises(FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"):
         writer.write("labels", 3, np.arange(3, dtype=np.uint32))
