@@ -62,6 +62,7 @@ def test_a_finer_or_larger_grid_is_refused():
 
 def test_the_finest_grid_of_the_same_coordinates_is_resampled_unless_another_is_named(tmp_path):
     writer = FolderSink(tmp_path).sequence("Val/Street/cartesian")
+    writer.write("points", 0, np.ones((1, 4), np.float32))
     for seed, (name, size) in enumerate({"middle": (8, 8, 4), "fine": (16, 16, 8), "last": (8, 8, 4)}.items()):
         grid = random_grid(seed, size)
         writer.write_document(layout.params_file(name), to_json(grid.spec.to_params()))
