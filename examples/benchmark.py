@@ -28,10 +28,10 @@ from completion.training import BEST, LAST, train
 from completion.weights import load_weights, read_weights
 
 from carlasc import GridSpec
-from carlasc.core.tables import CARLASC11
-from carlasc.metrics import Evaluation, Table, geometric_table, semantic_table
+from carlasc.captures import TrafficLevel
+from carlasc.metrics import CONVENTIONS, Evaluation, Table, geometric_table, semantic_table
 
-TRAFFIC = ("light", "medium", "heavy")
+TRAFFIC: tuple[TrafficLevel, ...] = ("light", "medium", "heavy")
 SPLITS = (("Train", 100), ("Val", 200), ("Test", 300))  # split, and seed of its first town
 
 
@@ -136,7 +136,7 @@ def run_entry(entry: Entry, data: Path, out: Path, processes: Processes) -> Eval
     load_weights(network, read_weights(out / BEST), str(out / BEST))
     loader = eval_loader(test, entry.config, processes.rank, processes.world)
     matrix = score(network.to(processes.device), loader, num_classes, processes)
-    return Evaluation(entry.name, CARLASC11, matrix, {}, len(test), "known", "zero", [])
+    return Evaluation(entry.name, CONVENTIONS["carlasc"], matrix, {}, len(test), "known", [])
 
 
 def average_seeds(groups: Mapping[str, Sequence[Evaluation]]) -> list[Table]:

@@ -18,11 +18,13 @@ from completion.predicting import Model, predict_dataset
 from completion.towns import Town, build_towns
 
 from carlasc import GridSpec
+from carlasc.captures import TrafficLevel
 from carlasc.metrics import Evaluation, evaluate
 
+_TRAFFIC: tuple[tuple[int, TrafficLevel], ...] = ((10, "light"), (11, "medium"), (12, "heavy"))
 TOWNS = tuple(
     Town(f"Town{seed}_{traffic.title()}", "Test", seed, traffic, first_frame)
-    for seed, traffic in ((10, "light"), (11, "medium"), (12, "heavy"))
+    for seed, traffic in _TRAFFIC
     for first_frame in range(50, 550, 50)
 )
 

@@ -13,6 +13,7 @@ from carlasc.converting.frames import FrameJob, Target, make_fields
 from carlasc.converting.protocol import FrameContent
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
+from carlasc.groundtruth import FromScans
 from carlasc.storage import FolderSink, FolderSource, layout
 
 PAGE = Path(__file__).parents[1] / "docs/contributing.md"
@@ -60,10 +61,10 @@ def test_a_field_of_the_recipe_goes_through_every_store(folder, tmp_path, store)
     if store == "zip":
         out = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", folder))
     else:
-        out = carlasc.pack(folder, tmp_path / f"packed.{store}", workers=1).out
+        out = carlasc.pack(folder, tmp_path / f"packed.{store}").out
     for found, wanted in zip(rings_of(out), rings_of(folder), strict=True):
         assert found.dtype == wanted.dtype == np.uint16 and np.array_equal(found, wanted)
-    carlasc.unpack(out, tmp_path / "back", workers=1)
+    carlasc.unpack(out, tmp_path / "back")
     assert {file.name: file.read_bytes() for file in (tmp_path / "back" / PATH / "rings").iterdir()} == files
 
 
@@ -101,6 +102,6 @@ def test_a_converter_passes_it_on(rings):
 
 def test_regrid_from_scans_carries_it_along(folder, tmp_path):
     spec = carlasc.GridSpec.published().with_size((8, 8, 4))
-    carlasc.regrid(folder, tmp_path / "out", spec, observations="scans", workers=1)
+    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), workers=1)
     for found, wanted in zip(rings_of(tmp_path / "out"), rings_of(folder), strict=True):
         assert np.array_equal(found, wanted)

@@ -148,7 +148,7 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
 def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
     rows = np.isfinite(array.reshape(len(array), -1)).all(axis=1)
     if not rows.all():
-        found = f"NaN or infinity in {int((~rows).sum())} rows, the first {int(np.argmin(rows))}"
+        found = f"NaN or infinity in {int((~rows).sum())} rows, first in row {int(np.argmin(rows))}"
         yield Finding("error", "not-finite", sequence.path, where, "finite numbers", found)
     elif name == "flow" and len(rows) and float(np.abs(array).max()) > _FASTEST_M_S:
         found = f"{float(np.abs(array).max()):.0f} m/s"

@@ -238,7 +238,7 @@ class _Scorer:
             return self.impossible
         summed = sum(self.matrices.values(), self._matrix())
         return Evaluation(
-            name, self.convention, summed, self.matrices, tuple(self.frames), self.options.voxels, self.failures, notes,
+            name, self.convention, summed, self.matrices, len(self.frames), self.options.voxels, self.failures, tuple(self.frames), notes,
             self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
         )  # fmt: skip
 
@@ -269,8 +269,8 @@ class _Scorer:
             if asked and _spec_of(pair) is None:
                 raise ArgumentError(
                     argument,
-                    expected="nothing for grids without geometry",
-                    found=str(argument),
+                    expected="None for grids without geometry",
+                    found="a region" if argument == "region" else str(asked),
                     advice=f"add params.json to {pair.truth.location}",
                 )
         if (self.options.rays or "motion" in self.options.by) and not isinstance(pair.truth, SequenceGrid):
@@ -311,10 +311,10 @@ class _Scorer:
         known = pair.truth.known(frame, self.convention.seen_by)
         if known is not None:
             return known.reshape(shape)
-        if pair.truth.spec is not None and self.convention.unknown == "left out":
+        if self.convention.unknown == "left out":
             raise MissingDataError(
                 f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
-                expected="counts, which say what is known",
+                expected="counts or a mask, which say what is known",
                 found="none",
                 advice="give `voxels=all` to score all voxels",
             )

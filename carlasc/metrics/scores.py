@@ -42,9 +42,10 @@ class Evaluation:
         convention: the rules by which they were scored.
         matrix: the confusion matrix over all frames, in the convention's classes.
         sequences: the confusion matrix of each sequence, by path.
-        frame_scores: the scores of each frame alone.
+        frames: number of frames scored.
         voxels: "known" voxels of the truth were scored, or "all".
         failures: (frame, message) of the frames that could not be scored.
+        frame_scores: the scores of each frame alone, where they were kept.
         notes: what a reader of the scores must know.
         breakdown: the confusion matrix of each region that was asked for, by name.
         rays: RayIoU, if it was asked for.
@@ -54,9 +55,10 @@ class Evaluation:
     convention: Convention
     matrix: ConfusionMatrix
     sequences: Mapping[str, ConfusionMatrix]
-    frame_scores: tuple[FrameScore, ...]
+    frames: int
     voxels: Literal["known", "all"]
     failures: list[tuple[str, str]]
+    frame_scores: tuple[FrameScore, ...] = ()
     notes: tuple[str, ...] = ()
     breakdown: Mapping[str, ConfusionMatrix] = field(default_factory=dict)
     rays: RayScore | None = None
@@ -65,11 +67,6 @@ class Evaluation:
     def classes(self) -> ClassTable:
         """The classes that are scored."""
         return self.convention.classes
-
-    @property
-    def frames(self) -> int:
-        """Number of frames scored."""
-        return len(self.frame_scores)
 
     @property
     def score(self) -> ConventionScore:

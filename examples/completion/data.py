@@ -17,7 +17,7 @@ from carlasc import Dataset, Flip
 from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
 from carlasc.core import class_weights as weights_of
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.metrics import semantickitti
+from carlasc.metrics import CONVENTIONS
 from completion.config import Config
 from completion.losses import IGNORE
 
@@ -42,10 +42,11 @@ class SemanticKittiRule:
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample in the benchmark's classes."""
-        raw = sample["labels"]
+        raw = sample["labels"], SEMANTICKITTI
+        _, labels, counted = CONVENTIONS["semantickitti"].prepare(raw, raw, None)
         return sample | {
-            "labels": REMAPS["semantickitti19"](raw),
-            "known": sample["known"] & semantickitti(raw),
+            "labels": labels,
+            "known": sample["known"] & counted,
         }
 
 

@@ -61,7 +61,7 @@ def converted(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
         for name, labels in (("own", "lab"), ("carla", "carla")):
-            options = ("--labels", labels, "--workers", 1, "--res", "0.8")
+            options = ("--classes", labels, "--workers", 1, "--res", "0.8")
             run("convert", "lab", root / "in", root / name, *options)
     sys.modules.pop("lab_converter", None)
     return root
@@ -105,9 +105,9 @@ def test_validate_finds_ids_that_the_table_lacks(converted, tmp_path):
 def test_it_is_drawn_in_its_own_colours(converted, tmp_path):
     pytest.importorskip("embreex")
     pytest.importorskip("PIL")
-    run("render", converted / "own", "-o", tmp_path / "a.png", "--size", "320x180", "--frame", 2)
+    run("render", converted / "own", "-o", tmp_path / "a.png", "--size", "320x180", "--frames", 2)
     assert (tmp_path / "a.png").stat().st_size > 5000
-    run("view", converted / "own", "--html", tmp_path / "a.html", "--frames", "0:2")
+    run("view", converted / "own", "-o", tmp_path / "a.html", "--frames", "0:2")
     assert '"building"' in (tmp_path / "a.html").read_text()
 
 

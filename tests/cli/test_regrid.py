@@ -89,7 +89,7 @@ def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
         (["--res", "0.2,0.2"], "--res: expected 1 or 3 numbers"),
         (["--res", "fine"], "--res: expected 1 or 3 numbers"),
         (["--res", 1e-4], "expected fewer than 2^31 cells"),
-        (["--size", "0,10,10"], "expected at least one cell an axis"),
+        (["--size", "0,10,10"], "expected at least one cell per axis"),
         (["--size", "1.5,10,10"], "--size: expected 3 whole numbers"),
         (["--res", 0.2, "--bounds", "1,-1,0,1,0,1"], "expected lower < upper on every axis"),
         (["--res", 0.2, "--bounds", "1,2,3"], "--bounds: expected 6 numbers"),

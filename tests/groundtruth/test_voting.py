@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from carlasc.core.cells import fast_azimuth
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.groundtruth.voting.ballot import Ballot, Votes, count_votes
 from carlasc.groundtruth.voting.observations import Observation
-from carlasc.groundtruth.voting.rays import azimuth
 
 _PI32 = float(np.float32(np.pi))
 SPECS = {
@@ -175,7 +175,7 @@ def test_points_that_are_not_finite_cast_no_vote() -> None:
 def test_azimuths_of_the_fast_path_are_within_its_error() -> None:
     angles = np.concatenate([np.linspace(-np.pi, np.pi, 20001), np.arange(-4, 5) * np.pi / 4])
     x, y = np.cos(angles), np.sin(angles)
-    found = np.array([azimuth(a, b) for a, b in zip(x, y, strict=True)])
+    found = np.array([fast_azimuth(a, b) for a, b in zip(x, y, strict=True)])
     off = np.abs(found - np.arctan2(y, x))
     assert np.minimum(off, 2 * np.pi - off).max() < 3e-10
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from carlasc.metrics import (
     evaluate,
     evaluate_by_all_conventions,
     geometric_table,
+    own_convention,
     semantic_table,
 )
 from carlasc.storage import FolderSink, layout
@@ -286,15 +288,15 @@ def test_a_plain_folder_of_truth_has_counts_or_all_its_voxels_are_unknown(tmp_pa
     result = evaluate(source, write_plain(tmp_path / "truth", plain))
     assert (result.matrix.total, result.matrix.accuracy) == (3, pytest.approx(2 / 3))
     without = write_plain(tmp_path / "without", {"000000.label": truth})
-    assert "give `mask=all`" in evaluate(source, without).failures[0][1]
-    assert evaluate(source, without, mask="all").matrix.total == 4
+    assert "give `voxels=all`" in evaluate(source, without).failures[0][1]
+    assert evaluate(source, without, voxels="all").matrix.total == 4
 
 
 def test_plain_folders_of_different_sizes_are_told_by_the_size_of_their_files(tmp_path):
     source = write_plain(tmp_path / "source", {"000000.label": np.zeros(3, np.uint32)})
     without = write_plain(tmp_path / "without", {"000000.label": np.zeros(4, np.uint32)})
     counted = {"000000.label": np.zeros(4, np.uint32), "000000.bin": np.ones(4, np.float32)}
-    assert r"expected the truth's shape (4,), found (3,)" in evaluate(source, without, mask="all").failures[0][1]
+    assert r"expected the truth's shape (4,), found (3,)" in evaluate(source, without, voxels="all").failures[0][1]
     assert "expected 4 labels" in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]
 
 
@@ -309,7 +311,7 @@ def test_the_classes_of_plain_predictions_can_be_named(folders, world, tmp_path)
 def test_a_region_needs_grids_whose_geometry_is_known(tmp_path):
     folder = write_plain(tmp_path / "plain", {"000000.label": np.zeros(4, np.uint32)})
     with pytest.raises(ArgumentError, match="region: expected None for grids without geometry"):
-        evaluate(folder, folder, mask="all", region=lambda spec: distance_band(spec, 0, 1))
+        evaluate(folder, folder, voxels="all", region=lambda spec: distance_band(spec, 0, 1))
 
 
 def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tmp_path):
@@ -320,20 +322,22 @@ def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tm
     )
     path = tmp_path / "a" / SEQUENCES[0] / layout.METADATA
     path.write_text(json.dumps({"classes": "semantickitti"}))
-    result = evaluate(tmp_path / "a", tmp_path / "a", mask="semantickitti")
+    result = evaluate(tmp_path / "a", tmp_path / "a", convention="semantickitti")
     assert result.matrix.total == 2
     half = evaluate(
-        tmp_path / "a", tmp_path / "a", mask="semantickitti", region=lambda spec: spec.centers()[..., 1] < 0
+        tmp_path / "a", tmp_path / "a", convention="semantickitti", region=lambda spec: spec.centers()[..., 1] < 0
     )
     assert half.matrix.total == 1
 
 
-def test_sequences_of_different_classes_are_not_summed(world, tmp_path):
+def test_sequences_of_different_classes_are_summed_in_the_classes_of_the_convention(world, tmp_path):
     labels, counts = world[2], world[1]
     for path, classes in zip(SEQUENCES, ("carlasc11", "carla"), strict=True):
         write_grids(tmp_path, {k: v for k, v in labels.items() if k[0] == path}, counts, classes=classes)
-    with pytest.raises(FormatError, match="expected the classes carlasc11, found carla"):
-        evaluate(tmp_path, tmp_path, remap=None)
+    result = evaluate(tmp_path, tmp_path)
+    assert (result.frames, result.matrix.accuracy) == (6, 1.0)
+    with pytest.raises(FormatError, match=r"the convention own has a map for \(carlasc11\), found carla"):
+        evaluate(tmp_path, tmp_path, convention="own")
 
 
 def test_of_several_grids_one_is_to_be_named(world, tmp_path):
@@ -347,7 +351,7 @@ def test_of_several_grids_one_is_to_be_named(world, tmp_path):
 
 
 def evaluation(classes, matrix, absent="zero"):
-    return Evaluation("Net_1", classes, matrix, {}, 1, "known", absent, [])
+    return Evaluation("Net_1", replace(own_convention(classes), absent=absent), matrix, {}, 1, "known", [])
 
 
 def test_ids_that_are_no_class_are_not_in_the_mean():
@@ -361,16 +365,19 @@ def test_figures_that_are_not_defined_are_dashes_and_null():
     classes = ClassTable("two", {0: "free", 1: "thing & co"}, {0: (0, 0, 0), 1: (1, 1, 1)})
     result = evaluation(classes, ConfusionMatrix(2, counts=np.diag([4, 0])), "skip")
     semantic, geometric = result.tables()
-    assert semantic.texts() == [["Net_1", "100.00", "-", "100.00", "-", "100.00"]]
-    assert geometric.texts() == [["Net_1", "-", "-", "-"]]
+    assert semantic.texts() == [["Net_1", "100.00", "-", "100.00", "0.00", "100.00"]]
+    assert geometric.texts() == [["Net_1", "-", "-", "-", "-"]]
     assert r"Network & free & thing \& co & mIoU" in semantic.to_latex()
     assert result.to_dict()["class_iou"] == {"free": 1.0, "thing & co": None}
     assert (result.to_dict()["iou"], result.to_dict()["miou"]) == (None, 1.0)
 
 
-def test_a_table_needs_evaluations_of_the_same_classes():
-    one, other = (ClassTable(name, {0: "free"}, {0: (0, 0, 0)}) for name in ("one", "other"))
+def test_a_table_needs_evaluations_by_the_same_convention():
     with pytest.raises(ArgumentError, match="found none"):
         semantic_table([])
-    with pytest.raises(ArgumentError, match="evaluations: expected evaluations of one class table, found one, other"):
-        semantic_table([evaluation(table, ConfusionMatrix(1)) for table in (one, other)])
+    results = [
+        Evaluation("Net_1", CONVENTIONS[name], ConfusionMatrix(20), {}, 1, "known", [])
+        for name in ("sscbench", "semantickitti")
+    ]
+    with pytest.raises(ArgumentError, match="evaluations by one convention, found semantickitti, sscbench"):
+        semantic_table(results)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
-from storage.contract import SCANS, WHOLE
 
 import carlasc
 from carlasc.errors import FormatError
@@ -19,6 +18,7 @@ from carlasc.storage import FolderSource, Sequence, Source
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack, unpack
+from carlasc.testing.data import SCANS, WHOLE
 
 PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
 KINDS = [
