@@ -8,7 +8,7 @@ SIDE_BY_SIDE := -q -n auto --dist worksteal
 COVERAGE := 90 # percent; below it, `make coverage` fails
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage lint types unit benchmark benchmark-ssc docs page clean
+.PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage lint types unit benchmark benchmark-ssc docs notebooks page clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -50,6 +50,9 @@ benchmark: $(VENV)/ready ## time the hot paths (docs/performance.md)
 
 benchmark-ssc: $(VENV)/ready ## train the networks on a small simulated data set and print the tables (SIZE=full on a GPU)
 	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small) --history
+
+notebooks: $(VENV)/ready ## run the notebooks and keep what they show in them
+	$(RUN)/python examples/notebooks/run.py
 
 page: ## build the bundle of the shareable page again from npm
 	carlasc/viewing/page/build.sh
