@@ -114,11 +114,11 @@ def test_it_is_drawn_in_its_own_colours(converted, tmp_path):
 @pytest.mark.parametrize("ending", ["zarr", "h5", "parquet"])
 def test_it_is_packed_and_unpacked(converted, tmp_path, ending):
     pytest.importorskip({"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[ending])
-    run("pack", converted / "own", tmp_path / f"a.{ending}", "--workers", 1)
+    run("pack", converted / "own", tmp_path / f"a.{ending}")
     (sequence,) = carlasc.open(tmp_path / f"a.{ending}").sequences().values()
     (own,) = carlasc.open(converted / "own").sequences().values()
     assert sequence.metadata == own.metadata and sequence.metadata.classes.name == "lab"
-    run("unpack", tmp_path / f"a.{ending}", tmp_path / "back", "--workers", 1)
+    run("unpack", tmp_path / f"a.{ending}", tmp_path / "back")
     document = f"{PATH}/carlasc.json"
     assert (tmp_path / "back" / document).read_bytes() == (converted / "own" / document).read_bytes()
 
@@ -132,7 +132,7 @@ def test_it_is_scored_by_its_own_classes(converted):
 
 
 def test_it_is_regridded_from_its_scans(converted, tmp_path):
-    run("regrid", converted / "own", "-o", tmp_path, "--source", "scans", "--res", "1.6", "--workers", 1)
+    run("regrid", converted / "own", "-o", tmp_path, "--observe", "scans", "--res", "1.6", "--workers", 1)
     (sequence,) = carlasc.open(tmp_path).sequences().values()
     assert sequence.metadata.classes.names == NAMES
     (grid,) = sequence.grids

@@ -7,8 +7,7 @@ import json
 import pytest
 
 from carlasc import open as open_source
-from carlasc.core.tables import CARLASC11
-from carlasc.metrics import ConfusionMatrix, Evaluation
+from carlasc.metrics import CONVENTIONS, ConfusionMatrix, Evaluation
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
@@ -52,12 +51,12 @@ def test_seeds_are_averaged_and_their_spread_is_told():
     def run(correct: int) -> Evaluation:
         matrix = ConfusionMatrix(11)
         matrix.counts[1, 1], matrix.counts[1, 0] = correct, 100 - correct
-        return Evaluation("run", CARLASC11, matrix, {}, 1, "known", "zero", [])
+        return Evaluation("run", CONVENTIONS["carlasc"], matrix, {}, 1, "known", [])
 
     semantic, geometric = benchmark.average_seeds({"two": [run(40), run(60)], "one": [run(50)]})
     assert semantic.rows[0][semantic.header.index("Building")] == "50.00 ± 14.14"
     assert semantic.rows[1][semantic.header.index("Building")] == "50.00"
-    assert geometric.rows[0] == ("two", "100.00 ± 0.00", "50.00 ± 14.14", "50.00 ± 14.14")
+    assert geometric.rows[0] == ("two", "100.00 ± 0.00", "50.00 ± 14.14", "50.00 ± 14.14", "50.00 ± 14.14")
     assert semantic.rows[0][semantic.header.index("Pole")] == "-"
 
 
