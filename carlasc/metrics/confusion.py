@@ -5,7 +5,6 @@ Matrices of frames, sequences and processes can be added. Every figure is comput
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.counting import Labels, count_arrays, count_tensors
+from carlasc.metrics.counting import Labels, count_arrays, count_tensors, device_of
 
 Absent = Literal["zero", "skip"]
 
@@ -83,13 +82,26 @@ class ConfusionMatrix:
                 raise FormatError(
                     name, expected=f"the truth's shape {tuple(np.shape(truth))}", found=str(tuple(np.shape(array)))
                 )
-        device = next((d for array in (prediction, truth, mask) if (d := _device(array)) is not None), None)
+        device = device_of(prediction, truth, mask)
         if device is None:  # torch tensors on the CPU are NumPy arrays without a copy
             known = None if mask is None else np.asarray(mask)
             self.counts += count_arrays(np.asarray(prediction), np.asarray(truth), known, self.num_classes)
         else:
             self.counts += count_tensors(device, prediction, truth, mask, self.num_classes)
         return self
+
+    def reset(self) -> None:
+        """Set all counts to zero."""
+        self.counts[:] = 0
+
+    def merge(self, other: ConfusionMatrix) -> Self:
+        """Add what another matrix has counted, in any order; the same as `+=`."""
+        self += other
+        return self
+
+    def compute(self) -> dict[str, float]:
+        """Return the usual figures by name: `miou`, `accuracy`, and `precision`, `recall` and `iou` of occupied space."""
+        return {"miou": self.miou, "accuracy": self.accuracy, **vars(self.completeness())}
 
     def __iadd__(self, other: ConfusionMatrix) -> Self:
         if (other.num_classes, other.free) != (self.num_classes, self.free):
@@ -201,9 +213,3 @@ def _ratio(numerator: Any, denominator: Any) -> NDArray[np.float64]:
     """Divide; NaN where the denominator is zero."""
     numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
     return np.divide(numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0)
-
-
-def _device(array: Labels | None) -> Any:
-    """Return the device of a tensor that is not on the CPU, else None; torch is not imported to find out."""
-    torch = sys.modules.get("torch")
-    return array.device if torch and isinstance(array, torch.Tensor) and array.device.type != "cpu" else None

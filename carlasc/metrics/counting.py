@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numba
@@ -16,6 +17,18 @@ if TYPE_CHECKING:
     Labels = NDArray[Any] | torch.Tensor
 else:
     Labels = Any
+
+
+def device_of(*arrays: Any) -> Any:
+    """Return the device of the first torch tensor that is not on the CPU, None without one; torch is not imported to find out."""
+    torch = sys.modules.get("torch")
+    tensors = [array for array in arrays if torch and isinstance(array, torch.Tensor) and array.device.type != "cpu"]
+    return tensors[0].device if tensors else None
+
+
+def to_numpy(array: Any) -> NDArray[Any]:
+    """Return a NumPy array, or a torch tensor from any device, as a NumPy array."""
+    return np.asarray(array.detach().cpu() if hasattr(array, "detach") else array)
 
 
 def count_arrays(

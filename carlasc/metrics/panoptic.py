@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics.counting import to_numpy
 
 Variant = Literal["standard", "pasco"]
 _SLOTS = 256  # of the tables of latest segments and pairs; a power of two
@@ -118,15 +119,15 @@ class PanopticQuality:
         """
         sides = []
         for name, side in (("prediction", prediction), ("truth", truth)):
-            classes, ids = (np.asarray(array).reshape(-1) for array in side)
-            if classes.shape != ids.shape or classes.shape != np.asarray(truth[0]).reshape(-1).shape:
+            classes, ids = (to_numpy(array).reshape(-1) for array in side)
+            if classes.shape != ids.shape or classes.shape != to_numpy(truth[0]).reshape(-1).shape:
                 raise FormatError(
                     name,
                     expected="classes and instances of the truth's shape",
                     found=f"{classes.shape} and {ids.shape}",
                 )
             sides.append((classes, ids))
-        counted = None if mask is None else np.asarray(mask, np.bool_).reshape(-1)
+        counted = None if mask is None else to_numpy(mask).astype(np.bool_).reshape(-1)
         if counted is not None:
             sides = [(classes[counted], ids[counted]) for classes, ids in sides]
         for name, (classes, _) in zip(("prediction", "truth"), sides, strict=True):

@@ -17,6 +17,7 @@ from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.casting import cast_rays, rayiou_directions
+from carlasc.metrics.counting import device_of, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
@@ -119,8 +120,8 @@ class RayIoU:
         """Add a frame.
 
         Args:
-            prediction: (X, Y, Z) class ids.
-            truth: (X, Y, Z) class ids.
+            prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of a tensor.
+            truth: (X, Y, Z) class ids, likewise.
             spec: geometry of both, Cartesian.
             origins: (O, 3) metres, where rays start (see `ray_origins`).
             known: (X, Y, Z) bool, voxels of the truth that were evaluated; only used with `skip_unknown`.
@@ -133,13 +134,14 @@ class RayIoU:
             ArgumentError: the grid is cylindrical, or `skip_unknown` was asked for and `known` is missing.
         """
         pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
+        device = device_of(prediction, truth)
         grids = [pred, true]
         if self.skip_unknown:
             if known is None:
                 raise ArgumentError("known", expected="the truth's known voxels", found="None")
             seen = np.asarray(known, np.bool_)
             grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))  # unknown voxels stop a ray here
-        voxels, depths = cast_rays(np.stack(grids), spec, np.asarray(origins), self.directions, free=self.free)
+        voxels, depths = self._cast(np.stack(grids), spec, np.asarray(origins), device)
         valid = voxels[1] >= 0
         if self.skip_unknown:
             valid &= voxels[2] == voxels[1]
@@ -153,6 +155,20 @@ class RayIoU:
         for row, threshold in enumerate(self.thresholds_m):
             self.hits[row] += np.bincount(flat_true[same & (off < threshold)], minlength=self.num_classes)
         return self
+
+    def _cast(
+        self, grids: NDArray[Any], spec: GridSpec, origins: NDArray[np.floating], device: Any
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Cast the rays on the device of the tensors that were given; on the CPU in compiled code."""
+        if device is None:
+            return cast_rays(grids, spec, origins, self.directions, free=self.free)
+        import torch
+
+        from carlasc.metrics.tensor_casting import cast_rays_on_device
+
+        on_device = torch.from_numpy(grids.astype(np.int32)).to(device)
+        voxels, depths = cast_rays_on_device(on_device, spec, origins, self.directions, free=self.free)
+        return voxels.cpu().numpy(), depths.cpu().numpy()
 
     def compute(self) -> RayScore:
         """Return the score of everything that was added."""
@@ -179,7 +195,7 @@ class RayIoU:
         return self
 
     def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> NDArray[Any]:
-        array = np.asarray(labels)
+        array = to_numpy(labels)
         if array.shape != spec.size:
             raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
         if array.dtype.kind not in "ui" or (array.size and (array.min() < 0 or array.max() >= self.num_classes)):
@@ -227,7 +243,7 @@ class RayPQ:
             spec: geometry of both, Cartesian.
             origins: (O, 3) metres, where rays start (see `ray_origins`).
         """
-        (pred, pred_ids), (true, true_ids) = ([np.asarray(a) for a in side] for side in (prediction, truth))
+        (pred, pred_ids), (true, true_ids) = ([to_numpy(a) for a in side] for side in (prediction, truth))
         voxels, depths = cast_rays(np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free)
         valid = (voxels[1] >= 0) & (true.reshape(-1)[voxels[1]] != self.free)
         near, far = voxels[0][valid], voxels[1][valid]

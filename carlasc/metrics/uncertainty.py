@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics.counting import to_numpy
 
 _BINS = 15
 _TOLERANCE = 1e-3  # how far the probabilities of a voxel may be from summing to one: half precision gives 5e-4
@@ -99,13 +100,13 @@ class Uncertainty:
         Raises:
             FormatError: shapes differ, or probabilities do not sum to one.
         """
-        prob = np.asarray(probabilities.detach().cpu() if hasattr(probabilities, "detach") else probabilities)
-        target = np.asarray(truth)
+        prob = to_numpy(probabilities)
+        target = to_numpy(truth)
         if prob.shape != (*target.shape, self.num_classes):
             raise FormatError(
                 "probabilities", expected=f"shape {(*target.shape, self.num_classes)}", found=str(prob.shape)
             )
-        counted = np.ones(target.shape, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+        counted = np.ones(target.shape, np.bool_) if mask is None else to_numpy(mask).astype(np.bool_)
         prob, target = prob[counted].astype(np.float64), target[counted]
         off = np.abs(prob.sum(axis=1) - 1)
         if not (off <= _TOLERANCE).all() or (prob < 0).any():

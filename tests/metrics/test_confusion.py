@@ -156,3 +156,16 @@ def test_metrics_of_arrays_do_not_import_torch():
         "ConfusionMatrix(2).update(a, a); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_matrix_is_reset_merged_and_computed_as_every_metric_is():
+    pred, target, mask = labels_and_mask(7)
+    whole = ConfusionMatrix(K).update(pred, target, mask)
+    merged = ConfusionMatrix(K).merge(whole).merge(whole)
+    assert merged.total == 2 * whole.total
+    found = merged.compute()
+    assert found == {"miou": whole.miou, "accuracy": whole.accuracy} | {
+        name: getattr(whole.completeness(), name) for name in ("precision", "recall", "iou")
+    }
+    merged.reset()
+    assert merged == ConfusionMatrix(K)
