@@ -85,10 +85,10 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
                 where,
                 expected="a rigid transform",
                 found=f"one off by {deviation:.3g}",
-                advice="scaled, sheared or not a pose",
+                advice="it is scaled or sheared, or is not a pose",
             )
         if np.linalg.det(rotation) < 0:
             raise FormatError(
-                where, expected="a rotation", found="a reflection (determinant -1)", advice="mirrored axes"
+                where, expected="a rotation", found="a reflection (determinant -1)", advice="the axes may be mirrored"
             )
     return poses

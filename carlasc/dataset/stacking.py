@@ -1,8 +1,8 @@
 """Scans to dense arrays: compiled code that transforms, bins and counts points in one pass, and maps labels in another.
 
-The rules are those of `GridSpec` (`to_axes`, `index`): every voxel is the same, for where quicker arithmetic could be in doubt the rules
-themselves are followed. A scan is
-worked through in blocks that stay in the cache: the columns are split, and the rest vectorises. Loading this module loads Numba.
+The rules are those of `GridSpec` (`to_axes`, `index`), and every voxel is the same: points whose voxel the fast arithmetic could get
+wrong are placed by the rules themselves. A scan is processed in blocks that stay in the cache: the columns are split first, and the
+other steps vectorise. Loading this module loads Numba.
 """
 
 from __future__ import annotations

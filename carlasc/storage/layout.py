@@ -95,13 +95,15 @@ class Field:
         size = len(data)
         if shape is not None and size != dtype.itemsize * int(np.prod(shape)):
             expected = f"{dtype.itemsize * int(np.prod(shape))} bytes ({' x '.join(map(str, shape))} {dtype.name})"
-            raise FormatError(where, expected=expected, found=str(size), advice="cut short, or of another grid")
+            raise FormatError(
+                where, expected=expected, found=str(size), advice="the file is cut short, or belongs to another grid"
+            )
         if size % row:
             raise FormatError(
                 where,
                 expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} per row)",
                 found=str(size),
-                advice="cut short?",
+                advice="the file may be cut short",
             )
         array = np.frombuffer(data, dtype)
         if shape is not None:

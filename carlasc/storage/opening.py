@@ -125,7 +125,7 @@ def _open_file(tree: Tree, name: str) -> Source:
         signature = bytes(tree.read_range(name, 0, _SIGNATURE))
     except FormatError as error:
         raise FormatError(
-            where, expected="a zip or a packed store", found="a file of a few bytes", advice="cut short?"
+            where, expected="a zip or a packed store", found="a file of a few bytes", advice="the file may be cut short"
         ) from error
     if signature.startswith((_ZIP, _EMPTY_ZIP)):
         inside = ZipTree(tree, name)
