@@ -54,7 +54,7 @@ class CommandGroup(TyperGroup):
                 typer.echo(f"carlasc: {_replace_arguments(message, self._options(ctx))}", err=True)
             fail(str(error))
         except KeyboardInterrupt:
-            fail("interrupted: files written so far are complete; run the same command again to go on", INTERRUPTED)
+            fail("interrupted: files written so far are complete; run the same command again to continue", INTERRUPTED)
         except BrokenPipeError:  # `carlasc info | head`
             sys.stderr.close()
             raise typer.Exit(FAILED) from None

@@ -112,7 +112,7 @@ class Recording(ABC):
         """Return (F, 4, 4) world_T_sensor by frame number, right-handed; None if the recording has no poses.
 
         Args:
-            force: go on without a calibration that the poses need.
+            force: continue without a calibration that the poses need.
 
         Raises:
             FormatError: a file does not hold what it must.

@@ -1,6 +1,6 @@
 """Class tables: the ids, names, colours and roles of classes, and the remaps from one table to another.
 
-Facts: see the format page, `docs/format.md#classes` (CarlaSC, CARLA's renumbering) and `docs/format.md#semantickitti`.
+See the format page, `docs/format.md#classes` (CarlaSC, and the renumbering in CARLA) and `docs/format.md#semantickitti`.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _MAX_ID = 65535  # ids are kept in 16 bits in memory
 class ClassTable:
     """A set of classes: the name, the colour and the roles of each id.
 
-    On points, id 0 is unlabelled; in voxels it is free. It has no role.
+    Id 0 means unlabelled for points and free for voxels. It has no role.
 
     Attributes:
         name: name of the table, as carlasc.json gives it.
         names: id -> name.
         colors: id -> RGB 0..255.
-        moving: ids whose label itself says that the thing moves.
-        movable: ids of things that may move, whether they do or not.
-        deformable: ids of things that change their shape as they move: people.
-        ground: ids of the surfaces that things stand on: roads, pavements, grass, water.
-        geometry_only: id that points count as where a scan has no labels; None takes the largest id.
-        num_channels: number of vote channels: ids are below it. More than the ids need where the format says so.
+        moving: ids of classes that contain only moving objects.
+        movable: ids of classes of objects that can move.
+        deformable: ids of classes of objects that change their shape while they move, such as people.
+        ground: ids of classes of ground surfaces, such as roads, pavements, grass and water.
+        geometry_only: id that the points of a scan without labels get; None takes the largest id.
+        num_channels: number of vote channels, which is greater than every id. It may be greater than necessary if the format requires it.
 
     Raises:
-        ArgumentError: an id without a name or a colour, or values of another type or range.
+        ArgumentError: an id has no name or no colour, or a value has the wrong type or range.
     """
 
     name: str
@@ -77,10 +77,10 @@ class ClassTable:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], where: str) -> Self:
-        """Read a table as `to_dict` writes it; `where` is the file named in errors.
+        """Return the table for values as `to_dict` returns them; `where` is the file named in errors.
 
         Raises:
-            FormatError: a key is missing, unknown or of another type, or the values make no table.
+            FormatError: a key is missing or unknown, or a value is not valid.
         """
         known = [entry.name for entry in fields(cls)]
         if unknown := sorted(set(values) - set(known)):
@@ -108,7 +108,7 @@ class ClassTable:
             ) from error
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the table as plain values for JSON; roles that no class has are left out."""
+        """Return the table as plain values for JSON, without the roles that no class has."""
         values: dict[str, Any] = {
             "name": self.name,
             "names": {str(index): name for index, name in self.names.items()},
@@ -120,12 +120,12 @@ class ClassTable:
 
     @property
     def geometry_id(self) -> int:
-        """The id that points count as where a scan has no labels."""
+        """The id that the points of a scan without labels get."""
         return max(self.names) if self.geometry_only is None else self.geometry_only
 
     @property
     def dtype(self) -> np.dtype[np.unsignedinteger]:
-        """The smallest unsigned type that holds every id: uint8, or uint16 where ids go over 255 (never wrapped)."""
+        """The smallest unsigned type that holds every id: uint8, or uint16 if there are more than 256 vote channels."""
         return np.dtype(np.uint8 if self.num_channels <= 256 else np.uint16)
 
     @cached_property
@@ -137,7 +137,7 @@ class ClassTable:
         return palette
 
     def id_of(self, name: str) -> int:
-        """Return the id of a class by name, in any case.
+        """Return the id of a class by its name, ignoring upper and lower case.
 
         Raises:
             ArgumentError: no class has that name.
@@ -152,7 +152,7 @@ class ClassTable:
         )
 
     def check(self, labels: NDArray[np.integer], where: str) -> None:
-        """Raise FormatError naming the largest id that is not below `num_channels`; `where` is the file."""
+        """Raise a FormatError if an id is negative or not below `num_channels`; `where` is the file named in the message."""
         if labels.size and (int(labels.max()) >= self.num_channels or int(labels.min()) < 0):
             bad = int(labels.max()) if int(labels.max()) >= self.num_channels else int(labels.min())
             count = int(np.count_nonzero(labels == bad))
@@ -168,10 +168,10 @@ class Remap:
     """A mapping from the ids of one table to those of another.
 
     Attributes:
-        name: what the command line and Dataset call it.
-        source: table of the ids going in.
-        target: table of the ids coming out.
-        mapping: id -> id.
+        name: name of the remap on the command line and in `Dataset`.
+        source: class table of the input ids.
+        target: class table of the output ids.
+        mapping: input id -> output id.
     """
 
     name: str
@@ -191,30 +191,30 @@ class Remap:
 
     @cached_property
     def table(self) -> NDArray[np.int32]:
-        """Lookup table over 0..max id, -1 for ids that the mapping does not know."""
+        """Lookup table for 0..max id, -1 for ids that are not in the mapping."""
         table = np.full(max(self.mapping) + 1, -1, np.int32)
         table[list(self.mapping)] = list(self.mapping.values())
         return table
 
     @cached_property
     def _lookup(self) -> NDArray[np.unsignedinteger]:
-        """The table in the target's own type, unknown ids as 0: used only once the ids have been checked."""
+        """The lookup table in the dtype of the target, with 0 for unknown ids. It is used only after the ids have been checked."""
         return np.where(self.table < 0, 0, self.table).astype(self.target.dtype)
 
     def unknown(self, labels: NDArray[np.integer]) -> dict[int, int]:
-        """Return the ids that the mapping does not know, each with its number of occurrences."""
+        """Return the number of occurrences of each id that is not in the mapping."""
         ids, counts = np.unique(labels, return_counts=True)
         return {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping}
 
     def __call__(self, labels: NDArray[np.integer], where: str = "labels") -> NDArray[np.unsignedinteger]:
-        """Return new labels in the target's dtype; the input is left as it is.
+        """Return the remapped labels in the dtype of the target. The input is not changed.
 
         Args:
-            labels: any shape, ids of the source table.
-            where: what to call the labels in an error: the file.
+            labels: ids of the source table, any shape.
+            where: the file named in errors.
 
         Raises:
-            FormatError: an id has no target; names the ids and the number of their occurrences.
+            FormatError: an id has no target; the message names these ids and the number of their occurrences.
         """
         labels = np.asarray(labels)
         outside = bool(labels.size) and (int(labels.max()) >= len(self.table) or int(labels.min()) < 0)
@@ -236,15 +236,15 @@ class Remap:
 def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None) -> NDArray[np.float64]:
     """Return the loss weight of each class: `1 / ln(count + 0.001)`.
 
-    The formula holds for counts above 1,000 and is negative below 1. Classes with fewer voxels take the largest of the other
-    weights, absent classes take 0. See the format page, `docs/format.md#classes`.
+    The formula is used for counts above 1,000 (it is negative for counts below 1). Classes with fewer voxels get the largest of the
+    other weights, and classes without voxels get 0. See the format page, `docs/format.md#classes`.
 
     Args:
-        voxel_counts: voxels of each class, by id of the remap's source table.
-        remap: sums the counts over the target's classes first; None leaves them.
+        voxel_counts: number of voxels of each class, by id of the source table of the remap.
+        remap: the counts are first summed over the classes of its target; None leaves them unchanged.
 
     Returns:
-        (K,) float64 weights by target id.
+        (K,) float64 weights, by id of the target.
     """
     counts: NDArray[np.float64] = np.asarray(voxel_counts, np.float64)
     if remap is not None:

@@ -1,4 +1,4 @@
-"""Rigid transforms. A transform named `dst_T_src` takes points of frame `src` to frame `dst`: `R @ p + t`."""
+"""Rigid transforms. A transform named `dst_T_src` converts points from frame `src` to frame `dst`: `R @ p + t`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Transform = NDArray[np.float64]
 
 
 def rotation_z(yaw_rad: float) -> Transform:
-    """Return the (4, 4) rotation by `yaw_rad` about z, taking x towards y."""
+    """Return the (4, 4) rotation by `yaw_rad` about z. A positive angle turns x towards y."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
 
@@ -25,7 +25,7 @@ def translation(xyz: ArrayLike) -> Transform:
 
 
 def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Take points from frame `src` to frame `dst`.
+    """Transform points from frame `src` to frame `dst`.
 
     Args:
         dst_T_src: (4, 4) rigid transform.
@@ -38,12 +38,12 @@ def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDAr
 
 
 def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Turn (..., 3) vectors (velocities, normals) from frame `src` to frame `dst`: no translation."""
+    """Rotate (..., 3) vectors, such as velocities and normals, from frame `src` to frame `dst`, without translation."""
     return np.asarray(vectors, np.float64) @ dst_T_src[:3, :3].T
 
 
 def invert(dst_T_src: Transform) -> Transform:
-    """Return `src_T_dst` of one (4, 4) or many (..., 4, 4) rigid transforms, by the transposed rotation."""
+    """Return the inverse `src_T_dst` of one (4, 4) or many (..., 4, 4) rigid transforms, from the transposed rotation."""
     rotation = np.swapaxes(dst_T_src[..., :3, :3], -1, -2)
     src_T_dst = np.zeros_like(dst_T_src, dtype=np.float64)
     src_T_dst[..., :3, :3] = rotation
@@ -62,14 +62,14 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
 
     Args:
         transforms: (4, 4) or (F, 4, 4).
-        name: what to call them in the error: a file, an argument.
+        name: name of the transforms in errors: a file or an argument.
         tolerance: greatest deviation of `R @ R.T` from the identity, and of the last row from 0 0 0 1.
 
     Returns:
         The same transforms as float64.
 
     Raises:
-        FormatError: names the first transform that is not rigid and what is wrong with it.
+        FormatError: a transform is not rigid; the message names the first one and the reason.
     """
     poses = np.asarray(transforms, np.float64)
     if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
@@ -85,10 +85,10 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
                 where,
                 expected="a rigid transform",
                 found=f"one off by {deviation:.3g}",
-                advice="scaled, sheared or not a pose",
+                advice="it is scaled or sheared, or is not a pose",
             )
         if np.linalg.det(rotation) < 0:
             raise FormatError(
-                where, expected="a rotation", found="a reflection (determinant -1)", advice="mirrored axes"
+                where, expected="a rotation", found="a reflection (determinant -1)", advice="the axes may be mirrored"
             )
     return poses

@@ -1,4 +1,4 @@
-"""Voxel grids: where their cells lie (GridSpec) and what is in them (Grid).
+"""Voxel grids: the geometry of their cells (GridSpec) and the content of the cells (Grid).
 
 Axes are x, y, z in a Cartesian grid and radius, azimuth = atan2(y, x), z in a cylindrical one; points are Cartesian in both.
 """
@@ -34,7 +34,7 @@ class GridSpec:
         upper: upper bound per axis.
 
     Raises:
-        ArgumentError: sizes or bounds that make no grid.
+        ArgumentError: the sizes or bounds are not those of a grid.
     """
 
     coordinates: Coordinates
@@ -87,10 +87,10 @@ class GridSpec:
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], where: str = "params.json") -> GridSpec:
-        """Read the keys of a params.json, numbers as they stand; `where` is the file named in errors.
+        """Return the grid that the keys of a params.json describe, with unchanged numbers; `where` is the file named in errors.
 
         Raises:
-            FormatError: a key is missing or makes no grid.
+            FormatError: a key is missing, or the values are not those of a grid.
         """
         try:
             size = [float(v) for v in params["grid_size"]]
@@ -111,7 +111,7 @@ class GridSpec:
             raise FormatError(where, problem=str(error)) from error
 
     def to_params(self, num_channels: int = 25) -> dict[str, Any]:
-        """Return the five published keys of params.json; sizes are written as floats, as there."""
+        """Return the five published keys of params.json. Sizes are floats, as in the published files."""
         return {
             "grid_size": [float(n) for n in self.size],
             "min_bound": list(self.lower),
@@ -121,11 +121,11 @@ class GridSpec:
         }
 
     def with_size(self, size: Sequence[int]) -> GridSpec:
-        """Return a grid of `size` cells with exactly these bounds."""
+        """Return a grid with the same bounds and `size` cells."""
         return replace(self, size=cast(tuple[int, int, int], tuple(size)))
 
     def with_bounds(self, lower: Sequence[float], upper: Sequence[float]) -> GridSpec:
-        """Return the grid with other bounds, rounded to float32 as the published ones are."""
+        """Return the grid with other bounds, rounded to float32 like the published bounds."""
         return replace(
             self,
             lower=cast(Triple, tuple(_float32(v) for v in lower)),
@@ -135,9 +135,10 @@ class GridSpec:
     def with_resolution(self, resolution: float | Sequence[float]) -> GridSpec:
         """Return a grid of cells of the given size that covers these bounds (the rule of `--res`).
 
-        With w a bounds' width, the cells are n = w/R where that is within 1e-4 of an integer, else the next integer above. The bounds
-        grow to n R: about the centre for x and y, upwards from the lower one for z and the radius. Azimuth keeps its
-        bounds. In a cylindrical grid a single R is radial and vertical, and azimuth keeps the published proportion.
+        Let w be the width of the bounds along an axis. The number of cells n is w / R, rounded to the nearest integer if it is
+        within 1e-4 of it, otherwise rounded up. The bounds grow to n R: symmetrically about the centre for x and y, upwards from the
+        lower bound for z and the radius. The bounds of the azimuth do not change. In a cylindrical grid, a single R applies to the
+        radius and to z, and the azimuth keeps the published proportion.
 
         Args:
             resolution: metres, or one value per axis (cylindrical: metres, radians, metres).
@@ -189,13 +190,13 @@ class GridSpec:
         return np.where(exact, upper - lower, rounded) / np.array(self.size, np.float64)
 
     def to_axes(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Take Cartesian points to the grid's axes: themselves, or radius, azimuth, z.
+        """Convert Cartesian points to the axes of the grid: unchanged in a Cartesian grid, otherwise radius, azimuth, z.
 
-        An azimuth that leaves the bounds comes back by a whole turn where that lands inside: so exactly +pi falls in the
-        first cell where the upper bound is pi.
+        An azimuth outside the bounds is changed by a full turn if it is then inside. An azimuth of exactly +pi is therefore in the
+        first cell if the upper bound is pi.
 
         Args:
-            points: (N, 3) metres, the grid's frame.
+            points: (N, 3) metres, in the frame of the grid.
 
         Returns:
             (N, 3), same dtype.
@@ -212,14 +213,14 @@ class GridSpec:
         )
 
     def from_axes(self, axes: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Take (..., 3) coordinates on the grid's axes back to Cartesian points."""
+        """Convert (..., 3) coordinates on the axes of the grid to Cartesian points."""
         if self.coordinates == "cartesian":
             return axes
         radius, azimuth, z = np.moveaxis(axes, -1, 0)
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
     def index(self, axes: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Find the cell of points given on the grid's axes: half-open, floor, clip; see `docs/format.md#cells`.
+        """Return the cells of points that are given on the axes of the grid: half-open, floor, clip; see `docs/format.md#cells`.
 
         Args:
             axes: (N, 3) as `to_axes` returns.
@@ -233,7 +234,7 @@ class GridSpec:
         return np.clip(cells, 0, np.array(self.size) - 1).astype(np.int32), inside
 
     def flat_index(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Return the C-order index of the voxel of each Cartesian point (N, 3), -1 outside: to_axes, index, ravel."""
+        """Return the C-order index of the voxel of each Cartesian point (N, 3), -1 for points outside: `to_axes`, `index`, ravel."""
         cells, inside = self.index(self.to_axes(points))
         return np.where(inside, np.ravel_multi_index(tuple(cells.T), self.size), -1)
 
@@ -252,15 +253,15 @@ class GridSpec:
 
 @dataclass(frozen=True)
 class Grid:
-    """What is in the cells of a grid.
+    """The labels and the counts of the cells of a grid.
 
     Attributes:
-        spec: where the cells lie.
-        labels: (X, Y, Z) unsigned integer classes, 0 is free, and also where unknown.
-        counts: (X, Y, Z) number of votes, 0 means unknown: never evaluated. None where a grid has no counts.
+        spec: geometry of the cells.
+        labels: (X, Y, Z) unsigned integer class ids. 0 is free space, and also unknown space.
+        counts: (X, Y, Z) number of votes. 0 means unknown (never evaluated). None if the grid has no counts.
 
     Raises:
-        FormatError: shapes do not fit the spec.
+        FormatError: the shape of an array is not the size of the spec.
     """
 
     spec: GridSpec
@@ -274,7 +275,7 @@ class Grid:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(X, Y, Z) bool: voxels with a vote; all of them where there are no counts."""
+        """(X, Y, Z) bool: voxels with at least one vote; all voxels if the grid has no counts."""
         return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
 
 
@@ -283,6 +284,6 @@ def _float32(value: float) -> float:
 
 
 def _cells(width: float, step: float) -> int:
-    """Number of cells of `step` that cover `width`: as exact as the format's float32 bounds allow."""
+    """Return the number of cells of size `step` that cover `width`. The tolerance accounts for the float32 bounds of the format."""
     ratio = width / step
     return max(1, round(ratio) if abs(ratio - round(ratio)) <= 1e-4 else math.ceil(ratio))

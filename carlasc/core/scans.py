@@ -22,10 +22,10 @@ class Scan:
         flow: (N, 3) float32 m/s, velocity of the actor hit, sensor frame, ego motion removed; or None.
         instances: (N,) uint32 actor ids, 0 is none; or None.
         remission: (N,) float32, the 4th column of the file (zero in CarlaSC); or None.
-        others: further fields of the layout with a row per point, by name.
+        others: other fields of the layout with one row per point, by name.
 
     Raises:
-        FormatError: the shapes do not fit each other.
+        FormatError: the shapes of the arrays do not match.
     """
 
     points: NDArray[np.float32]
@@ -52,7 +52,7 @@ class Scan:
         return len(self.points)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
-        """Return the points chosen by a mask or by indices, with all of their fields."""
+        """Return the points that a mask or indices select, with all of their fields."""
 
         def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if values is None else values[keep]
@@ -68,7 +68,7 @@ class Scan:
 
 
 def check_finite(points: NDArray[np.floating], name: str) -> None:
-    """Raise FormatError naming the first point that is NaN or infinite; `name` is the file."""
+    """Raise a FormatError that names the first point that is NaN or infinite; `name` is the file."""
     if not np.isfinite(points).all():
         row = int(np.flatnonzero(~np.isfinite(points).reshape(len(points), -1).all(axis=1))[0])
         raise FormatError(name, expected="finite coordinates", found=f"{points[row].tolist()} at point {row}")

@@ -120,7 +120,7 @@ SEMANTICKITTI19 = ClassTable(
 
 
 def _ranges(table: str) -> dict[int, int]:
-    """Read "1->7 14..19->10 12,13->4" as a mapping."""
+    """Return the mapping that a text such as "1->7 14..19->10 12,13->4" describes."""
     mapping: dict[int, int] = {}
     for entry in table.split():
         left, right = entry.split("->")
@@ -167,7 +167,7 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
     {
         remap.name: remap
         for remap in (
-            # Ids 23 and 24 exist only as vote channels: no class of the paper's table maps them.
+            # Ids 23 and 24 exist only as vote channels; the table in the paper has no class for them.
             Remap("carlasc11", CARLA, CARLASC11, {i: k for i, (_, _, k) in enumerate(_CARLA)}),
             Remap("semantickitti19", SEMANTICKITTI, SEMANTICKITTI19, {i: k for i, _, _, k in _KITTI}),
             Remap(
@@ -189,7 +189,7 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
                 ),
             ),
             Remap("semanticposs_to_carla", SEMANTICPOSS, CARLA, _POSS_TO_CARLA),
-            Remap(  # tags of CARLA 0.9.14 and later; before, the ids are those of CARLA above
+            Remap(  # tags of CARLA 0.9.14 and later; those of earlier versions are the ids of the table CARLA above
                 "carla0914_to_carla",
                 ClassTable(
                     "carla0.9.14", {i: f"tag {i}" for i in range(29)}, dict.fromkeys(range(29), (128, 128, 128))
@@ -214,14 +214,14 @@ TRAIN_VOXEL_COUNTS = np.array(
     ],
     np.int64,
 )  # fmt: skip
-"""(23,) voxels of each CARLA class in the training split, coarse Cartesian grid."""
+"""(23,) number of voxels of each CARLA class in the training split, in the coarse Cartesian grid."""
 
 
 def table_named(name: str) -> ClassTable:
-    """Return one of the class tables in `TABLES` by its name.
+    """Return the class table with a name in `TABLES`.
 
     Raises:
-        FormatError: no table has that name.
+        FormatError: no table has this name.
     """
     if name not in TABLES:
         raise FormatError("classes", expected=f"one of {', '.join(TABLES)}", found=repr(name))
@@ -229,14 +229,14 @@ def table_named(name: str) -> ClassTable:
 
 
 def table_from_json(value: object, where: str) -> ClassTable:
-    """Return the class table that a JSON file names, or holds whole.
+    """Return the class table that a JSON file names or contains.
 
     Args:
         value: the name of a table in `TABLES`, or what `ClassTable.to_dict` returns.
         where: the file, for errors.
 
     Raises:
-        FormatError: no table has that name, the values make no table, or they differ from those of the table in `TABLES` of that name.
+        FormatError: no table has this name, the values are not those of a table, or a table in `TABLES` has the same name and other values.
     """
     if not isinstance(value, Mapping):
         try:
@@ -256,15 +256,15 @@ def table_from_json(value: object, where: str) -> ClassTable:
 
 
 def table_to_json(table: ClassTable) -> str | dict[str, Any]:
-    """Return what a JSON file holds for a class table: the name of one in `TABLES`, any other table whole."""
+    """Return what a JSON file contains for a class table: its name if it is in `TABLES`, otherwise the whole table."""
     return table.name if TABLES.get(table.name) == table else table.to_dict()
 
 
 def remap_named(name: str) -> Remap:
-    """Return a remap by name.
+    """Return the remap with a name in `REMAPS`.
 
     Raises:
-        ArgumentError: no remap has that name.
+        ArgumentError: no remap has this name.
     """
     if name not in REMAPS:
         raise ArgumentError("remap", expected=f"one of {', '.join(REMAPS)}", found=repr(name))
@@ -272,10 +272,10 @@ def remap_named(name: str) -> Remap:
 
 
 def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
-    """Return the remaps that lead from one table to another: none, one, or two with CARLA's table between them.
+    """Return the remaps to apply, in order, to convert ids of one table to another: none, one, or two by way of the table CARLA.
 
     Raises:
-        ArgumentError: no remaps lead there.
+        ArgumentError: there are no such remaps.
     """
 
     def direct(one: ClassTable, other: ClassTable) -> Remap | None:
@@ -301,13 +301,13 @@ def to_table(
 
     Args:
         labels: ids of `source`.
-        source: their table.
-        target: the table wanted.
-        where: file or field, for the error message.
+        source: class table of the labels.
+        target: class table of the result.
+        where: the file or field named in errors.
 
     Raises:
-        ArgumentError: no remaps lead from one to the other.
-        FormatError: a label is not of `source`.
+        ArgumentError: no remaps convert `source` to `target`.
+        FormatError: a label is not an id of `source`.
     """
     for remap in remaps_between(source, target):
         labels = remap(labels, where)

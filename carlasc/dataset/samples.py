@@ -55,7 +55,7 @@ class Dataset(_MapStyle):
 
         occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the frame's own scan last
         density       (T, X, Y, Z) uint16, number of points per voxel
-        labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also stands for unknown
+        labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also unknown
         known         (X, Y, Z) bool, voxels that have a vote: leave the others out of losses and metrics
         counts        (X, Y, Z) float32, number of votes per voxel
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan

@@ -1,8 +1,8 @@
-"""Scans to dense arrays, fast: moved, binned and counted in one pass of compiled code, and labels looked up in another.
+"""Scans to dense arrays: compiled code that transforms, bins and counts points in one pass, and maps labels in another.
 
-The rules are those of `GridSpec` (`to_axes`, `index`): every voxel is the same, for where quicker arithmetic could be in doubt the rules
-themselves are followed. A scan is
-worked through in blocks that stay in the cache: the columns are split, and the rest vectorises. Loading this module loads Numba.
+The rules are those of `GridSpec` (`to_axes`, `index`), and every voxel is the same: points whose voxel the fast arithmetic could get
+wrong are placed by the rules themselves. A scan is processed in blocks that stay in the cache: the columns are split first, and the
+other steps vectorise. Loading this module loads Numba.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype
 
 
 def _geometry(spec: GridSpec) -> tuple[Any, ...]:
-    """Return what the quick arithmetic takes: lower bounds, cells per metre or radian, sizes, and how many cells it may be off."""
+    """Return the constants of the fast arithmetic: lower bounds, cells per metre or radian, sizes, and its largest error in cells."""
     voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
     # Rounding, the difference of voxel_size * size from the bounds, and the error of the azimuth.
     doubt = 1e-6 + 1e-7 * max(sizes)
@@ -83,19 +83,19 @@ def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the array as the one kind that the kernels are compiled for."""
+    """Return the array as the only type that the kernels are compiled for."""
     if array.flags.writeable:
         array = array.view()
         array.flags.writeable = False
     return array
 
 
-_step = numba.njit(nogil=True, inline="always")  # pasted into the loop over blocks: only there does it vectorise
+_step = numba.njit(nogil=True, inline="always")  # inlined into the loop over blocks; otherwise it does not vectorise
 
 
 @_step
 def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
-    """Take x, y and z of each point apart: two 64-bit words a point vectorise, four floats do not."""
+    """Split points into x, y and z. Reading two 64-bit words per point vectorises; reading four floats does not."""
     for n in range(len(words) // 2):
         xy, zw = words[2 * n], words[2 * n + 1]
         x[n] = np.uint32(xy).view(np.float32)
@@ -116,7 +116,7 @@ def _leave_out(x, y, z, count, near_squared, far_squared):  # type: ignore[no-un
     for n in range(count):
         squared = x[n] * x[n] + y[n] * y[n] + z[n] * z[n]
         if squared < near_squared or squared > far_squared:
-            x[n] = np.nan  # not a number is inside no grid
+            x[n] = np.nan  # NaN is outside every grid
 
 
 @_step
@@ -137,7 +137,7 @@ def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore
         angle = fast_azimuth(x[n], y[n])
         turned = angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
         angle = turned if (turned >= lower) & (turned < upper) else angle
-        azimuth[n] = angle if squared > 0 else lower  # at the origin: on an edge, so looked at again
+        azimuth[n] = angle if squared > 0 else lower  # a point at the origin is on an edge, so the exact rule decides
         radius[n] = np.sqrt(squared)
 
 
@@ -145,7 +145,8 @@ def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore
 def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def]
     """Write the flat index of each point's voxel given on the grid's axes: -1 outside, -2 where it is in doubt.
 
-    Three divisions a point would take half the time. So multiply, and doubt what comes near to a cell's edge.
+    Three divisions per point would take half of the time. The code multiplies instead, and marks points near the edge of a cell as
+    doubtful.
     """
     (l0, l1, l2), (w0, w1, w2), (s0, s1, s2), doubt = geometry
     clear = 0.5 - doubt
@@ -193,7 +194,7 @@ def _bin_block(x, y, z, radius, azimuth, found, count, rows, cells, geometry, ra
 
 
 def _compile(sources: int):  # type: ignore[no-untyped-def]
-    """Return the two functions below. They close over `sources`, so that a change of the cell rule compiles them again."""
+    """Return the two functions below. Their closure over `sources` invalidates the cache of Numba when the cell rule changes."""
 
     @cached
     def bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""How good a grid is: confusion and completeness, rays, segments, uncertainty, time; the conventions of the benchmarks; scores over data sets."""
+"""Scores of grids: confusion and completeness, rays, segments, uncertainty and time; the conventions of the benchmarks; scores over data sets."""
 
 from carlasc.metrics.casting import cast_rays, rayiou_directions
 from carlasc.metrics.comparison import Outcome, compare_grids

@@ -1,4 +1,4 @@
-"""Rays cast through voxel grids: what each ray meets first, and how far away. Compiled, on the CPU."""
+"""Casting rays through voxel grids: the first occupied voxel on each ray and its distance, in compiled code on the CPU."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ def cast_rays(
     *,
     free: int = 0,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Cast rays through grids of the same geometry: the voxel that each ray meets first.
+    """Cast rays through grids of the same geometry, and return the first occupied voxel on each ray.
 
-    The first voxel on the ray that is not free counts, the origin's own voxel included. A ray that meets nothing takes the last voxel
-    before it leaves the grid. A ray from outside the grid starts where it enters.
+    The first voxel on the ray that is not free is returned; it may be the voxel of the origin. If there is none, the last voxel before
+    the ray leaves the grid is returned. A ray that starts outside the grid begins at the point where it enters the grid.
 
     Args:
-        grids: (G, X, Y, Z) class ids; all grids are cast in one walk.
-        spec: their geometry, Cartesian.
-        origins: (O, 3) metres, the grid's frame.
-        directions: (R, 3) unit vectors, the grid's frame.
+        grids: (G, X, Y, Z) class ids; rays are cast through all grids in one pass.
+        spec: geometry of the grids, Cartesian.
+        origins: (O, 3) metres, in the frame of the grid.
+        directions: (R, 3) unit vectors, in the frame of the grid.
         free: the id of free space.
 
     Returns:
-        (G, O * R) flat index of the voxel that each ray takes, -1 where a ray never enters the grid; and (G, O * R) metres from the
-        origin to where the ray leaves that voxel. Rays stand origin by origin.
+        (G, O * R) flat index of the voxel of each ray, -1 if the ray does not enter the grid; and (G, O * R) distance in metres from
+        the origin to the point where the ray leaves that voxel. The rays of each origin are consecutive.
 
     Raises:
-        ArgumentError: the grid is cylindrical, or the shapes do not fit.
+        ArgumentError: the grid is cylindrical, or the shapes do not match.
     """
     if spec.coordinates != "cartesian":
         raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
@@ -139,7 +139,7 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _entry(start, step, size):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray from outside enters the grid, -1 where it never does."""
+    """Return the distance at which a ray from outside enters the grid, -1 if it does not enter the grid."""
     near, far = 0.0, np.inf
     for axis in range(3):
         if step[axis] == 0:

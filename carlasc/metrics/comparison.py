@@ -1,4 +1,4 @@
-"""Where a predicted grid is right and where it errs, voxel by voxel."""
+"""Comparison of a predicted grid with the ground truth, voxel by voxel."""
 
 from __future__ import annotations
 

@@ -173,7 +173,7 @@ class ConfusionMatrix:
 
         Args:
             with_free: include free space in the mean (CarlaSC's paper does, SemanticKITTI does not).
-            absent: how a class counts that is in neither the prediction nor the truth: "zero" (the paper and SemanticKITTI),
+            absent: value of a class that is in neither the prediction nor the truth: "zero" (the paper and SemanticKITTI),
                 or "skip", which leaves it out of the mean. The mean of no class is NaN.
 
         Raises:
@@ -186,7 +186,7 @@ class ConfusionMatrix:
 
     @property
     def accuracy(self) -> float:
-        """Share of the voxels whose prediction is right; NaN if no voxel was counted."""
+        """Share of the voxels that are predicted correctly; NaN if no voxel was counted."""
         return float(_ratio(np.trace(self.counts), self.counts.sum()))
 
     def completeness(self) -> Completeness:

@@ -1,6 +1,6 @@
-"""What a score means: which voxels count, in which classes, over which of them the mean is taken. One convention per benchmark.
+"""Conventions of scores: which voxels count, in which classes, and over which classes the mean is taken. Each benchmark has one.
 
-Papers differ in all of these, and a score without the name of its convention cannot be compared with another.
+Papers differ in all of these. A score without the name of its convention therefore cannot be compared with another score.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import ConfusionMatrix
 
 IGNORED = -1
-"""Target of the classes that a convention leaves out: such a voxel of the truth does not count; predicted, it is free."""
+"""Target of the classes that a convention leaves out. Voxels with such a class in the truth do not count; predicted, it counts as free."""
 
-_LEFT_OUT, _UNKNOWN = 254, 255  # of the look-up tables; scored ids are below
+_LEFT_OUT, _UNKNOWN = 254, 255  # values in the look-up tables; the scored ids are smaller
 
 Absent = Literal["zero", "skip", "skip-truth", "nan"]
 
@@ -34,10 +34,10 @@ class ConventionScore:
     Attributes:
         miou: mean IoU over the convention's classes.
         class_iou: IoU of each class of the mean by name; NaN for a class in neither the prediction nor the truth.
-        precision: share of the voxels predicted as occupied that are.
-        recall: share of the occupied voxels that were predicted so.
-        iou: intersection over union of occupied voxels.
-        false_free: share of the occupied voxels that were predicted free: 1 - recall, the number that a planner asks for.
+        precision: share of the voxels predicted as occupied that are occupied.
+        recall: share of the occupied voxels that are predicted as occupied.
+        iou: intersection over union of the occupied voxels.
+        false_free: share of the occupied voxels that are predicted as free: 1 - recall.
     """
 
     miou: float
@@ -53,20 +53,21 @@ class Convention:
     """How a benchmark scores grids.
 
     Attributes:
-        name: what the command line and results call it.
-        title: the benchmark, for people.
+        name: name of the convention on the command line and in results.
+        title: readable name of the benchmark.
         classes: the scored classes.
         free: id of free space among them.
         averaged: ids over which the mean is taken.
         maps: name of a class table -> id -> scored id, or IGNORED.
-        usual_truth: the class table of true labels that do not name one: what the benchmark's own files hold.
-        usual_prediction: likewise of predictions.
-        seen_by: which of the data's masks says what is known: "lidar" or "camera".
-        unknown: what a voxel is that the truth never evaluated (count 0): "left out", or "free" where the benchmark cannot tell.
-        absent: what a class in neither the prediction nor the truth adds to the mean: "zero"; "skip": it is left out; "skip-truth": a
-            class absent from the truth is left out even where it was predicted; "nan": the mean is NaN.
+        usual_truth: class table of true labels whose files do not name one: that of the benchmark's own files.
+        usual_prediction: likewise for predictions.
+        seen_by: sensor whose mask says which voxels are known: "lidar" or "camera".
+        unknown: how voxels count that the truth never evaluated (count 0): "left out", or "free" if the benchmark does not distinguish
+            them from free voxels.
+        absent: how a class counts that is in neither the prediction nor the truth: "zero": as 0 in the mean; "skip": it is left out;
+            "skip-truth": a class that is not in the truth is left out even if it was predicted; "nan": the mean is NaN.
         epsilon: added to the denominator of each IoU.
-        notes: what else a reader must know, in one sentence.
+        notes: a further remark for readers of the scores, one sentence.
     """
 
     name: str
@@ -108,7 +109,7 @@ class Convention:
         known: NDArray[np.bool_] | None,
         region: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]:
-        """Bring a frame into the scored classes.
+        """Convert the labels of a frame to the scored classes.
 
         Args:
             prediction: labels of any shape, and the table of their ids.
@@ -175,7 +176,7 @@ class Convention:
 
     def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
         lookup = self._lookups[table.name]
-        beyond = len(lookup) - 1  # the last entry stands for every id beyond the table's
+        beyond = len(lookup) - 1  # the last entry is for all ids beyond those of the table
         found = lookup[labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)]
         if (unknown := found == _UNKNOWN).any():
             bad = int(labels[unknown][0])
@@ -351,7 +352,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OCC3D,
                 OCC3D,
                 absent="skip-truth",
-                notes="A class absent from the truth is left out of the mean even where it was predicted.",
+                notes="A class that is not in the truth is left out of the mean even if it was predicted.",
             ),
             Convention(
                 "occ3d-camera",
@@ -364,7 +365,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OCC3D,
                 absent="skip",
                 seen_by="camera",
-                notes="Data without cameras do not know which voxels one would see: there is no such score for them.",
+                notes="Data without cameras do not say which voxels a camera observed, so this score does not exist for them.",
             ),
             Convention(
                 "openoccupancy",
@@ -378,7 +379,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OPENOCCUPANCY,
                 unknown="free",
                 absent="nan",
-                notes="The benchmark has no mask: a voxel that nobody saw counts as empty, and a class that is absent makes the mean NaN.",
+                notes="The benchmark has no mask: an unobserved voxel counts as empty, and an absent class makes the mean NaN.",
             ),
         )
     }

@@ -1,4 +1,4 @@
-"""Counting pairs of classes: how often each class of the truth was predicted as each, for NumPy arrays and for torch tensors."""
+"""Counting how many voxels of each true class were predicted as each class, for NumPy arrays and torch tensors."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def count_tensors(
 
 
 def _in_range(labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int, name: str) -> NDArray[Any]:
-    """Return labels that are in 0..K-1 everywhere: ids outside are an error where they count, and 0 where they do not."""
+    """Return labels with all ids in 0..K-1. An id outside is an error in a voxel that counts, and becomes 0 in other voxels."""
     if not labels.size or (labels.max() < num_classes and (labels.dtype.kind != "i" or labels.min() >= 0)):
         return labels
     wrong = ((labels < 0) | (labels >= num_classes)) & counted

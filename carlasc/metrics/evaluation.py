@@ -50,27 +50,27 @@ def evaluate(
         source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a folder of `.label` files, or files of
             SemanticKITTI, SSCBench, Occ3D or OpenOccupancy.
         truth: the ground truth, likewise.
-        convention: the benchmark whose rules say which voxels count, in which classes, and how the mean is taken: a name in
-            `carlasc.metrics.CONVENTIONS`; "own" scores the data's own classes as they are. None: "carlasc" for class tables that it
-            has a map for, else "own".
+        convention: the benchmark whose rules are used: a Convention or a name in `carlasc.metrics.CONVENTIONS`. It says which voxels
+            count, in which classes, and how the mean is taken. "own" scores the unchanged classes of the data. None takes "carlasc"
+            for class tables that it has a map for, and "own" for others.
         grid: the grid that holds the predictions; None takes the name of the true grid, or the only grid of a sequence.
         truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
-        source_classes: name of the class table of the predictions, for data that do not name one. None takes what the convention's own
-            files hold.
-        voxels: "known" scores what the convention scores; "all" scores voxels that the truth never evaluated, too.
-        region: makes a mask of a GridSpec, such as `lambda spec: distance_band(spec, 0, 10)`: only voxels in it count.
-        by: break the score down by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
-        rays: also cast the rays of RayIoU; needs poses and a Cartesian grid.
+        source_classes: name of the class table of the predictions, for data that do not name one. None takes the class table of the
+            convention's own files.
+        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
+        region: function from a GridSpec to a mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in the mask count.
+        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
+        rays: also compute RayIoU; this needs poses and a Cartesian grid.
         frames: the frames that are scored; None scores all frames of the ground truth.
-        name: what to call the predictions in tables.
+        name: name of the predictions in tables.
         progress: called with (frames done, frames in total).
 
     Returns:
         The scores. Frames that could not be scored are listed in `failures`.
 
     Raises:
-        ArgumentError: an argument has no such value, or `region`, `by` or `rays` needs what the data do not have.
-        MissingDataError: there is no grid, a sequence has no ground truth, or there is no frame to score.
+        ArgumentError: an argument has an unknown value, or `region`, `by` or `rays` needs data that do not exist.
+        MissingDataError: no grid exists, a sequence has no ground truth, or no frame can be scored.
         FormatError: the grids or the classes of the two sides cannot be compared.
     """
     (result,) = _score_all(
@@ -93,7 +93,7 @@ def evaluate_by_all_conventions(
     name: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Mapping[str, Evaluation | CarlascError]:
-    """Score predictions by every convention, reading each frame once: so that the numbers of two papers can be compared.
+    """Score predictions by every convention. Each frame is read once.
 
     Args:
         source: the predictions, as for `evaluate`.
@@ -106,7 +106,7 @@ def evaluate_by_all_conventions(
         progress: as for `evaluate`.
 
     Returns:
-        By the name of the convention: the scores, or the error that says why these data cannot have such a score.
+        For the name of each convention: the scores, or the error that says why the data cannot be scored by it.
     """
     results = _score_all(
         list(CONVENTIONS), source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
@@ -216,7 +216,7 @@ class _Scorer:
         frame: int,
         content: tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]] | CarlascError,
     ) -> None:
-        """Score a frame, or note why it could not be scored."""
+        """Score a frame, or record the reason why it cannot be scored."""
         if self.impossible is not None:
             return
         path, frame_name = pair.truth.path, pair.truth.name_of(frame)
@@ -225,7 +225,7 @@ class _Scorer:
                 raise content
             matrix = self._score(pair, frame, *content)
         except ArgumentError:
-            raise  # every frame would meet the same
+            raise  # the error is the same in every frame
         except CarlascError as error:
             self.failures.append((f"{path}:{frame_name}", str(error)))
             return
@@ -233,7 +233,7 @@ class _Scorer:
         self.frames.append(FrameScore(path, frame_name, self.convention.score(matrix)))
 
     def result(self, name: str, notes: tuple[str, ...]) -> Evaluation | CarlascError:
-        """Return the scores of everything that was added, or why there are none."""
+        """Return the scores of all frames that were added, or the error that prevented them."""
         if self.impossible is not None:
             return self.impossible
         summed = sum(self.matrices.values(), self._matrix())
@@ -299,7 +299,7 @@ class _Scorer:
                     self.breakdown.update(pred, true, masks, counted)
                 if self.rays is not None and isinstance(pair.truth, SequenceGrid):
                     self.rays.update(pred, true, spec, _origins(pair.truth, frame, spec))
-        except FormatError as error:  # it says which side it is about
+        except FormatError as error:  # the message must name the side
             side = pair.prediction if error.where == "prediction" else pair.truth
             raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
         return matrix
@@ -357,7 +357,7 @@ def _spec_of(pair: Pair) -> GridSpec | None:
 
 
 def _origins(truth: SequenceGrid, frame: int, spec: GridSpec) -> NDArray[np.float64]:
-    """Return where the rays of a frame start: the places of the sensor at the frames that have a true grid."""
+    """Return the origins of the rays of a frame: the positions of the sensor in the frames that have a true grid."""
     numbers = truth.frames().tolist()
     poses = np.stack([truth.sequence.read_pose(number) for number in numbers])
     return ray_origins(poses, numbers.index(frame), spec)

@@ -21,12 +21,12 @@ _LABELS = (
     "semantics",
     "pred",
     "occ_pred",
-)  # arrays of an .npz that hold classes: the benchmark's own, and what people write
+)  # names of the array of classes in an .npz: the benchmark's own, and other common ones
 _NOISE = 255
 
 
 class TokenFrames(GridFrames):
-    """A scene whose frames have tokens for names. They are numbered in the order of their names, predictions in that of the truth.
+    """A scene whose frames are named by tokens. Frames are numbered in the order of the tokens of the ground truth.
 
     Attributes:
         files: file of each frame, by token.
@@ -72,7 +72,7 @@ class Occ3dScene(TokenFrames):
         return arrays[name]
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (200, 200, 16) which voxels the LiDAR, or a camera, observed; None where the file does not say."""
+        """Return the (200, 200, 16) mask of the voxels that the LiDAR or a camera observed; None if the file does not contain it."""
         mask = _load_npz(self._file(frame)).get(f"mask_{seen_by}")
         return None if mask is None else mask.astype(np.bool_)
 
@@ -103,7 +103,7 @@ class OpenOccupancyScene(TokenFrames):
         return labels
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> None:
-        """Return None: the benchmark does not say what was observed."""
+        """Return None, because the benchmark does not say which voxels were observed."""
         return None
 
 

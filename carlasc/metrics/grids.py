@@ -24,7 +24,7 @@ class GridFrames(ABC):
 
     Attributes:
         path: of the sequence; "" for a plain folder.
-        location: what to call the grid in errors.
+        location: name of the grid in errors.
         spec: its geometry; None if it is not known.
         classes: the class table of its ids; None if it is not known.
     """
@@ -50,11 +50,11 @@ class GridFrames(ABC):
         """
 
     def name_of(self, frame: int) -> str:
-        """Return what to call a frame in messages: its number, or its token."""
+        """Return the name of a frame in messages: its number or its token."""
         return str(frame)
 
     def follow(self, truth: GridFrames) -> None:  # noqa: B027 (only some data need it)
-        """Learn from the ground truth what files of predictions do not say: how many voxels, which frame is which."""
+        """Take from the ground truth what files of predictions do not contain: the number of voxels and the numbers of the frames."""
 
 
 class SequenceGrid(GridFrames):

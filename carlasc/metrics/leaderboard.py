@@ -68,7 +68,7 @@ class ScoreTable:
         return self.table().to_latex()
 
     def to_html(self) -> str:
-        """Return an HTML page: the figures, and for each result a bar per class. It names no other host."""
+        """Return a self-contained HTML page: the figures, and for each result a bar per class."""
         table = self.table(classes=False)
         header = "".join(f"<th>{html.escape(name)}</th>" for name in (*table.header, "IoU of each class"))
         rows = ""

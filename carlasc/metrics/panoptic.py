@@ -1,4 +1,4 @@
-"""Panoptic quality: how well segments (an object each, or all of a stuff class) are found and outlined (Kirillov et al., CVPR 2019)."""
+"""Panoptic quality: recognition and segmentation of single objects and of stuff classes (Kirillov et al., CVPR 2019)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from carlasc.metrics.counting import to_numpy
 
 Variant = Literal["standard", "pasco"]
 _SLOTS = 256  # of the tables of latest segments and pairs; a power of two
-_MATCH = 0.5  # more than half of the union in common: at most one segment can have that, so matching needs no search
+_MATCH = 0.5  # above it, a segment has at most one match, so that no search is needed
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PanopticScore:
     things: frozenset[int]
 
     def mean(self, what: Literal["pq", "sq", "rq"] = "pq", which: Literal["all", "things", "stuff"] = "all") -> float:
-        """Return the mean over the classes that occur: all of them, only things, or only stuff; NaN where none does."""
+        """Return the mean over the classes that occur: all of them, only things, or only stuff; NaN if none occurs."""
         values = getattr(self, what)
         is_thing = np.isin(np.arange(len(values)), sorted(self.things))
         keep = {"all": np.ones_like(is_thing), "things": is_thing, "stuff": ~is_thing}[which] & ~np.isnan(self.pq)
@@ -79,8 +79,8 @@ class PanopticQuality:
         num_classes: K; ids are 0..K-1.
         things: ids of the classes whose instances count one by one; all elements of another class are one segment per frame.
         free: id of free space.
-        variant: "standard", or "pasco": a stuff segment that overlaps the true one of its class at all is a match, as in PaSCo's
-            evaluation script, so that stuff is never a false positive while its class occurs.
+        variant: "standard", or "pasco": a stuff segment matches the true segment of its class if they overlap at all, as in PaSCo's
+            evaluation script. Stuff is then never a false positive if its class occurs in the truth.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class PanopticQuality:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.counts = np.zeros((3, self.num_classes), np.int64)  # true positives, false positives, false negatives
         self.iou_sum = np.zeros(self.num_classes)
         self.elements = np.zeros((3, self.num_classes), np.int64)  # in common, predicted, true
@@ -227,7 +227,7 @@ def match_segments(
 def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
     """Number the segments of both sides in the order in which they occur, and count elements and overlaps, in one pass.
 
-    Few segments take turns along a row. Small tables of the latest ones, at a place that the key gives, spare most look-ups.
+    Neighbouring elements mostly belong to few segments. Small tables of the latest segments, indexed by the key, avoid most look-ups.
     """
     numbers = {np.int64(-1): np.int64(-1)}  # side and key -> number
     keys = [[np.int64(0) for _ in range(0)] for _ in range(2)]

@@ -1,7 +1,7 @@
-"""RayIoU and RayPQ: grids compared by what rays meet in them, not voxel by voxel (SparseOcc).
+"""RayIoU and RayPQ: grids compared by the first surface on each ray, not voxel by voxel (SparseOcc).
 
-A wall that is predicted half a metre too thick costs voxel IoU much and a robot nothing. Rays from where the sensor was on its way see the
-first surface only.
+A wall that is predicted too thick reduces the IoU of voxels, although its visible surface is correct. Rays from the positions of the
+sensor along the sequence compare only the first surface.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segme
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
 _MOST_ORIGINS = 8
-_MARGIN_M = 1.0  # origins lie this far inside the grid's sides: 39 m for Occ3D's grid of 40 m
-_FEWEST_RAYS = 10  # a segment of fewer rays is neither missed nor invented
+_MARGIN_M = 1.0  # distance of origins from the sides of the grid: 39 m for Occ3D's grid of 40 m
+_FEWEST_RAYS = 10  # a segment of fewer rays is neither a false negative nor a false positive
 
 
 def ray_origins(world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec) -> NDArray[np.float64]:
-    """Return where the rays of a frame start: the sensor's places along the sequence that lie in the frame's grid.
+    """Return the origins of the rays of a frame: positions of the sensor along the sequence that are inside the grid of the frame.
 
     Args:
         world_T_sensors: (F, 4, 4) poses of the sequence's (key) frames.
         frame: row of the frame that is scored.
-        spec: its grid.
+        spec: the grid of the frame.
 
     Returns:
-        (O, 3) metres in the frame's sensor frame, at most 8: taken evenly from the places within the grid's sides less 1 m in x and y.
+        (O, 3) metres, in the sensor frame of the scored frame. At most 8 positions, evenly chosen from those that are at least 1 m inside
+        the sides of the grid in x and y.
     """
     here: Transform = invert(world_T_sensors[frame])
     places = (here @ world_T_sensors)[:, :3, 3]
@@ -74,10 +75,10 @@ class RayScore:
 
 
 class RayIoU:
-    """Adds up what rays meet in predicted and true grids.
+    """Adds up the first surfaces on rays through predicted and true grids.
 
-    A ray is right where the prediction's first voxel has the class of the truth's and lies less than a threshold before or behind it.
-    Rays that meet nothing in the truth are dropped. Counts are summed over all frames before dividing.
+    A ray is correct if the first voxels of the prediction and of the truth have the same class and their distances differ by less than a
+    threshold. Rays without a surface in the truth are left out. Counts are summed over all frames before they are divided.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
@@ -104,7 +105,7 @@ class RayIoU:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.true = np.zeros(self.num_classes, np.int64)
         self.predicted = np.zeros(self.num_classes, np.int64)
         self.hits = np.zeros((len(self.thresholds_m), self.num_classes), np.int64)
@@ -225,7 +226,7 @@ class RayPQ:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.qualities = [PanopticQuality(self.num_classes, self.things, free=self.free) for _ in self.thresholds_m]
 
     def update(

@@ -1,4 +1,4 @@
-"""Where a score is taken: masks that break a grid down by distance, height, visibility and motion."""
+"""Regions of a grid for separate scores: masks by distance, height, visibility and motion."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def height_bands(spec: GridSpec, edges_m: Sequence[float]) -> Masks:
 
 
 def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 0) -> Masks:
-    """Return what the sensor could see at this instant, and what it could not, by the true grid.
+    """Return which voxels the sensor could see at this instant, and which it could not, according to the true grid.
 
-    A voxel is visible where no occupied voxel of the truth lies between the sensor and its centre. What stands behind something can only
-    be completed, not seen.
+    A voxel is visible if no occupied voxel of the truth is between the sensor and the centre of the voxel. A network can only complete
+    the other voxels, because it has no observation of them.
 
     Args:
         truth: the true grid, Cartesian.
-        origin: (3,) metres, the sensor's place in the grid's frame.
+        origin: (3,) metres, position of the sensor in the frame of the grid.
         free: id of free space.
 
     Returns:
@@ -61,13 +61,13 @@ def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 
 
 
 def motion(truth: Grid, scan: Scan, movable: Sequence[int], *, min_speed_m_s: float = 0.3) -> Masks:
-    """Return the voxels of things that move, and of things that could but stand, by the flow of the frame's own scan.
+    """Return the voxels of moving objects and those of movable objects at rest, from the flow of the frame's own scan.
 
     Args:
         truth: the true grid.
         scan: the frame's points with flow, in the grid's frame.
         movable: ids of the classes that may move.
-        min_speed_m_s: slower points stand.
+        min_speed_m_s: slower points are at rest.
 
     Returns:
         Masks "moving" and "standing", (X, Y, Z) bool. Voxels of movable classes that hold no point are in neither.
@@ -106,7 +106,7 @@ class Breakdown:
         return dict(self.matrices)
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.matrices = {}
 
     def merge(self, other: Breakdown) -> Self:

@@ -1,6 +1,6 @@
-"""How sure a score is: confidence intervals by bootstrap over sequences, and a paired test of two predictions.
+"""Statistical uncertainty of scores: confidence intervals by bootstrap over sequences, and a paired test of two predictions.
 
-Frames of one sequence show nearly the same scene, so sequences are what is drawn, not frames.
+Sequences are drawn instead of frames, because the frames of one sequence show nearly the same scene.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Interval:
         value: the score of all sequences together.
         low: lower end.
         high: upper end.
-        level: share of intervals made like this that hold the true value.
+        level: confidence level: share of such intervals that contain the true value.
     """
 
     value: float
@@ -42,9 +42,9 @@ class Comparison:
     """Two predictions of the same sequences.
 
     Attributes:
-        difference: score of the first less that of the second, with its interval.
-        p_value: how often a difference at least as large comes up where the two are equally good.
-        sequences: the sequences that both have.
+        difference: score of the first minus that of the second, with its interval.
+        p_value: probability of a difference at least as large if both are equally good.
+        sequences: the sequences that both predictions have.
     """
 
     difference: Interval
@@ -62,15 +62,15 @@ class Comparison:
 
 
 def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95) -> Interval:
-    """Return a score with the interval that drawing the sequences again, with replacement, gives it.
+    """Return a score with its confidence interval by bootstrap: sequences are drawn again with replacement.
 
     Args:
-        matrices: confusion of each sequence.
-        score: what is taken of their sum.
-        level: of the interval.
+        matrices: confusion matrix of each sequence.
+        score: function that computes the score from the sum of the matrices.
+        level: confidence level of the interval.
 
     Raises:
-        ArgumentError: fewer than five sequences: their spread says nothing.
+        ArgumentError: there are fewer than five sequences.
     """
     _check_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
@@ -84,14 +84,14 @@ def compare(
 ) -> Comparison:
     """Compare two predictions, sequence by sequence.
 
-    The interval draws sequences again, for both alike. The p-value swaps the two predictions in some of the sequences: all ways of doing so
-    up to twelve sequences, 2,000 random ones beyond.
+    For the interval, the same sequences are drawn again for both predictions. For the p-value, the two predictions are swapped in some of
+    the sequences: in all possible ways for up to twelve sequences, in 2,000 random ways for more.
 
     Args:
-        first: confusion of each sequence, by path.
+        first: confusion matrix of each sequence, by path.
         second: likewise; sequences that only one of them has are left out.
-        score: what is taken of a sum of matrices.
-        level: of the interval.
+        score: function that computes the score from a sum of matrices.
+        level: confidence level of the interval.
 
     Raises:
         MissingDataError: they have no sequence in common.
@@ -115,7 +115,7 @@ def compare(
         swaps = (np.arange(2 ** len(common))[:, None] >> np.arange(len(common)) & 1).astype(bool)
     else:
         swaps = rng.random((_DRAWS, len(common))) < 0.5
-        swaps[0] = False  # the way that was found is one of them
+        swaps[0] = False  # the actual assignment is one of them
     swapped = [
         difference(np.where(s[:, None, None], b, a).sum(axis=0), np.where(s[:, None, None], a, b).sum(axis=0))
         for s in swaps

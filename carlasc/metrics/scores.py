@@ -38,7 +38,7 @@ class Evaluation:
     """The scores of predictions. All figures are computed from the sum of the confusion matrices of all frames.
 
     Attributes:
-        name: of the predictions: a network's name, or where they are stored.
+        name: name of the predictions: that of a network, or where they are stored.
         convention: the rules by which they were scored.
         matrix: the confusion matrix over all frames, in the convention's classes.
         sequences: the confusion matrix of each sequence, by path.
@@ -46,9 +46,9 @@ class Evaluation:
         voxels: "known" voxels of the truth were scored, or "all".
         failures: (frame, message) of the frames that could not be scored.
         frame_scores: the scores of each frame alone, where they were kept.
-        notes: what a reader of the scores must know.
-        breakdown: the confusion matrix of each region that was asked for, by name.
-        rays: RayIoU, if it was asked for.
+        notes: remarks for readers of the scores.
+        breakdown: the confusion matrix of each requested region, by name.
+        rays: RayIoU, if it was requested.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Evaluation:
 
     @property
     def miou(self) -> float:
-        """Mean IoU, taken as the convention says."""
+        """Mean IoU by the rules of the convention."""
         return self.score.miou
 
     @property

@@ -1,4 +1,4 @@
-"""Scores over time: does a map agree with itself from frame to frame, and is the future that it predicts the one that came."""
+"""Scores over time: the consistency of consecutive frames, and the accuracy of predicted future frames."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ HORIZONS_S = (1.0, 2.0, 3.0)
 
 
 def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
-    """Return a grid as seen from another place: each voxel takes the label of the source voxel that holds its centre.
+    """Return a grid in another frame: each voxel takes the label of the source voxel that contains its centre.
 
     Args:
         grid: labels and counts in the frame `src`.
         dst_T_src: (4, 4) rigid transform.
 
     Returns:
-        A grid of the same geometry in the frame `dst`; what lies outside the source is unknown (count 0).
+        A grid of the same geometry in the frame `dst`; voxels outside the source are unknown (count 0).
     """
     spec = grid.spec
     centers = transform_points(invert(dst_T_src), spec.from_axes(spec.centers()).reshape(-1, 3))
@@ -39,10 +39,10 @@ def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
 
 
 class Consistency:
-    """Adds up how well consecutive frames agree about what does not move.
+    """Adds up the agreement of consecutive frames in the static parts of the scene.
 
-    Voxels of frame t that hold a static class, or free space, are moved into frame t + 1 and compared there with what that frame says,
-    over the voxels that both know.
+    Voxels of frame t with a static class or free space are moved to frame t + 1 and compared with the voxels of that frame, over the
+    voxels that are known in both.
 
     Attributes:
         matrix: confusion of the later frame (columns) against the earlier one (rows).
@@ -76,11 +76,11 @@ class Consistency:
         return self
 
     def compute(self) -> float:
-        """Return the IoU of occupied voxels between consecutive frames; NaN where nothing was compared."""
+        """Return the IoU of occupied voxels between consecutive frames; NaN if nothing was compared."""
         return self.matrix.completeness().iou
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.matrix = ConfusionMatrix(self.matrix.num_classes, free=self.matrix.free)
 
     def merge(self, other: Consistency) -> Self:
@@ -130,21 +130,21 @@ class ForecastScore:
 
 
 class Forecasting:
-    """Adds up how good predicted futures are, by how far ahead they look.
+    """Adds up the scores of predicted future frames for each horizon.
 
     Attributes:
-        matrices: confusion of each horizon, seconds ahead.
+        matrices: confusion matrix of each horizon, in seconds.
     """
 
     def __init__(self, num_classes: int, *, free: int = 0, horizons_s: Iterable[float] = HORIZONS_S) -> None:
         self.matrices = {float(horizon): ConfusionMatrix(num_classes, free=free) for horizon in horizons_s}
 
     def update(self, horizon_s: float, prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
-        """Add the future of one frame: what was predicted for `horizon_s` later, and what was there then.
+        """Add the future of one frame: the prediction for the time `horizon_s` later, and the truth at that time.
 
         Raises:
-            ArgumentError: no such horizon.
-            FormatError: shapes or ids do not fit.
+            ArgumentError: the horizon is not one of those of the metric.
+            FormatError: the shapes do not match, or an id is out of range.
         """
         if float(horizon_s) not in self.matrices:
             raise ArgumentError(
@@ -162,7 +162,7 @@ class Forecasting:
         }
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.matrices = {h: ConfusionMatrix(m.num_classes, free=m.free) for h, m in self.matrices.items()}
 
     def merge(self, other: Forecasting) -> Self:

@@ -1,4 +1,4 @@
-"""Scoring ground truth itself: a grid against a better grid of the same scene at the same time."""
+"""Scores of ground truth: comparison of a grid with a better grid of the same scene at the same time."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
 
     Args:
         grid: the grid that is scored; voxels with count 0 are unknown.
-        reference: the grid that is taken to be right, of the same spec.
+        reference: the grid that is taken to be correct, with the same spec.
         num_classes: number of classes; ids are below it.
         mask: (X, Y, Z) bool: only these voxels are scored, such as a distance band; None scores all.
 

@@ -1,4 +1,4 @@
-"""How far predicted probabilities can be believed: calibration error, likelihood, reliability diagrams (as PaSCo reports them)."""
+"""Scores of predicted probabilities: calibration error, likelihood and reliability diagrams (as PaSCo reports them)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.counting import to_numpy
 
 _BINS = 15
-_TOLERANCE = 1e-3  # how far the probabilities of a voxel may be from summing to one: half precision gives 5e-4
-_EPSILON = 1e-12  # of the logarithm
+_TOLERANCE = 1e-3  # largest deviation of the sum of the probabilities of a voxel from one: half precision gives 5e-4
+_EPSILON = 1e-12  # added in the argument of the logarithm
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Reliability:
     Attributes:
         count: (B,) voxels in each bin.
         confidence: (B,) mean probability in each bin; NaN in an empty one.
-        accuracy: (B,) share of the voxels of each bin that were predicted right.
+        accuracy: (B,) share of the voxels of each bin that were predicted correctly.
     """
 
     count: NDArray[np.int64]
@@ -61,10 +61,10 @@ class UncertaintyScore:
 
 
 class Uncertainty:
-    """Adds up how confident a network was, and how often it was right.
+    """Adds up the confidence and the accuracy of predictions.
 
-    Calibration errors are taken per frame and averaged, likelihoods are pooled over voxels, both apart for voxels predicted free and
-    predicted occupied: PaSCo's convention.
+    As in PaSCo, calibration errors are computed per frame and averaged, likelihoods are pooled over voxels, and both are computed
+    separately for voxels that are predicted free and occupied.
 
     Attributes:
         num_classes: K.
@@ -81,7 +81,7 @@ class Uncertainty:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was added."""
+        """Remove everything that was added."""
         self.sums = np.zeros((2, 3, self.bins))  # predicted free or occupied; count, confidence, right; by bin
         self.nll = np.zeros((2, 2))  # predicted free or occupied; sum, count
         self.ece = np.zeros((2, 2))  # predicted free or occupied; sum of frames, number of frames

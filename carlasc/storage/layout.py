@@ -1,4 +1,4 @@
-"""The published layout as one table: field, file name, type, shape, unit. No other module knows a file name.
+"""The published layout as one table: field, file name, type, shape, unit. No other module contains file names.
 
     <split>/<sequence>/<coordinates>/velodyne/000000.bin, ...: see the format page, `docs/format.md#layout`
 
@@ -28,7 +28,7 @@ TIMES = "times.txt"
 METADATA = "carlasc.json"
 PARAMS = "params.json"
 
-FRAME_PERIOD_S = 0.1  # scans are taken at 10 Hz
+FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 
@@ -41,21 +41,21 @@ Kind = Literal["position", "vector", "class", "id", "value", "count", "votes", "
 class Field:
     """The content of one file per frame.
 
-    Everything that handles fields goes by `per` and `kind`, not by names: stores, packing, `info`, `validate`, converting.
+    Stores, packing, converting, `info` and `validate` use `per` and `kind` to decide how to handle a field, not its name.
 
     Attributes:
-        name: what a Source and a Sink call it.
+        name: name of the field in a Source and a Sink.
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
-        per: what one row of the file belongs to. The files of a scan have a row for each of its points, those of a grid a value for
-            each voxel ("voxel") or a row for each vote ("vote"); "scan" is a whole file for a scan.
-        kind: what the values are: "position" and "vector" (turn with the axes), "class" (ids of the class table), "id" (unsigned whole
+        per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
+            "vote" (one row per vote), or "scan" (the whole file belongs to the scan).
+        kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "id" (unsigned whole
             numbers, such as actors), "value" (any number), "count", "votes" (a table), "picture" (the bytes of a file).
         dtype: NumPy type on disk, little-endian.
         names: name of each value of a row.
         unit: unit of the values.
         meaning: one line for the documentation.
-        published: whether the data set's download has it.
+        published: whether the published download contains the field.
     """
 
     name: str
@@ -79,15 +79,15 @@ class Field:
         return f"{self.folder}/{frame:06d}{self.suffix}"
 
     def decode(self, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
-        """Read a file's bytes as an array, without a copy where the type allows.
+        """Return the content of a file as an array, without a copy if the type allows it.
 
         Args:
             data: the whole file.
             where: the file, for errors.
-            shape: expected shape (grids); None takes the number of rows from the size.
+            shape: expected shape, for grids; None computes the number of rows from the size of the file.
 
         Raises:
-            FormatError: the size does not fit.
+            FormatError: the size of the file does not match.
         """
         if self.kind == "votes":
             return _decode_votes(data, where)
@@ -95,13 +95,15 @@ class Field:
         size = len(data)
         if shape is not None and size != dtype.itemsize * int(np.prod(shape)):
             expected = f"{dtype.itemsize * int(np.prod(shape))} bytes ({' x '.join(map(str, shape))} {dtype.name})"
-            raise FormatError(where, expected=expected, found=str(size), advice="cut short, or of another grid")
+            raise FormatError(
+                where, expected=expected, found=str(size), advice="the file is cut short, or belongs to another grid"
+            )
         if size % row:
             raise FormatError(
                 where,
                 expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} per row)",
                 found=str(size),
-                advice="cut short?",
+                advice="the file may be cut short",
             )
         array = np.frombuffer(data, dtype)
         if shape is not None:
@@ -112,7 +114,7 @@ class Field:
         """Return the bytes of a frame's file.
 
         Raises:
-            FormatError: the array's shape or values do not fit the field.
+            FormatError: the shape or the type of the array does not match the field.
         """
         self.check(array, where)
         if self.kind == "votes":
@@ -120,10 +122,10 @@ class Field:
         return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
 
     def check(self, array: NDArray[Any], where: str) -> None:
-        """Check that an array may be a frame of the field.
+        """Check that an array has the shape and the type of a frame of the field.
 
         Raises:
-            FormatError: its shape or type does not fit; `where` is the file named there.
+            FormatError: the shape or the type does not match; the message names the file `where`.
         """
         if self.kind == "votes":
             if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
@@ -193,7 +195,7 @@ LINE_FIELDS = ("poses", "times")
 
 
 def field_named(name: str) -> Field:
-    """Return the field of a flat name: `points`, `evaluation/labels`, ...
+    """Return the field with a flat name such as `points` or `evaluation/labels`.
 
     Raises:
         FormatError: the layout has no such field.
@@ -211,7 +213,7 @@ def field_named(name: str) -> Field:
 
 
 def point_fields() -> tuple[str, ...]:
-    """Return the names of the fields with a row per point, without `points` itself."""
+    """Return the names of the fields with one row per point, except `points`."""
     return tuple(name for name, field in SCAN_FIELDS.items() if field.per == "point" and field.kind != "position")
 
 
@@ -226,14 +228,14 @@ def params_file(grid: str) -> str:
 
 
 def grid_folder(spec: GridSpec) -> str:
-    """Return a grid's folder: `evaluation` for the published one of its coordinates, else with the size in its name."""
+    """Return the name of a grid's folder: `evaluation` for the published grid of its coordinates; otherwise it contains the size."""
     return (
         EVALUATION if spec == GridSpec.published(spec.coordinates) else f"{EVALUATION}_{'x'.join(map(str, spec.size))}"
     )
 
 
 def frame_of(file_name: str, suffix: str) -> int | None:
-    """Return the frame number of a file name such as `000012.label`, None if it is no frame of that suffix."""
+    """Return the frame number of a file name such as `000012.label`; None if it is not the name of a frame with that suffix."""
     if not file_name.endswith(suffix):
         return None
     stem = file_name[: len(file_name) - len(suffix)]
@@ -241,7 +243,7 @@ def frame_of(file_name: str, suffix: str) -> int | None:
 
 
 def encode_poses(poses: NDArray[np.float64]) -> bytes:
-    """Return the text of poses.txt for (F, 4, 4) transforms: the top 3 x 4, row-major, '%.18e'."""
+    """Return the text of poses.txt for (F, 4, 4) transforms: the first three rows of each, row-major, '%.18e'."""
     return _encode_lines(poses[:, :3, :].reshape(-1, 12))
 
 
@@ -249,7 +251,7 @@ def decode_poses(data: bytes, where: str) -> NDArray[np.float64]:
     """Read poses.txt as (F, 4, 4) float64.
 
     Raises:
-        FormatError: a line has not 12 numbers.
+        FormatError: a line does not have 12 numbers.
     """
     rows = _decode_lines(data, 12, where)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -258,7 +260,7 @@ def decode_poses(data: bytes, where: str) -> NDArray[np.float64]:
 
 
 def encode_times(times: NDArray[np.float64]) -> bytes:
-    """Return the text of times.txt for (F,) seconds: one a line, '%.18e'."""
+    """Return the text of times.txt for (F,) seconds: one number per line, '%.18e'."""
     return _encode_lines(np.asarray(times, np.float64).reshape(-1, 1))
 
 
@@ -266,7 +268,7 @@ def decode_times(data: bytes, where: str) -> NDArray[np.float64]:
     """Read times.txt as (F,) float64 seconds.
 
     Raises:
-        FormatError: a line is no number.
+        FormatError: a line is not a number.
     """
     return _decode_lines(data, 1, where)[:, 0]
 

@@ -1,4 +1,4 @@
-"""Finding out what a path or a URL holds, by looking at it, and opening it."""
+"""Opening a path or a URL as a Source. The kind of store is determined from its content."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from carlasc.storage.packed.protocol import Options, PackedSink
 from carlasc.storage.protocol import Source
 
 _ZIP, _EMPTY_ZIP, _HDF5, _PARQUET = b"PK\x03\x04", b"PK\x05\x06", b"\x89HDF\r\n\x1a\n", b"PAR1"
-_SIGNATURE = 8  # bytes that tell them apart
+_SIGNATURE = 8  # number of leading bytes that identify the kind of file
 
 
 def open(path: str | os.PathLike[str], **storage_options: Any) -> Source:
-    """Open whatever holds sequences: it is looked at, not told by its ending.
+    """Open a store of sequences. Its kind is determined from its content, not from the ending of its name.
 
     Args:
         path: a folder of the published layout (the data set, a split, a sequence, one `<coordinates>` folder), a zip of such a folder (read
-            in place), a packed store (zarr, HDF5, Parquet), or the URL of any of these (http, s3, and whatever fsspec knows).
-        **storage_options: what fsspec needs for the URL: `anon=True`, `endpoint_url=...`.
+            in place), a packed store (zarr, HDF5, Parquet), or the URL of any of these (http, s3, and all other protocols of fsspec).
+        **storage_options: options of fsspec for the URL, such as `anon=True` or `endpoint_url=...`.
 
     Returns:
-        The source. It holds no open handles, and pickles.
+        The source. It holds no open handles and can be pickled.
 
     Raises:
-        MissingDataError: there is nothing.
-        FormatError: it is none of these, or damaged.
-        DependencyError: a package is missing; says which extra of carlasc brings it.
+        MissingDataError: nothing exists at the path.
+        FormatError: the content is none of these, or is damaged.
+        DependencyError: a package is missing; the message names the extra of carlasc that installs it.
     """
     text = os.fspath(path)
     if "://" in text and not text.startswith("file://"):
@@ -56,16 +56,16 @@ def open(path: str | os.PathLike[str], **storage_options: Any) -> Source:
 
 
 def as_source(source: str | os.PathLike[str] | Source) -> Source:
-    """Return a Source as it is, and open anything else that `open` takes."""
+    """Return a Source unchanged; open anything else with `open`."""
     return source if isinstance(source, Source) else open(source)
 
 
 def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
-    """Start a packed store, of the kind that its ending says: `.zarr`, `.h5` (`.hdf5`), `.parquet`.
+    """Start a packed store. The ending of its name gives its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`.
 
     Raises:
         ArgumentError: another ending, or an option that the store does not have.
-        ConflictError: something is in its place, and `overwrite` is not given.
+        ConflictError: the path already exists, and `overwrite` is not given.
         DependencyError: a package is missing.
     """
     if path.suffix == ".zarr":
@@ -100,7 +100,7 @@ def _open_remote(tree: RemoteTree) -> Source:
 
 
 def _open_store(tree: Tree) -> Source | None:
-    """Open a packed store that is a folder; None where the folder is none."""
+    """Open a packed store that is a folder; return None if the folder is not a packed store."""
     if tree.is_file("zarr.json"):
         from carlasc.storage.packed.arrays.zarr_store import ZarrSource
 
@@ -125,7 +125,7 @@ def _open_file(tree: Tree, name: str) -> Source:
         signature = bytes(tree.read_range(name, 0, _SIGNATURE))
     except FormatError as error:
         raise FormatError(
-            where, expected="a zip or a packed store", found="a file of a few bytes", advice="cut short?"
+            where, expected="a zip or a packed store", found="a file of a few bytes", advice="the file may be cut short"
         ) from error
     if signature.startswith((_ZIP, _EMPTY_ZIP)):
         inside = ZipTree(tree, name)

@@ -1,8 +1,8 @@
-"""The protocol between stores and everything else: a Source yields sequences, a Sink takes them.
+"""The protocol between the stores and all other modules: a Source yields sequences, a Sink takes them.
 
 A sequence is one `<split>/<sequence>/<coordinates>` of the layout. It has fields and frames; one call reads one field of one
-frame as an array. Fields it lacks are absent from `fields()`. Sources hold paths, never open handles, so they pickle; a store
-that needs a handle opens it per process on first read.
+frame as an array. A field that the sequence does not have is not listed by `fields()`. Sources hold paths, never open handles, so
+that they can be pickled. A store that needs a handle opens it in each process on the first read.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ class Sequence(ABC):
     """One `<split>/<sequence>/<coordinates>`: fields and frames, read one at a time.
 
     Attributes:
-        path: where it stands in its Source, "Train/Town01_Light/cartesian"; unique there; "" where the Source is just it.
-        location: what to call it in errors: a folder, a URL.
+        path: path of the sequence in its Source, such as "Train/Town01_Light/cartesian", which is unique there; "" if the Source is
+            this one sequence.
+        location: name of the sequence in errors: a folder or a URL.
         split: "Train", "Val", "Test", or None.
         name: "Town01_Light".
         coordinates: "cartesian" or "cylindrical".
@@ -49,48 +50,48 @@ class Sequence(ABC):
 
     @abstractmethod
     def fields(self) -> frozenset[str]:
-        """Return the names of the fields that stand in files of their own (see `carlasc.storage.layout`): no poses, no times."""
+        """Return the names of the fields with one file per frame (see `carlasc.storage.layout`), without poses and times."""
 
     @abstractmethod
     def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the sorted frame numbers that have a field; empty where it is absent."""
+        """Return the sorted numbers of the frames that have a field; empty if the sequence does not have the field."""
 
     @abstractmethod
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame, with the values and the shape of the published file.
 
-        Labels and counts may come in a narrower type than the file's; `points` is (N, 4) float32, a grid's arrays (X, Y, Z), bev
-        the (B,) uint8 bytes of the picture. The array may be read-only.
+        Labels and counts may have a narrower type than in the file. `points` is (N, 4) float32, the arrays of a grid are (X, Y, Z),
+        and `bev` is the (B,) uint8 bytes of the picture. The array may be read-only.
 
         Raises:
-            MissingDataError: the field or the frame is not there.
-            FormatError: what is there is not what the format says.
+            MissingDataError: the field or the frame does not exist.
+            FormatError: the data do not have the format of the field.
         """
 
     @abstractmethod
     def documents(self) -> tuple[str, ...]:
-        """Return the names of the text files that are there: poses.txt, times.txt, carlasc.json, `<grid>/params.json`."""
+        """Return the names of the existing text files: poses.txt, times.txt, carlasc.json, `<grid>/params.json`."""
 
     @abstractmethod
     def read_document(self, name: str) -> bytes:
-        """Return a text file's bytes as they stand.
+        """Return the unchanged bytes of a text file.
 
         Raises:
-            MissingDataError: it is not there.
+            MissingDataError: the file does not exist.
         """
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read one field of several frames; stores that can do so read them in one go."""
+        """Read one field of several frames. Stores that can do so read them in one request."""
         return [self.read(field, frame) for frame in frames]
 
     def read_xyz(
         self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Read where the points of several frames are, laid out in memory as the store has them: to be read, not to be kept.
+        """Read the coordinates of the points of several frames, in the memory layout of the store. The caller must not keep them.
 
         Args:
-            frames: their numbers.
-            spare: what earlier calls returned and nobody looks at any more: the store may write over it.
+            frames: numbers of the frames.
+            spare: arrays that earlier calls returned and that are no longer in use. The store may overwrite them.
 
         Returns:
             (N, 3) or (N, 4) float32 metres of each frame: rows, or the transpose of contiguous x, y and z.
@@ -99,14 +100,14 @@ class Sequence(ABC):
 
     @cached_property
     def metadata(self) -> Metadata:
-        """What carlasc.json says, or the defaults."""
+        """The metadata in carlasc.json, or the defaults if the file does not exist."""
         if layout.METADATA not in self.documents():
             return Metadata()
         return Metadata.from_json(self.read_document(layout.METADATA), f"{self.location}/{layout.METADATA}")
 
     @cached_property
     def grids(self) -> Mapping[str, GridSpec]:
-        """The sequence's grids by name (their folder), each with its geometry."""
+        """The geometry of each grid of the sequence, by the name of the grid's folder."""
         names = sorted(
             name.removesuffix(f"/{layout.PARAMS}") for name in self.documents() if name.endswith(f"/{layout.PARAMS}")
         )
@@ -116,7 +117,7 @@ class Sequence(ABC):
         }
 
     def params(self, grid: str) -> dict[str, Any]:
-        """Return a grid's params.json; it is read once."""
+        """Return the params.json of a grid. The file is read once."""
         if grid not in self._params:
             name = layout.params_file(grid)
             self._params[grid] = parse_json(self.read_document(name), f"{self.location}/{name}")
@@ -129,10 +130,11 @@ class Sequence(ABC):
     def classes_of(self, grid: str) -> ClassTable:
         """Return the class table of a grid's labels.
 
-        It is the sequence's, unless the grid's params.json names another one, or holds it whole, under `carlasc`: predictions.
+        This is the class table of the sequence, unless the grid's params.json names or contains another one under `carlasc`, as
+        predictions do.
 
         Raises:
-            FormatError: carlasc.json or params.json names an unknown table, or holds a damaged one.
+            FormatError: carlasc.json or params.json names an unknown table, or contains an invalid one.
         """
         table = self._record(grid).get("classes")
         if table is None:
@@ -140,12 +142,12 @@ class Sequence(ABC):
         return table_from_json(table, f"{self.location}/{layout.params_file(grid)}")
 
     def predicted_by(self, grid: str) -> str | None:
-        """Return the network that predicted a grid, as its params.json says under `carlasc`; None: it is no prediction."""
+        """Return the name of the network that predicted a grid, from its params.json; None if the grid is not a prediction."""
         name = self._record(grid).get("network")
         return None if name is None else str(name)
 
     def _record(self, grid: str) -> Mapping[str, Any]:
-        """How a grid was made: params.json's `carlasc`, empty if there is none."""
+        """Return the record of how a grid was made: the value of `carlasc` in params.json, or an empty mapping."""
         record = self.params(grid).get("carlasc")
         if not isinstance(record, dict):
             return {}
@@ -153,9 +155,9 @@ class Sequence(ABC):
         return record
 
     def with_poses(self, poses: NDArray[np.float64]) -> Self:
-        """Return a copy of the sequence that has other poses than its poses.txt.
+        """Return a copy of the sequence with other poses than those in its poses.txt.
 
-        Copies and pickles of it keep these poses. Its documents are those of the sequence.
+        Copies and pickles of the result keep these poses. Its documents are those of the sequence.
 
         Args:
             poses: (L, 4, 4) first_T_sensor, one per line, as `poses` returns them.
@@ -167,10 +169,10 @@ class Sequence(ABC):
 
     @cached_property
     def poses(self) -> NDArray[np.float64]:
-        """(F, 4, 4) first_T_sensor, a line of poses.txt each; `read_pose` finds a frame's.
+        """(F, 4, 4) first_T_sensor, one per line of poses.txt; `read_pose` returns that of a frame.
 
         Raises:
-            MissingDataError: there is no poses.txt.
+            MissingDataError: poses.txt does not exist.
         """
         if self._given_poses is not None:
             return self._given_poses
@@ -178,7 +180,7 @@ class Sequence(ABC):
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
-        """(F,) seconds since the first frame, a line of times.txt each; `read_time` finds a frame's."""
+        """(F,) seconds since the first frame, one per line of times.txt; `read_time` returns that of a frame."""
         return layout.decode_times(self.read_document(layout.TIMES), f"{self.location}/{layout.TIMES}")
 
     def read_pose(self, frame: int) -> Transform:
@@ -186,14 +188,14 @@ class Sequence(ABC):
         return self.poses[self.line_of(frame, len(self.poses), layout.POSES)]
 
     def read_time(self, frame: int) -> float:
-        """Return a frame's seconds since the first one."""
+        """Return the time of a frame in seconds since the first frame."""
         return float(self.times[self.line_of(frame, len(self.times), layout.TIMES)])
 
     def line_of(self, frame: int, lines: int, document: str) -> int:
-        """Return which line of a text file belongs to a frame.
+        """Return the number of the line of a text file that belongs to a frame.
 
-        Line i is frame i wherever the file is long enough for the last frame (frames may be missing in between). A file
-        with just a line for each frame that is there goes by their order.
+        Line i belongs to frame i if the file is long enough for the last frame; frames in between may be missing. If the file has
+        exactly one line per existing frame, the lines belong to the frames in their order.
 
         Raises:
             FormatError: the file has too few lines.
@@ -217,7 +219,7 @@ class Sequence(ABC):
         return int(frames[-1]) if len(frames) else -1, {int(frame): line for line, frame in enumerate(frames)}
 
     def scan_frames(self) -> NDArray[np.int64]:
-        """Return the frames of the sequence: those with points, or, where it has only grids, those of all fields."""
+        """Return the frames of the sequence: those with points, or those of all fields if the sequence has only grids."""
         if len(points := self.frames("points")):
             return points
         return np.unique(
@@ -225,7 +227,7 @@ class Sequence(ABC):
         )
 
     def scan(self, frame: int, fields: Iterable[str] | None = None) -> Scan:
-        """Read a frame's points with those of `fields` that the sequence has; None reads every field with a row per point."""
+        """Read the points of a frame with those of `fields` that the sequence has; None reads all fields with one row per point."""
         wanted = layout.point_fields() if fields is None else fields
         points = self.read("points", frame)
         read = {name: self.read(name, frame) for name in wanted if name in self.fields() and name != "remission"}
@@ -236,7 +238,7 @@ class Sequence(ABC):
             raise error.within(f"{self.location}: frame {frame}") from error
 
     def grid(self, name: str, frame: int) -> Grid:
-        """Read a grid of a frame: labels, and counts where there are any."""
+        """Read a grid of a frame: its labels, and its counts if they exist."""
         if name not in self.grids:
             raise MissingDataError(
                 self.location, expected=f"the grid {name}", found=f"{', '.join(self.grids) or 'none'}"
@@ -249,30 +251,31 @@ class Sequence(ABC):
 
 
 class Source(ABC):
-    """Where sequences are read from.
+    """A store that sequences are read from.
 
     Attributes:
-        location: what to call it in errors: a folder, a file, a URL.
+        location: name of the source in errors: a folder, a file or a URL.
     """
 
     location: str
 
     @abstractmethod
     def sequences(self) -> Mapping[str, Sequence]:
-        """Return the sequences by their path, in sorted order."""
+        """Return the sequences by path, in sorted order."""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
 
 
 class SequenceWriter(ABC):
-    """Takes one sequence. In a folder, what `write` has returned from is there whole, whatever happens next.
+    """Writes one sequence.
 
-    A packed store is there whole once its sink is closed, and not before.
+    In a folder, a file is complete when `write` returns, even if the run fails later. A packed store is complete only after its sink
+    has been closed.
 
     Attributes:
-        location: what to call it in errors.
-        concurrent: whether several processes may write at once, each with its own pickled copy.
+        location: name of the output in errors.
+        concurrent: whether several processes may write at the same time, each with its own pickled copy of the writer.
     """
 
     location: str
@@ -280,13 +283,14 @@ class SequenceWriter(ABC):
 
     @abstractmethod
     def has(self, field: str, frame: int) -> bool:
-        """Whether a field of a frame is already there, whole."""
+        """Return whether a field of a frame already exists and is complete."""
 
     @abstractmethod
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
-        """Write one field of one frame, over what is there.
+        """Write one field of one frame; an existing one is replaced.
 
-        A grid's params.json comes before its first frame. Stores that append want each field's frames in rising order.
+        The params.json of a grid must be written before its first frame. Stores that append need the frames of each field in
+        increasing order.
 
         Raises:
             FormatError: the array does not fit the field.
@@ -294,26 +298,26 @@ class SequenceWriter(ABC):
 
     @abstractmethod
     def write_document(self, name: str, data: bytes) -> None:
-        """Write a text file's bytes, over what is there."""
+        """Write the bytes of a text file; an existing file is replaced."""
 
     @abstractmethod
     def read_document(self, name: str) -> bytes | None:
-        """Return a text file's bytes, None if it is not there: how a second run finds what a first one left."""
+        """Return the bytes of an existing text file, or None. A run uses this to continue the output of an earlier run."""
 
     def read(self, field: str, frame: int) -> NDArray[Any] | None:
-        """Return a field of a frame that is there, as the file's flat or (N, columns) rows; None where the store cannot tell."""
+        """Return an existing field of a frame as a flat array or (N, columns) rows; None if the store cannot read it."""
         return None
 
     def remove_grid(self, grid: str) -> None:
-        """Remove a grid, its params.json last, so that a removal that is cut short can be gone on with.
+        """Remove a grid. Its params.json is removed last, so that an interrupted removal can be continued.
 
         Raises:
-            ConflictError: the store cannot.
+            ConflictError: the store cannot remove grids.
         """
         raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new one")
 
     def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)
-        """Finish: a store that needs a last word (an index) says it here. Not called when the work failed."""
+        """Finish the sequence, for example by writing an index. This is not called if the work failed."""
 
     def __enter__(self) -> Self:
         return self
@@ -326,16 +330,16 @@ class SequenceWriter(ABC):
 
 
 class Sink(ABC):
-    """Where sequences are written to."""
+    """A store that sequences are written to."""
 
     location: str
 
     @abstractmethod
     def sequence(self, path: str) -> SequenceWriter:
-        """Start, or go on with, the sequence at a path such as "Train/Town01_Light/cartesian"."""
+        """Start or continue the sequence at a path such as "Train/Town01_Light/cartesian"."""
 
     def close(self) -> None:  # noqa: B027 (a folder has nothing to finish)
-        """Finish: a packed store stands in its place from here on. Not called when the work failed."""
+        """Finish the store. A packed store gets its final name here. This is not called if the work failed."""
 
     def __enter__(self) -> Self:
         return self
@@ -348,10 +352,10 @@ class Sink(ABC):
 
 
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
-    """Return split, name and coordinates that a sequence's path tells.
+    """Return the split, the name and the coordinates of a sequence from its path.
 
-    The path is that of the `<coordinates>` folder, as much of it as is known, absolute or not. A last part that names no
-    coordinates is the sequence itself, Cartesian.
+    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be missing. If the last part is not the
+    name of coordinates, it is the name of the sequence, whose coordinates are then Cartesian.
     """
     parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("/", ".")]
     coordinates = parts.pop() if parts and parts[-1] in layout.COORDINATES else "cartesian"

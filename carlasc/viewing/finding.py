@@ -35,7 +35,7 @@ class FoundSequence:
 
 
 def find_sequence(source: SceneSource, name: str | None = None) -> FoundSequence:
-    """Find the sequence that a source and a name stand for.
+    """Find the sequence that a source and a name describe.
 
     Args:
         source: see `SceneSource`.

@@ -1,4 +1,4 @@
-"""Ground truth by ray voting in plain NumPy: slow, dense and short. The judge of the kernel (FORMAT section 4)."""
+"""Ground truth by ray voting in plain NumPy: slow, dense and short. The judge of the kernel (see the format page, `docs/format.md#votes`)."""
 
 from __future__ import annotations
 

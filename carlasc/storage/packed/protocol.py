@@ -41,7 +41,7 @@ class Options:
 
     @property
     def scale_m(self) -> float | None:
-        """Metres that one step of a quantised coordinate stands for; None where points are not quantised."""
+        """Size of one step of a quantised coordinate, metres; None if points are not quantised."""
         return None if self.lossy_mm is None else self.lossy_mm / 1000
 
 

@@ -104,7 +104,7 @@ class FrameRenderer:
 
 
 def views_named(name: str) -> tuple[View, ...]:
-    """Return the views that a name stands for: "both" stands for two.
+    """Return the views that a name means: one, or two for "both".
 
     Raises:
         ArgumentError: an unknown name.

@@ -38,7 +38,7 @@ _RIGHT, _LEFT, _SPACE = 262, 263, 32  # key codes of GLFW
 _PRESSED, _SHIFT, _CONTROL = 1, 1, 2
 _SUN = np.array([-0.38, -0.5, 0.78]) / np.linalg.norm([0.38, 0.5, 0.78])
 _BACKGROUND = (0.96, 0.965, 0.972)
-_EDGE = 0.8  # brightness of a voxel's edges, relative to its faces
+_EDGE = 0.8  # brightness of the edges of voxels, relative to their faces
 
 
 @dataclass

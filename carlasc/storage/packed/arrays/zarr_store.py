@@ -341,7 +341,7 @@ def _codecs(encoding: Encoding, dtype: np.dtype[Any]) -> dict[str, Any]:
 
 
 def _encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
-    """Return the encoding that the (inner) codecs in an array's metadata stand for.
+    """Return the encoding that the (inner) codecs in an array's metadata describe.
 
     Raises:
         ValueError: they are not those of an `Encoding`.
