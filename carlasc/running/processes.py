@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
@@ -63,8 +62,8 @@ def count_workers(workers: int | None) -> int:
         ArgumentError: `workers` is not positive.
     """
     if workers is None:
-        # macOS does not say which cores a process may use.
-        return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+        cores_of = getattr(os, "sched_getaffinity", None)  # macOS does not say which cores a process may use
+        return len(cores_of(0)) if cores_of else os.cpu_count() or 1
     if workers < 1:
         raise ArgumentError("workers", expected="at least 1", found=str(workers))
     return workers

@@ -27,7 +27,7 @@ def test_the_benchmark_simulates_trains_and_prints_both_tables_and_goes_on_where
     results = json.loads((tmp_path / "results.json").read_text())["results"]
     assert [result["name"] for result in results[:4]] == ["LMSCNet SS", "SSCNet full", "MotionSC T=1", "MotionSC T=5"]
     assert len(results) == 8
-    assert all(0 < result["voxels"] == results[0]["voxels"] for result in results)
+    assert all(0 < result["scored_voxels"] == results[0]["scored_voxels"] for result in results)
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("best.safetensors")}
     benchmark.main(tmp_path, **arguments)
     assert capsys.readouterr().out == printed
