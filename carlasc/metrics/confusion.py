@@ -96,8 +96,7 @@ class ConfusionMatrix:
 
     def merge(self, other: ConfusionMatrix) -> Self:
         """Add what another matrix has counted, in any order; the same as `+=`."""
-        self += other
-        return self
+        return self.__iadd__(other)
 
     def compute(self) -> dict[str, float]:
         """Return the usual figures by name: `miou`, `accuracy`, and `precision`, `recall` and `iou` of occupied space."""
