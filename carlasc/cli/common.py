@@ -171,16 +171,6 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     return values
 
 
-def parse_frames(text: str | None) -> tuple[int | None, int | None] | None:
-    """Read a half-open range of frame numbers: "A:B", "A:", ":B", or one frame "A".
-
-    Raises:
-        ArgumentError: it is not a range.
-    """
-    frames = _read_frames(text)
-    return None if frames is None else (frames.start, frames.stop)
-
-
 def _read_frames(text: str | None) -> FrameRange | None:
     from carlasc.core.frames import FrameRange
 

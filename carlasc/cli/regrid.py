@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from carlasc.cli.common import (
+    FramesOption,
     Json,
     Overwrite,
     Workers,
-    parse_frames,
     print_json,
     progress_bar,
     report_failures,
@@ -75,10 +75,7 @@ def regrid(
     bounds: BoundsOption = None,
     free_step_m: Annotated[float, typer.Option(help="Distance between two free samples on a ray, in metres.")] = 1.5,
     rule: RuleOption = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(help="Frame numbers A:B of the source, without B; either end may be left out.", metavar="A:B"),
-    ] = None,
+    frames: FramesOption = None,
     workers: Workers = None,
     keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False,
     name: Annotated[str | None, typer.Option(help="Name of the grid's folder; default: a name by its size.")] = None,
@@ -139,7 +136,7 @@ def regrid(
             out,
             observe=_observe(observe, scans, from_grid),
             voting=voting,
-            frames=parse_frames(frames),
+            frames=frames,
             name=name,
             overwrite=overwrite,
             workers=workers,

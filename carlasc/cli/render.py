@@ -7,11 +7,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Json, print_json, progress_bar
+from carlasc.cli.common import FramesOption, Json, print_json, progress_bar
 from carlasc.cli.scene_options import (
     ClassesOption,
     EveryOption,
-    FramesOption,
     GridOption,
     OverwriteOption,
     SequenceOption,
@@ -21,7 +20,6 @@ from carlasc.cli.scene_options import (
     TruthOption,
     describe_frames,
 )
-from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError
 
 
@@ -82,7 +80,7 @@ def render(
     scene = viewing.Scene(
         source,
         sequence=sequence,
-        frames=None if frames is None else FrameRange.parse(frames),
+        frames=frames,
         every=every,
         grid=grid,
         truth=truth,

@@ -15,9 +15,6 @@ SourceArgument = Annotated[
 SequenceOption = Annotated[
     str | None, typer.Option("--sequence", help="Name of the sequence if there are several. Default: the first.")
 ]
-FramesOption = Annotated[
-    str | None, typer.Option("--frames", help="Frames A:B (B not included), or one frame A. Default: see above.")
-]
 EveryOption = Annotated[int, typer.Option("--every", help="Take every N-th frame.", min=1)]
 GridOption = Annotated[
     str | None, typer.Option("--grid", help="Name of the grid. Default: `evaluation`, or the first grid.")

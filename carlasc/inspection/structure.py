@@ -62,7 +62,7 @@ def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArra
 
 
 def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
-    """Which ids are things that stand still and upright; where no label says that a thing moves, no movable class counts."""
+    """Return which ids are static objects above the ground. If no class contains only moving objects, all movable classes are left out."""
     static = np.zeros(np.iinfo(np.uint16).max + 1, np.bool_)
     static[sorted(set(table.names) - {0} - table.ground - (table.moving or table.movable))] = True
     return static

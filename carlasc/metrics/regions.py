@@ -40,7 +40,7 @@ def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 
     """Return which voxels the sensor could see at this instant, and which it could not, according to the true grid.
 
     A voxel is visible if no occupied voxel of the truth is between the sensor and the centre of the voxel. A network can only complete
-    the other voxels, because it has no observation of them.
+    the other voxels, because the scan of this instant does not observe them.
 
     Args:
         truth: the true grid, Cartesian.

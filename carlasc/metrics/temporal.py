@@ -59,8 +59,8 @@ class Consistency:
         Args:
             earlier: grid of frame t.
             later: grid of frame t + 1, of the same geometry.
-            later_T_earlier: (4, 4) how the sensor moved.
-            ignored: (X, Y, Z) bool voxels of the later frame that are left out (where something moves that no class tells).
+            later_T_earlier: (4, 4) motion of the sensor.
+            ignored: (X, Y, Z) bool voxels of the later frame that are left out, such as moving objects of a static class.
 
         Raises:
             FormatError: the geometries differ.

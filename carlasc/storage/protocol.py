@@ -81,7 +81,7 @@ class Sequence(ABC):
         """
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read one field of several frames. Stores that can do so read them in one request."""
+        """Read one field of several frames. Stores that can do so read them together."""
         return [self.read(field, frame) for frame in frames]
 
     def read_xyz(

@@ -10,7 +10,8 @@ import typer
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.cli.common import CommandGroup, FramesOption, parse_frames, parse_numbers, print_json, report_failures
+from carlasc.cli.common import CommandGroup, FramesOption, parse_numbers, print_json, report_failures
+from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 
 
@@ -129,14 +130,13 @@ def test_failures_of_a_batch_are_listed_and_exit_1():
 
 
 def test_frames_are_half_open_ranges():
-    assert parse_frames(None) is None
-    assert parse_frames("3:7") == (3, 7)
-    assert parse_frames("3:") == (3, None)
-    assert parse_frames(":7") == (None, 7)
-    assert parse_frames("3") == (3, 4)
+    assert FrameRange.parse("3:7") == FrameRange(3, 7)
+    assert FrameRange.parse("3:") == FrameRange(3, None)
+    assert FrameRange.parse(":7") == FrameRange(None, 7)
+    assert FrameRange.parse("3") == FrameRange(3, 4)
     for text in ("a:b", "7:3", "3:3", "1:2:3"):
         with pytest.raises(ArgumentError, match="frames: expected"):
-            parse_frames(text)
+            FrameRange.parse(text)
 
 
 def test_numbers_are_counted():

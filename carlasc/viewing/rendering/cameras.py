@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import ArgumentError
+from carlasc.storage.metadata import Axes
 
 Floats = NDArray[np.float64]
 
@@ -154,7 +155,7 @@ class Camera:
 
 
 def perspective_camera(
-    extent: Floats, viewpoint: Viewpoint, aspect: float, *, left_handed: bool = True, margin: float = 0.02
+    extent: Floats, viewpoint: Viewpoint, aspect: float, *, axes: Axes = "left", margin: float = 0.02
 ) -> Camera:
     """Return the camera of a viewpoint; what the viewpoint leaves open is fitted to the extent.
 
@@ -162,7 +163,7 @@ def perspective_camera(
         extent: (N, 3) points that should be in the picture, metres.
         viewpoint: what is given.
         aspect: width over height of the picture.
-        left_handed: whether y points to the right in the frame of the data.
+        axes: handedness of the data: "left" (y to the right) or "right" (y to the left).
         margin: share of the picture that is left free on each side.
 
     Raises:
@@ -176,39 +177,39 @@ def perspective_camera(
             raise ArgumentError(
                 "viewpoint", expected="a target away from the position", found=f"both at {target.tolist()}"
             )
-        return Camera(position, _axes(target - position, left_handed), tan_y)
+        return Camera(position, _upright(target - position, axes), tan_y)
 
-    side = 1.0 if left_handed else -1.0
+    side = 1.0 if axes == "left" else -1.0
     azimuth, elevation = viewpoint.azimuth_rad, viewpoint.elevation_rad
     forward = np.array(
         [np.cos(azimuth) * np.cos(elevation), -side * np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)]
     )
-    axes = _axes(forward, left_handed, azimuth)
+    rows = _upright(forward, axes, azimuth)
     if viewpoint.distance_m is not None:
-        return Camera(target - viewpoint.distance_m * axes[2], axes, tan_y)
+        return Camera(target - viewpoint.distance_m * rows[2], rows, tan_y)
     seen = 1 - 2 * margin
     if viewpoint.target is None:
-        distance, shift = _fit(extent - target, axes, tan_y * aspect * seen, tan_y * seen)
-        target = target + shift[0] * axes[0] + shift[1] * axes[1]
+        distance, shift = _fit(extent - target, rows, tan_y * aspect * seen, tan_y * seen)
+        target = target + shift[0] * rows[0] + shift[1] * rows[1]
     else:
-        distance = max(_fit(extent - target, axes, tan_y * aspect * seen, tan_y * seen)[0], 1.0)
-    return Camera(target - distance * axes[2], axes, tan_y)
+        distance = max(_fit(extent - target, rows, tan_y * aspect * seen, tan_y * seen)[0], 1.0)
+    return Camera(target - distance * rows[2], rows, tan_y)
 
 
-def birdseye_camera(extent: Floats, aspect: float, *, left_handed: bool = True, margin: float = 0.01) -> Camera:
+def birdseye_camera(extent: Floats, aspect: float, *, axes: Axes = "left", margin: float = 0.01) -> Camera:
     """Return an orthographic camera above the extent: x points up in the picture, the vehicle's right is on the right."""
     lower, upper = extent.min(0), extent.max(0)
     size = np.maximum(upper - lower, 1e-3)
-    axes = np.array([[0.0, 1.0 if left_handed else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    rows = np.array([[0.0, 1.0 if axes == "left" else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     half_height = max(size[0], size[1] / aspect) / 2 / (1 - 2 * margin)
     middle = (lower + upper) / 2
-    return Camera(np.array([middle[0], middle[1], upper[2] + 10.0]), axes, float(half_height), orthographic=True)
+    return Camera(np.array([middle[0], middle[1], upper[2] + 10.0]), rows, float(half_height), orthographic=True)
 
 
-def _axes(forward: Floats, left_handed: bool, azimuth: float = 0.0) -> Floats:
+def _upright(forward: Floats, axes: Axes, azimuth: float = 0.0) -> Floats:
     """Return rows right, up, forward of an upright camera; if it looks straight down, its top points along `azimuth`."""
     forward = forward / np.linalg.norm(forward)
-    side = 1.0 if left_handed else -1.0
+    side = 1.0 if axes == "left" else -1.0
     right = side * np.cross((0.0, 0.0, 1.0), forward)
     if np.linalg.norm(right) < 1e-6:
         right = np.array([np.sin(azimuth), side * np.cos(azimuth), 0.0])

@@ -11,6 +11,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import FormatError
 from carlasc.metrics.comparison import Outcome, compare_grids
+from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry
 from carlasc.viewing.remapping import without_invalid_points
@@ -47,11 +48,11 @@ class Drawing:
     legend: list[Entry] = field(default_factory=list)
     note: str | None = None
 
-    def render(self, camera: Camera, width: int, height: int, *, left_handed: bool = True) -> NDArray[np.uint8]:
-        """Return the picture, (height, width, 3) uint8, without legend or title."""
+    def render(self, camera: Camera, width: int, height: int, *, axes: Axes = "left") -> NDArray[np.uint8]:
+        """Return the picture, (height, width, 3) uint8, without legend or title; `axes` is the handedness of the data."""
         frame = empty_frame(width, height)
         if self.mesh is not None:
-            cast(self.mesh, camera, frame, left_handed=left_handed)
+            cast(self.mesh, camera, frame, axes=axes)
         if self.points is not None and self.point_colors is not None:
             splat(self.points, self.point_colors, camera, frame)
         return frame.resolve()

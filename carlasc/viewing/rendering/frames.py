@@ -59,7 +59,11 @@ class FrameRenderer:
             title = self._title(content) if len(contents) > 1 else ""
             panels += [Panel(drawing, view, title, self._view_of(drawing, view, frame)) for view in self.views]
         return draw_panels(
-            panels, viewpoint=viewpoint, size=self.size, legend=self.legend, left_handed=self.reader.left_handed
+            panels,
+            viewpoint=viewpoint,
+            size=self.size,
+            legend=self.legend,
+            axes=self.reader.data.sequence.metadata.axes,
         )
 
     def draw(self, content: str, frame: int) -> Drawing:

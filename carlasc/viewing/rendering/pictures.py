@@ -15,6 +15,7 @@ from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
+from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ClassColors, Entry, PaletteName, merge_legends
 from carlasc.viewing.rendering.cameras import Viewpoint, birdseye_camera, perspective_camera
 from carlasc.viewing.rendering.drawings import (
@@ -56,7 +57,7 @@ def draw_panels(
     viewpoint: Viewpoint | None = None,
     size: tuple[int, int] = DEFAULT_SIZE,
     legend: Sequence[Entry] | bool = True,
-    left_handed: bool = True,
+    axes: Axes = "left",
 ) -> NDArray[np.uint8]:
     """Draw panels side by side.
 
@@ -65,17 +66,19 @@ def draw_panels(
         viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
         size: (width, height) of the whole picture, pixels.
         legend: whether there is a legend; or its entries, so that all pictures of a film have the same legend.
-        left_handed: whether y points to the right in the frame of the data.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
 
     Returns:
         (height, width, 3) uint8 RGB.
 
     Raises:
-        ArgumentError: no panel, or an impossible size, view or viewpoint.
+        ArgumentError: no panel, or an impossible size, view, viewpoint or value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
     if not panels:
         raise ArgumentError("panels", expected="at least one", found="none")
+    if axes not in get_args(Axes):
+        raise ArgumentError("axes", expected=" or ".join(get_args(Axes)), found=repr(axes))
     for panel in panels:
         if panel.view not in VIEWS:
             raise ArgumentError("view", expected=f"one of {', '.join(VIEWS)}", found=repr(panel.view))
@@ -89,9 +92,7 @@ def draw_panels(
         legend=entries,
         aspect=float(np.mean([1.0 if panel.view == "bev" else 16 / 9 for panel in panels])),
     )
-    pictures = [
-        _draw(panel, page, number, viewpoint or Viewpoint(), left_handed) for number, panel in enumerate(panels)
-    ]
+    pictures = [_draw(panel, page, number, viewpoint or Viewpoint(), axes) for number, panel in enumerate(panels)]
     return draw_page(page, pictures, [panel.title for panel in panels], [panel.drawing.note for panel in panels])
 
 
@@ -104,7 +105,7 @@ def render_grid(
     size: tuple[int, int] = DEFAULT_SIZE,
     palette: PaletteName = "class",
     legend: bool = True,
-    left_handed: bool = True,
+    axes: Axes = "left",
     title: str = "",
     ego: bool = True,
 ) -> NDArray[np.uint8]:
@@ -118,7 +119,7 @@ def render_grid(
         size: (width, height), pixels.
         palette: "class", "colorblind" or "height".
         legend: whether there is a legend, of the classes in the grid.
-        left_handed: whether y points to the right (CarlaSC) or to the left (KITTI) in the frame of the grid.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
         title: a line above the picture; "" for none.
         ego: whether a plain car is drawn at the sensor.
 
@@ -127,13 +128,11 @@ def render_grid(
 
     Raises:
         FormatError: a label is not in the class table.
-        ArgumentError: an impossible size, view or palette.
+        ArgumentError: an impossible size, view, palette or value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
     drawing = grid_drawing(grid, ClassColors(table, palette), ego=ego)
-    return draw_panels(
-        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed
-    )
+    return draw_panels([Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes)
 
 
 def render_scan(
@@ -145,7 +144,7 @@ def render_scan(
     size: tuple[int, int] = DEFAULT_SIZE,
     palette: PaletteName = "class",
     legend: bool = True,
-    left_handed: bool = True,
+    axes: Axes = "left",
     title: str = "",
     ego: bool = True,
     flow: bool = False,
@@ -161,7 +160,7 @@ def render_scan(
         size: (width, height), pixels.
         palette: "class", "colorblind" or "height".
         legend: whether there is a legend.
-        left_handed: whether y points to the right (CarlaSC) or to the left (KITTI) in the frame of the scan.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
         title: a line above the picture; "" for none.
         ego: whether a plain car is drawn at the sensor.
         flow: draw static points in grey, moving ones in colour, with an arrow as long as the distance moved in one second.
@@ -172,14 +171,12 @@ def render_scan(
 
     Raises:
         FormatError: a label is not in the class table, or `flow` is given and the scan has no flow.
-        ArgumentError: an impossible size, view or palette.
+        ArgumentError: an impossible size, view, palette or value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
     draw = flow_drawing if flow else scan_drawing
     drawing = draw(scan, ClassColors(table, palette), extent=extent, ego=ego)
-    return draw_panels(
-        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed
-    )
+    return draw_panels([Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes)
 
 
 def render_comparison(
@@ -193,7 +190,7 @@ def render_comparison(
     size: tuple[int, int] = DEFAULT_SIZE,
     palette: PaletteName = "class",
     legend: bool = True,
-    left_handed: bool = True,
+    axes: Axes = "left",
     ego: bool = True,
 ) -> NDArray[np.uint8]:
     """Draw a prediction beside the ground truth and, with `errors`, where it is right, wrong, missed or invented.
@@ -208,7 +205,7 @@ def render_comparison(
         size: (width, height) of the whole picture, pixels.
         palette: "class", "colorblind" or "height".
         legend: whether there is a legend.
-        left_handed: whether y points to the right (CarlaSC) or to the left (KITTI) in the frame of the grids.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
         ego: whether a plain car is drawn at the sensor.
 
     Returns:
@@ -216,7 +213,7 @@ def render_comparison(
 
     Raises:
         FormatError: a label is not in the class table.
-        ArgumentError: the grids differ in their geometry; or an impossible size, view or palette.
+        ArgumentError: the grids differ in their geometry; or an impossible size, view, palette or value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
     colors = ClassColors(table, palette)
@@ -226,17 +223,17 @@ def render_comparison(
     ]
     if errors:
         panels.append(Panel(error_drawing(prediction, truth, ego=ego), view, "errors"))
-    return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, left_handed=left_handed)
+    return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, axes=axes)
 
 
-def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, left_handed: bool) -> NDArray[np.uint8]:
+def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, axes: Axes) -> NDArray[np.uint8]:
     box = page.panels[number]
     aspect = box.width / box.height
     extent = panel.drawing.extent if panel.fixed_view is None else panel.fixed_view[0]
     if panel.view == "bev":
-        camera = birdseye_camera(extent, aspect, left_handed=left_handed)
+        camera = birdseye_camera(extent, aspect, axes=axes)
     else:
-        camera = perspective_camera(extent, viewpoint, aspect, left_handed=left_handed)
+        camera = perspective_camera(extent, viewpoint, aspect, axes=axes)
     if panel.fixed_view is not None:
         camera = camera.moved(panel.fixed_view[1])
-    return panel.drawing.render(camera, box.width, box.height, left_handed=left_handed)
+    return panel.drawing.render(camera, box.width, box.height, axes=axes)

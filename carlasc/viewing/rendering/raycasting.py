@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import import_extra
+from carlasc.storage.metadata import Axes
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
@@ -56,14 +57,14 @@ def empty_frame(width: int, height: int) -> Frame:
     return Frame(np.full((*shape, 3), BACKGROUND, np.uint8), np.full(shape, np.inf, np.float32))
 
 
-def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = True) -> None:
+def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, axes: Axes = "left") -> None:
     """Draw a mesh into a frame, with light and shadows.
 
     Args:
         mesh: what is drawn.
         camera: from where it is seen.
         frame: is drawn into, where the mesh is nearer than what the frame already shows.
-        left_handed: whether y points to the right in the frame of the data; the sun is behind the vehicle on its left in both cases.
+        axes: handedness of the data: "left" or "right"; the sun is behind the vehicle on its left in both cases.
 
     Raises:
         DependencyError: Embree is not installed.
@@ -72,7 +73,7 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, left_handed: bool = Tr
         return
     scene, geometry = _embree_scene(mesh)
     sky = _sky_visibility(scene, mesh)
-    suns = _suns(left_handed)
+    suns = _suns(axes)
     extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
     height, width = frame.depth.shape
     band = max(1, _BAND // width)
@@ -117,9 +118,9 @@ def _embree_scene(mesh: QuadMesh) -> tuple[Any, Any]:
     return scene, construction.TriangleMesh(scene, *mesh.triangles())
 
 
-def _suns(left_handed: bool) -> NDArray[np.float32]:
+def _suns(axes: Axes) -> NDArray[np.float32]:
     """Return (SAMPLES^2, 3) unit vectors to points of the sun's disc, behind the vehicle on its left."""
-    sun = _TO_SUN * (1.0, 1.0 if left_handed else -1.0, 1.0)
+    sun = _TO_SUN * (1.0, 1.0 if axes == "left" else -1.0, 1.0)
     spread = 0.02 * np.array([(a, b) for a in np.linspace(-1, 1, SAMPLES) for b in np.linspace(-1, 1, SAMPLES)])
     suns = sun + np.column_stack([spread, np.zeros(len(spread))])
     return (suns / np.linalg.norm(suns, axis=1, keepdims=True)).astype(np.float32)

@@ -14,7 +14,7 @@ angles = st.floats(-3.1, 3.1)
 @given(angles, st.floats(-1.5, 1.5), st.floats(0.2, 2.0), st.floats(0.3, 4.0), st.booleans())
 def test_a_fitted_camera_sees_the_whole_scene_and_fills_the_picture(azimuth, elevation, fov, aspect, left_handed):
     viewpoint = Viewpoint(azimuth_rad=azimuth, elevation_rad=elevation, fov_rad=fov)
-    camera = perspective_camera(BOX, viewpoint, aspect, left_handed=left_handed, margin=0.0)
+    camera = perspective_camera(BOX, viewpoint, aspect, axes="left" if left_handed else "right", margin=0.0)
     columns, rows, depths = camera.project(BOX, round(1000 * aspect), 1000)
     assert (depths > 0).all()
     assert columns.min() > -1 and columns.max() < round(1000 * aspect) + 1
@@ -25,7 +25,7 @@ def test_a_fitted_camera_sees_the_whole_scene_and_fills_the_picture(azimuth, ele
 
 @given(angles, st.floats(-1.5, 1.5), st.booleans())
 def test_axes_are_unit_vectors_at_right_angles_and_up_is_up(azimuth, elevation, left_handed):
-    camera = perspective_camera(BOX, Viewpoint(azimuth, elevation), 1.5, left_handed=left_handed)
+    camera = perspective_camera(BOX, Viewpoint(azimuth, elevation), 1.5, axes="left" if left_handed else "right")
     np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-9)
     assert camera.axes[1, 2] > 0
     assert abs(camera.axes[0, 2]) < 1e-9
@@ -37,8 +37,8 @@ def test_axes_are_unit_vectors_at_right_angles_and_up_is_up(azimuth, elevation, 
 def test_the_vehicles_right_is_on_the_right(left_handed, right):
     beside = np.array([[10.0, 5.0 * right, -1.0], [10.0, -5.0 * right, -1.0]])
     for camera in (
-        perspective_camera(BOX, Viewpoint(), 1.5, left_handed=left_handed),
-        birdseye_camera(BOX, 1.5, left_handed=left_handed),
+        perspective_camera(BOX, Viewpoint(), 1.5, axes="left" if left_handed else "right"),
+        birdseye_camera(BOX, 1.5, axes="left" if left_handed else "right"),
     ):
         columns, rows, _ = camera.project(beside, 300, 200)
         assert columns[0] > 150 > columns[1]
@@ -48,7 +48,7 @@ def test_the_vehicles_right_is_on_the_right(left_handed, right):
 
 def test_azimuth_90_stands_on_the_vehicles_right():
     for left_handed in (True, False):
-        camera = perspective_camera(BOX, Viewpoint(azimuth_rad=np.pi / 2), 1.5, left_handed=left_handed)
+        camera = perspective_camera(BOX, Viewpoint(azimuth_rad=np.pi / 2), 1.5, axes="left" if left_handed else "right")
         assert camera.position[1] * (1 if left_handed else -1) > 20
         assert abs(camera.position[0]) < 1e-6
 

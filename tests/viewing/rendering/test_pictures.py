@@ -47,7 +47,7 @@ def test_a_block_ahead_on_the_right_is_ahead_and_on_the_right(spec, view):
 @views
 def test_in_kittis_frame_left_is_left(view):
     grid = grid_with({(10, 5, -0.5): RED})  # y is left there
-    picture = render_grid(grid, view=view, size=SIZE, legend=False, ego=False, left_handed=False)
+    picture = render_grid(grid, view=view, size=SIZE, legend=False, ego=False, axes="right")
     column, _ = middle_of(red_pixels(picture))
     assert column < SIZE[0] / 2
     mirrored = render_grid(grid, view=view, size=SIZE, legend=False, ego=False)[:, ::-1]
@@ -276,6 +276,11 @@ def test_an_unknown_view_is_refused(view):
         draw_panels([])
 
 
+def test_unknown_axes_are_refused():
+    with pytest.raises(ArgumentError, match="axes: expected left or right, found 'up'"):
+        render_grid(grid_with({}), axes="up", size=SIZE)
+
+
 def test_points_have_the_colours_of_their_classes_and_a_legend():
     scan = scan_of(((5, 0, 0), RED, (0, 0, 0), 0), ((0, 5, 0), 0, (0, 0, 0), 0))
     drawing = scan_drawing(scan, ClassColors())
@@ -337,10 +342,10 @@ def test_the_legend_names_the_classes_of_all_panels():
     assert has_color(legend, CARLA.colors[RED], 0) and has_color(legend, CARLA.colors[BLUE], 0)
 
 
-@pytest.mark.parametrize("left_handed", [True, False])
-def test_shadows_fall_ahead_to_the_right(left_handed):
+@pytest.mark.parametrize("axes", ["left", "right"])
+def test_shadows_fall_ahead_to_the_right(axes):
     tower = grid_with({(0, 0, z): BLUE for z in (-1.5, -0.5, 0.5)})
-    picture = render_grid(tower, view="bev", size=(400, 400), legend=False, ego=False, left_handed=left_handed)
+    picture = render_grid(tower, view="bev", size=(400, 400), legend=False, ego=False, axes=axes)
     right, ahead = (int(400 * 0.98 / 51.2 * metres) for metres in (1.3, 1.0))
     assert picture[200 - ahead, 200 + right].max() < 200  # in the shadow
     for row, column in ((200 + ahead, 200 - right), (200 + ahead, 200 + right), (200 - ahead, 200 - right)):
