@@ -244,6 +244,7 @@ def test_option_tables_name_every_option():
                     assert f"`{option}`" in table, f"{name}: {option}"
 
 
+@pytest.mark.needs("mkdocs", "material", "mkdocstrings")
 def test_the_site_builds_without_a_warning(tmp_path):
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     arguments = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
@@ -263,6 +264,8 @@ def test_no_page_is_only_api():
 
 @pytest.fixture(scope="session")
 def figures():
+    for package in ("matplotlib", "PIL", "embreex"):
+        pytest.importorskip(package)
     sys.path.insert(0, str(DOCS))
     try:
         import figures

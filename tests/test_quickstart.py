@@ -4,10 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
-import torch
-from helpers.drives import write_drive
 
-from carlasc.core.grids import GridSpec
+torch = pytest.importorskip("torch")
+
+from helpers.drives import write_drive  # noqa: E402
+
+from carlasc.core.grids import GridSpec  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 HOWTO, README = ROOT / "docs" / "howto" / "train.md", ROOT / "README.md"

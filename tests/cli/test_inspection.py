@@ -80,6 +80,7 @@ def test_info_of_a_capture_tells_its_sensors(golden_capture: Path) -> None:
     assert "5 sensors, 3 frames (100..102)" in run("info", golden_capture / "raw").output
 
 
+@pytest.mark.needs("matplotlib")
 def test_stats_prints_both_tables_and_draws_the_plot(sequence: Path, tmp_path: Path) -> None:
     plot = tmp_path / "classes.png"
     result = run("stats", sequence, "--plot", plot)

@@ -102,6 +102,7 @@ def test_validate_finds_ids_that_the_table_lacks(converted, tmp_path):
     assert "lab" in found["class-ids"].expected and "9 (1 times)" in found["class-ids"].found
 
 
+@pytest.mark.needs("embreex", "PIL")
 def test_it_is_drawn_in_its_own_colours(converted, tmp_path):
     pytest.importorskip("embreex")
     pytest.importorskip("PIL")
