@@ -5,14 +5,12 @@ Mirroring is its own inverse, so each function serves both directions.
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
-
-Axes = Literal["left", "right"]
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 

@@ -10,7 +10,7 @@ import operator
 import os
 from collections.abc import Callable, Iterable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, SupportsIndex
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,7 @@ from carlasc.dataset.selection import (
 from carlasc.dataset.transforms import Sample
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, import_extra
 from carlasc.storage import Sequence, Source, as_source, layout
-
-Axes = Literal["left", "right"]
+from carlasc.storage.metadata import Axes
 
 FIELDS = ("occupancy", "density", "labels", "known", "counts", "points", "point_labels", "flow", "poses")
 ALWAYS = ("valid", "sequence", "frame")
