@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from carlasc.converting.axes import Axes
 from carlasc.converting.frames import Block, FrameJob, Target, Velocity, convert_block, write_fields
 from carlasc.converting.places import check_outside
 from carlasc.converting.plans import (
@@ -30,7 +29,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 from carlasc.running.processes import count_workers, run_all
 from carlasc.storage.folders.folder import FolderSink
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.protocol import Sink
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ def run(path: Path) -> nbformat.NotebookNode:
     Raises:
         nbclient.exceptions.CellExecutionError: a cell raised an error.
     """
-    notebook = nbformat.read(path, as_version=4)
+    notebook = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
     with tempfile.TemporaryDirectory() as folder:
         NotebookClient(notebook, timeout=600, resources={"metadata": {"path": folder}}, record_timing=False).execute()
     for cell in notebook.cells:
@@ -30,4 +30,4 @@ def run(path: Path) -> nbformat.NotebookNode:
 
 if __name__ == "__main__":
     for notebook in NOTEBOOKS:
-        nbformat.write(run(notebook), notebook)
+        nbformat.write(run(notebook), notebook)  # type: ignore[no-untyped-call]
