@@ -113,6 +113,8 @@ def draw_frame_scores(evaluation: Evaluation, plot: Path) -> None:
         axes.set_title(path or evaluation.name, loc="left", fontsize=10)
         axes.grid(alpha=0.3)
     figure.axes[0].legend(loc="upper right", fontsize=8, ncols=3)
+    for axes in figure.axes:
+        axes.xaxis.get_major_locator().set_params(integer=True)
     figure.axes[-1].set_xlabel("frame")
     figure.suptitle(f"{evaluation.name}, by {evaluation.convention.title}")
     _write(figure, plot)
