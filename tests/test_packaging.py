@@ -103,6 +103,17 @@ def test_the_release_checklist_lists_the_relative_links_of_the_readme():
     assert all((ROOT / link.partition("#")[0]).is_file() for link in relative)
 
 
+def test_files_that_contributors_are_sent_to_exist():
+    for page in ("CONTRIBUTING.md", "docs/contributing.md", "docs/releasing.md", "SECURITY.md"):
+        text = (ROOT / page).read_text()
+        named = re.findall(r"`((?:carlasc|converters|docs|tests|examples)/[\w./-]+)`", text)
+        linked = [
+            (ROOT / page).parent / link for link in re.findall(r"\]\(([^)#:]+)[^)]*\)", text) if "http" not in link
+        ]
+        missing = [str(path) for path in [*map(ROOT.__truediv__, named), *linked] if not path.exists()]
+        assert not missing, f"{page}: {missing}"
+
+
 @pytest.mark.slow
 def test_the_types_are_right_on_macos_too(tmp_path):
     pytest.importorskip("mypy")
