@@ -1,7 +1,6 @@
 """A bad frame is named and the others go on; a place that cannot be written to stops the run; nothing half-written stays."""
 
 import re
-import shutil
 import subprocess
 import sys
 
@@ -102,9 +101,6 @@ def test_a_file_cut_short_in_the_output_fails_its_frame_alone(tmp_path):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_full_disk_stops_the_run_in_one_line_and_leaves_whole_files(tmp_path, workers):
     """A limit on the size of files fails a write in its middle, as a full disk does."""
-    write_capture(tmp_path / "first")
-    regrid(tmp_path / "first", GridSpec.published(), workers=1)  # compiled code is cached, which needs larger files
-    shutil.rmtree(tmp_path / "first")
     write_capture(tmp_path, frames=4)
     code = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
@@ -113,7 +109,9 @@ def test_a_full_disk_stops_the_run_in_one_line_and_leaves_whole_files(tmp_path, 
     command = [sys.executable, "-c", code, "regrid", str(tmp_path), "--preset", "coarse", "--workers", str(workers)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 1
-    (line,) = run.stderr.splitlines()
+    assert "Traceback" not in run.stderr
+    # Numba may warn that its cache of compiled code exceeds this limit, too; of our own there is one line.
+    (line,) = [line for line in run.stderr.splitlines() if line.startswith("carlasc: ")]
     assert "evaluation/00000" in line and "cannot be written: File too large" in line
     written = read_tree(tmp_path)
     assert not [name for name in written if ".part" in name or name.startswith("cartesian/evaluation/0")]
