@@ -21,15 +21,16 @@ test: $(VENV)/ready .system-libraries lint types docs unit ## lint, types, docum
 test-slow: $(VENV)/ready .system-libraries ## the slow tests: notebooks, browsers, pages of commands, training, benchmarks once
 	$(RUN)/pytest $(SIDE_BY_SIDE) -m slow
 
+# Each with a cache of its own for compiled code: versions of numba do not read each other's.
 test-lowest: .venv-lowest/ready ## the quick tests with the lowest versions that pyproject.toml allows (PYTHON=python3.11)
-	.venv-lowest/bin/pytest $(SIDE_BY_SIDE)
+	NUMBA_CACHE_DIR=$(CURDIR)/.venv-lowest/numba .venv-lowest/bin/pytest $(SIDE_BY_SIDE)
 
 test-newest: .venv-newest/ready ## the quick tests with the newest versions of everything (PYTHON=python3.13)
-	.venv-newest/bin/pytest $(SIDE_BY_SIDE)
+	NUMBA_CACHE_DIR=$(CURDIR)/.venv-newest/numba .venv-newest/bin/pytest $(SIDE_BY_SIDE)
 
 test-wheel: .venv-wheel/ready ## the quick tests with the package installed as users do, not editable
 	.venv-wheel/bin/pip install --quiet --no-deps --force-reinstall .
-	.venv-wheel/bin/pytest $(SIDE_BY_SIDE)
+	NUMBA_CACHE_DIR=$(CURDIR)/.venv-wheel/numba .venv-wheel/bin/pytest $(SIDE_BY_SIDE)
 
 coverage: $(VENV)/ready .system-libraries ## all tests, with the lines that they reach
 	$(RUN)/pytest $(SIDE_BY_SIDE) -m '' --cov --cov-report=term --cov-report=xml --cov-fail-under=$(COVERAGE)

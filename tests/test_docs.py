@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -276,6 +277,8 @@ def figures():
 
 @pytest.mark.parametrize("name", ["frames.svg", "votes.svg"])
 def test_drawings_are_those_that_the_script_draws(name, figures):
+    if f"matplotlib=={version('matplotlib')}" not in (ROOT / "constraints.txt").read_text().splitlines():
+        pytest.skip("drawn by another version of matplotlib")
     assert figures.draw(name).decode() == (figures.IMAGES / name).read_text()
 
 

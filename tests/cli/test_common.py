@@ -166,4 +166,4 @@ def test_help_of_a_flag_names_no_value():
     result = CliRunner().invoke(app, ["regrid", "--help"], terminal_width=200)
     (flag,) = (line for line in result.output.splitlines() if "--overwrite" in line)
     assert "bool" not in flag
-    assert "<" in next(line for line in result.output.splitlines() if "--workers" in line)
+    assert "int" in next(line for line in result.output.splitlines() if "--workers" in line).lower()
