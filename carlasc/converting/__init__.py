@@ -1,6 +1,6 @@
 """Other data sets into the CarlaSC layout, and back."""
 
-from carlasc.converting.axes import mirror_grid, mirror_points, mirror_poses, mirror_spec
+from carlasc.converting.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
 from carlasc.converting.exporting import ExportResult, export
 from carlasc.converting.frames import VOXEL_FILES
 from carlasc.converting.protocol import (
@@ -34,6 +34,7 @@ __all__ = [
     "converter_names",
     "export",
     "load_converter",
+    "mirror_boxes",
     "mirror_grid",
     "mirror_points",
     "mirror_poses",

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.core.grids import GridSpec
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -26,6 +27,11 @@ def mirror_points(points: NDArray[np.float32]) -> NDArray[np.float32]:
 def mirror_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mirror (..., 4, 4) poses: both the frame that a pose leads from and the one that it leads to."""
     return _MIRROR @ poses @ _MIRROR
+
+
+def mirror_boxes(boxes: Boxes) -> Boxes:
+    """Mirror boxes: each box's own axes are mirrored too, so that x stays its length and the rotation stays one."""
+    return Boxes.from_poses(boxes.tracks, boxes.labels, mirror_poses(boxes.sensor_T_box), boxes.sizes, boxes.annotated)
 
 
 def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.axes import mirror_grid, mirror_points
+from carlasc.converting.axes import mirror_boxes, mirror_grid, mirror_points
 from carlasc.converting.protocol import FrameContent, FrameHandle
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import GridSpec
@@ -179,6 +179,11 @@ def make_fields(content: FrameContent, job: FrameJob, target: Target) -> tuple[d
     for name, array in content.others.items():
         mirrored = target.mirrored and layout.field_named(name).kind == "vector"
         fields[name] = mirror_points(array) if mirrored else array
+    if content.boxes is not None:
+        boxes = replace(
+            content.boxes, labels=target.map_labels(content.boxes.labels, f"boxes of {job.handle.location}")
+        )
+        fields["boxes"] = (mirror_boxes(boxes) if target.mirrored else boxes).to_table()
     fields["points"] = mirror_points(content.points) if target.mirrored else content.points
     return fields, without_flow
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import storage
+from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import GridSpec
 
@@ -37,12 +38,15 @@ class FrameContent:
         instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same number in all frames of the
             recording, whether it moves or not. None if the frame has no instances.
         others: further fields of the layout with a row per point, by name; vectors right-handed. They are written as they are.
+        boxes: tracked boxes with class ids of the data set, right-handed sensor frame; tracks have the numbers of `instances` where
+            the frame has both. None if the frame was not annotated.
     """
 
     points: NDArray[np.float32]
     labels: NDArray[np.unsignedinteger] | None = None
     instances: NDArray[np.uint32] | None = None
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    boxes: Boxes | None = None
 
 
 @dataclass(frozen=True)

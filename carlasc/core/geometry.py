@@ -52,6 +52,39 @@ def invert(dst_T_src: Transform) -> Transform:
     return src_T_dst
 
 
+def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the (N, 3, 3) rotations of (N, 4) quaternions w, x, y, z, of any length but 0."""
+    w, x, y, z = (np.asarray(quaternions, np.float64) / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations; the first number that is not 0 is positive."""
+    r = np.asarray(rotations, np.float64)
+    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
+    # Each row is 4 q_k (w, x, y, z) for one k; the longest is farthest from a division by zero.
+    candidates = np.array(
+        [
+            [1 + xx + yy + zz, wx, wy, wz],
+            [wx, 1 + xx - yy - zz, xy, xz],
+            [wy, xy, 1 - xx + yy - zz, yz],
+            [wz, xz, yz, 1 - xx - yy + zz],
+        ]
+    )
+    longest = np.argmax(np.square(candidates).sum(axis=1), axis=0)
+    chosen = candidates[longest, :, np.arange(len(r))]
+    unit = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+    leading = unit[np.arange(len(r)), np.argmax(np.abs(unit) > 1e-9, axis=1)]
+    return np.where(leading < 0, -1.0, 1.0)[:, None] * unit
+
+
 def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Express world poses (..., 4, 4) in the frame `first`: `inv(first) @ pose`, as in poses.txt."""
     return np.linalg.inv(first) @ poses

@@ -1,4 +1,4 @@
-"""A LiDAR scan, and the labels, flow and other values of its points."""
+"""A LiDAR scan: the labels, flow and other values of its points, and the boxes around its objects."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.errors import FormatError
 
 
@@ -23,6 +24,7 @@ class Scan:
         instances: (N,) uint32 actor ids, 0 is none; or None.
         remission: (N,) float32, the 4th column of the file (zero in CarlaSC); or None.
         others: other fields of the layout with one row per point, by name.
+        boxes: tracked boxes of the frame, sensor frame, none if nothing was there; or None where the frame was not annotated.
 
     Raises:
         FormatError: the shapes of the arrays do not match.
@@ -34,6 +36,7 @@ class Scan:
     instances: NDArray[np.uint32] | None = None
     remission: NDArray[np.float32] | None = None
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    boxes: Boxes | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -52,7 +55,7 @@ class Scan:
         return len(self.points)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
-        """Return the points that a mask or indices select, with all of their fields."""
+        """Return the points that a mask or indices select, with all of their fields; boxes are kept."""
 
         def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if values is None else values[keep]
@@ -64,6 +67,7 @@ class Scan:
             chosen(self.instances),
             chosen(self.remission),
             {name: values[keep] for name, values in self.others.items()},
+            self.boxes,
         )
 
 

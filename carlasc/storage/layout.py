@@ -2,8 +2,7 @@
 
     <split>/<sequence>/<coordinates>/velodyne/000000.bin, ...: see the format page, `docs/format.md#layout`
 
-Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid>/counts`, `<grid>/votes` for the grid in the
-folder `<grid>`. `poses` and `times` are in text files with one line per frame.
+Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid>/counts`, ... for the grid in the folder `<grid>`. `poses` and `times` are in text files with one line per frame.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 
@@ -27,14 +27,18 @@ POSES = "poses.txt"
 TIMES = "times.txt"
 METADATA = "carlasc.json"
 PARAMS = "params.json"
+REPORT = "carlasc-report.json"
 
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
+CERTAIN = 65535  # the number in the column `votes` of `<grid>/classes` that means a probability of 1
 
 
-Per = Literal["point", "voxel", "vote", "scan"]
-Kind = Literal["position", "vector", "class", "id", "value", "count", "votes", "picture"]
+Per = Literal["point", "voxel", "vote", "box", "scan"]
+Kind = Literal[
+    "position", "vector", "class", "id", "value", "count", "probability", "flags", "votes", "boxes", "picture"
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,10 +52,11 @@ class Field:
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
         per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
-            "vote" (one row per vote), or "scan" (the whole file belongs to the scan).
+            "vote" (one row per vote), "box" (one row per box), or "scan" (the whole file belongs to the scan).
         kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "id" (unsigned whole
-            numbers, such as actors), "value" (any number), "count", "votes" (a table), "picture" (the bytes of a file).
-        dtype: NumPy type on disk, little-endian.
+            numbers, such as actors), "value" (any number), "count", "probability" (0 to 1), "flags" (bits), "votes" and "boxes" (tables),
+            "picture" (the bytes of a file).
+        dtype: NumPy type on disk, little-endian; "" for tables, whose columns have types of their own.
         names: name of each value of a row.
         unit: unit of the values.
         meaning: one line for the documentation.
@@ -91,6 +96,8 @@ class Field:
         """
         if self.kind == "votes":
             return _decode_votes(data, where)
+        if self.kind == "boxes":
+            return _decode_boxes(data, where)
         dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
         size = len(data)
         if shape is not None and size != dtype.itemsize * int(np.prod(shape)):
@@ -119,6 +126,8 @@ class Field:
         self.check(array, where)
         if self.kind == "votes":
             return _encode_votes(array)
+        if self.kind == "boxes":
+            return array.tobytes()
         return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
 
     def check(self, array: NDArray[Any], where: str) -> None:
@@ -130,6 +139,10 @@ class Field:
         if self.kind == "votes":
             if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
                 raise FormatError(where, expected="a table of voxel, label and votes", found=str(array.dtype))
+            return
+        if self.kind == "boxes":
+            if array.dtype != BOXES_DTYPE or array.ndim != 1:
+                raise FormatError(where, expected="a table of boxes", found=f"{array.dtype}, shape {array.shape}")
             return
         if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
             raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
@@ -164,6 +177,11 @@ SCAN_FIELDS: dict[str, Field] = {
             meaning="actor of each point, 0 none, consistent over a sequence", published=False,
         ),
         Field(
+            name="boxes", folder="boxes", suffix=".bin", per="box", kind="boxes",
+            dtype="", names=BOXES_DTYPE.names or (), unit="m",
+            meaning="tracked boxes: track, class, pose, size, whether annotated in this frame", published=False,
+        ),
+        Field(
             name="bev", folder="bev", suffix=".jpg", per="scan", kind="picture",
             dtype="u1", names=("jpeg",), unit="bytes",
             meaning="bird's-eye camera picture, as its JPEG bytes",
@@ -188,9 +206,31 @@ _GRID_FIELDS: dict[str, Field] = {
             dtype="", names=("voxel", "label", "votes"), unit="votes",
             meaning="votes by class: voxel (flat index), label, votes; only non-zero ones", published=False,
         ),
+        Field(
+            name="occupied", folder="", suffix=".occupied.bin", per="voxel", kind="probability",
+            dtype="<f2", names=("occupied",), unit="probability",
+            meaning="probability that the voxel is occupied; 0.5 where nothing is known", published=False,
+        ),
+        Field(
+            name="classes", folder="", suffix=".classes.npz", per="vote", kind="votes",
+            dtype="", names=("voxel", "label", "votes"), unit="1/65535",
+            meaning="probability of each class of a voxel if it is occupied, in 1/65535: voxel, label, votes; only non-zero ones",
+            published=False,
+        ),
+        Field(
+            name="flags", folder="", suffix=".flags.bin", per="voxel", kind="flags",
+            dtype="u1", names=("flags",), unit="bits",
+            meaning="what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in an actor", published=False,
+        ),
+        Field(
+            name="views", folder="", suffix=".views.bin", per="voxel", kind="count",
+            dtype="<u2", names=("views",), unit="scans",
+            meaning="number of scans that saw the voxel", published=False,
+        ),
     )
 }  # fmt: skip
 GRID_FIELDS = tuple(_GRID_FIELDS)
+EVIDENCE_FIELDS = ("occupied", "classes", "flags", "views")  # what `carlasc regrid --keep-evidence` adds to a grid
 LINE_FIELDS = ("poses", "times")
 
 
@@ -225,6 +265,11 @@ def scan_folders() -> frozenset[str]:
 def params_file(grid: str) -> str:
     """Return the path of a grid's params.json under `<coordinates>/`."""
     return f"{grid}/{PARAMS}"
+
+
+def report_file(grid: str) -> str:
+    """Return the path of a grid's carlasc-report.json under `<coordinates>/`."""
+    return f"{grid}/{REPORT}"
 
 
 def grid_folder(spec: GridSpec) -> str:
@@ -302,6 +347,17 @@ def _decode_votes(data: bytes | memoryview, where: str) -> NDArray[Any]:
     for name, column in columns.items():
         votes[name] = column
     return votes
+
+
+def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
+    if len(data) % BOXES_DTYPE.itemsize:
+        raise FormatError(
+            where,
+            expected=f"a multiple of {BOXES_DTYPE.itemsize} bytes (a box each)",
+            found=str(len(data)),
+            advice="the file may be cut short",
+        )
+    return np.frombuffer(data, BOXES_DTYPE)
 
 
 def _encode_votes(votes: NDArray[Any]) -> bytes:

@@ -18,6 +18,7 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
@@ -61,7 +62,7 @@ class Sequence(ABC):
         """Read one field of one frame, with the values and the shape of the published file.
 
         Labels and counts may have a narrower type than in the file. `points` is (N, 4) float32, the arrays of a grid are (X, Y, Z),
-        and `bev` is the (B,) uint8 bytes of the picture. The array may be read-only.
+        `boxes` is a table (`carlasc.core.BOXES_DTYPE`), and `bev` is the (B,) uint8 bytes of the picture. The array may be read-only.
 
         Raises:
             MissingDataError: the field or the frame does not exist.
@@ -70,7 +71,7 @@ class Sequence(ABC):
 
     @abstractmethod
     def documents(self) -> tuple[str, ...]:
-        """Return the names of the existing text files: poses.txt, times.txt, carlasc.json, `<grid>/params.json`."""
+        """Return the names of the existing text files: poses.txt, times.txt, carlasc.json, and params.json and the report of each grid."""
 
     @abstractmethod
     def read_document(self, name: str) -> bytes:
@@ -227,15 +228,27 @@ class Sequence(ABC):
         )
 
     def scan(self, frame: int, fields: Iterable[str] | None = None) -> Scan:
-        """Read the points of a frame with those of `fields` that the sequence has; None reads all fields with one row per point."""
-        wanted = layout.point_fields() if fields is None else fields
+        """Read the points of a frame with those of `fields` that exist; None reads boxes and all fields with one row per point."""
+        wanted = {*layout.point_fields(), "boxes"} if fields is None else set(fields)
+        boxes = self.boxes(frame) if "boxes" in wanted else None
+        wanted -= {"boxes", "remission"}
         points = self.read("points", frame)
-        read = {name: self.read(name, frame) for name in wanted if name in self.fields() and name != "remission"}
+        read = {name: self.read(name, frame) for name in layout.point_fields() if name in wanted & self.fields()}
         own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
         try:
-            return Scan(points[:, :3], remission=points[:, 3], **own, others=read)
+            return Scan(points[:, :3], remission=points[:, 3], **own, others=read, boxes=boxes)
         except FormatError as error:
             raise error.within(f"{self.location}: frame {frame}") from error
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """Read the tracked boxes of a frame; None where it was not annotated.
+
+        Raises:
+            FormatError: the boxes are damaged, or are not valid (see `carlasc.Boxes`).
+        """
+        if frame not in self.frames("boxes"):
+            return None
+        return Boxes.from_table(self.read("boxes", frame), f"{self.location}: frame {frame}")
 
     def grid(self, name: str, frame: int) -> Grid:
         """Read a grid of a frame: its labels, and its counts if they exist."""

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import FolderSource, Sequence, Sink, Source
 from carlasc.testing.data import FRAMES, GRIDS, SCANS, WHOLE, published_bytes, write_dataset
@@ -95,6 +96,17 @@ class SourceContract:
         assert sequence.read("instances", 5).dtype == np.uint32
         assert sequence.read("labels", 5).dtype.kind == "u"
         assert sequence.read("evaluation/labels", 5).dtype.kind == "u"
+
+    def test_boxes_are_whole_none_where_nothing_was_and_absent_where_nobody_looked(
+        self, source: Source, expected: dict[str, Sequence]
+    ) -> None:
+        sequence = source.sequences()[WHOLE]
+        none, found, wanted = sequence.boxes(0), sequence.boxes(5), expected[WHOLE].boxes(5)
+        assert none is not None and len(none) == 0 and sequence.boxes(2) is None
+        assert found is not None and wanted is not None and len(found) == 5
+        assert found.annotated.dtype == np.bool_ and np.array_equal(found.annotated, wanted.annotated)
+        assert np.array_equal(found.tracks, wanted.tracks) and np.array_equal(found.sensor_T_box, wanted.sensor_T_box)
+        assert sequence.read("boxes", 5).dtype == BOXES_DTYPE
 
     def test_reads_frames_in_any_order_and_twice(self, source: Source) -> None:
         sequence = source.sequences()[WHOLE]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.storage import layout
 from carlasc.storage.folders.folder import FolderSink
 
@@ -45,10 +46,36 @@ def scan(rng: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
     }
 
 
+def boxes(rng: np.random.Generator, count: int) -> Boxes:
+    """Return random boxes, some of them filled in."""
+    rotations = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    rotations[np.linalg.det(rotations) < 0, :, 0] *= -1
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, rng.normal(scale=10, size=(count, 3))
+    tracks = rng.permutation(1000)[:count].astype(np.uint32) + np.uint32(1)
+    labels, sizes = rng.integers(1, 23, count).astype(np.uint32), rng.uniform(0.3, 5, (count, 3))
+    return Boxes.from_poses(tracks, labels, poses, sizes, rng.random(count) < 0.7)
+
+
 def grid(rng: np.random.Generator, size: tuple[int, int, int], whole: bool = True) -> dict[str, NDArray[Any]]:
     """Return the labels and counts of a random grid; counts are whole numbers, or not."""
     counts = rng.integers(0, 40, size).astype(np.float32)
     return {"labels": rng.integers(0, 23, size).astype(np.uint32), "counts": counts if whole else counts / 3}
+
+
+def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = False) -> dict[str, NDArray[Any]]:
+    """Return the fields of a random grid that say how certain it is; `wide` class ids have two bytes."""
+    voxels = int(np.prod(size))
+    classes = np.zeros(2 * voxels, layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)
+    classes["voxel"], classes["label"] = np.repeat(np.arange(voxels), 2), np.tile([1, 10], voxels)
+    shares = rng.integers(1, layout.CERTAIN, voxels)
+    classes["votes"] = np.column_stack([shares, layout.CERTAIN - shares]).reshape(-1)
+    return {
+        "occupied": rng.random(size).astype(np.float16),
+        "classes": classes,
+        "flags": rng.integers(0, 16, size).astype(np.uint8),
+        "views": rng.choice([0, 1, 61, 300, 65535], size).astype(np.uint16),
+    }
 
 
 def lines(count: int) -> tuple[bytes, bytes]:
@@ -84,6 +111,8 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
                 whole.write(f"evaluation/{part}", frame, array)
         for part, array in grid(rng, SECOND, whole=False).items():
             whole.write(f"evaluation_8x4x3/{part}", frame, array)
+        if frame != 2:  # a frame that was not annotated; the first one has no objects
+            whole.write("boxes", frame, boxes(rng, frame).to_table())
         whole.write("bev", frame, rng.integers(0, 256, 300 + frame).astype(np.uint8))
     scans = sink.sequence(SCANS)
     for frame in range(3):
@@ -98,6 +127,14 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
     votes = np.zeros(5, layout.VOTES_DTYPE)
     votes["voxel"], votes["label"], votes["votes"] = [0, 1, 7, 20, 47], [1, 2, 3, 22, 0], [1, 300, 65535, 2, 1]
     grids.write("evaluation/votes", 4, votes)
+    for part, array in evidence(rng, SIZE).items():
+        grids.write(f"evaluation/{part}", 4, array)
+    for frame in FRAMES:
+        fields = evidence(rng, SECOND, wide=True)
+        if frame == FRAMES[0]:  # whole numbers, which stores often keep in another type, before others
+            fields["occupied"] = np.round(fields["occupied"])
+        for part, array in fields.items():
+            whole.write(f"evaluation_8x4x3/{part}", frame, array)
     return root
 
 

@@ -1,16 +1,26 @@
 """From a frame of another data set to the fields of the layout, on frames in memory."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
-from carlasc.converting import FrameContent, VoxelContent, mirror_grid, mirror_points, mirror_poses, mirror_spec
+from carlasc.converting import (
+    FrameContent,
+    VoxelContent,
+    mirror_boxes,
+    mirror_grid,
+    mirror_points,
+    mirror_poses,
+    mirror_spec,
+)
 from carlasc.converting.frames import Block, FrameJob, Target, convert_block, make_fields
 from carlasc.converting.places import check_outside
 from carlasc.converting.plans import choose_recordings, plan_recording, write_documents
 from carlasc.converting.results import Steps
 from carlasc.converting.trajectory import read_poses, times_from_first
-from carlasc.core import REMAPS, SEMANTICKITTI, GridSpec
+from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.storage import Metadata, layout
@@ -41,6 +51,35 @@ def test_mirrored_poses_move_mirrored_points_to_the_mirrored_place():
     signs = np.array([1, -1, 1, 1])
     np.testing.assert_allclose(mirror_poses(pose) @ (point * signs), (pose @ point) * signs)
     np.testing.assert_array_equal(mirror_poses(mirror_poses(pose)), pose)
+
+
+def some_boxes():
+    poses = np.stack([translation((10, 3, -1)) @ rotation_z(0.4), translation((5, -2, 0)) @ rotation_z(-3)])
+    tracks, labels = np.array([2, 9], np.uint32), np.array([10, 30], np.uint32)
+    return Boxes.from_poses(tracks, labels, poses, np.array([[4, 2, 1.5], [0.5, 0.6, 1.8]]), np.array([True, False]))
+
+
+def test_mirrored_boxes_hold_the_mirrored_points():
+    boxes, points = some_boxes(), np.random.default_rng(0).uniform((4, -4, -2), (13, 6, 1), (5000, 3))
+    mirrored = mirror_boxes(boxes)
+    assert boxes.contains(points).sum(axis=1).min() > 0
+    np.testing.assert_array_equal(mirrored.contains(points * [1, -1, 1]), boxes.contains(points))
+    headings = np.arctan2(mirrored.sensor_T_box[:, 1, 0], mirrored.sensor_T_box[:, 0, 0])
+    np.testing.assert_allclose(headings, [-0.4, 3])
+    np.testing.assert_allclose(mirror_boxes(mirrored).quaternions, boxes.quaternions, atol=1e-15)
+
+
+def test_boxes_are_mirrored_and_get_the_classes_that_are_written():
+    boxes = some_boxes()
+    frame = MemoryFrame(0, FrameContent(np.ones((1, 4), np.float32), boxes=boxes))
+    left = Boxes.from_table(make_fields(frame.read(), FrameJob(frame, True), LEFT)[0]["boxes"])
+    right = make_fields(frame.read(), FrameJob(frame, True), RIGHT)[0]["boxes"]
+    assert left.labels.tolist() == [10, 4] and left.centers.tolist() == [[10, -3, -1], [5, 2, 0]]
+    assert left.tracks.tolist() == [2, 9] and left.annotated.tolist() == [True, False]
+    assert right.tobytes() == boxes.to_table().tobytes()
+    strange = FrameContent(np.ones((1, 4), np.float32), boxes=replace(boxes, labels=boxes.labels + np.uint32(200)))
+    with pytest.raises(FormatError, match=r"boxes of .*: expected class ids of semantickitti, found 210"):
+        make_fields(strange, FrameJob(frame, True), LEFT)
 
 
 def test_a_mirrored_grid_has_its_classes_at_the_mirrored_places():

@@ -15,9 +15,19 @@ CLASSES = (1, 7, 8, 10)  # CARLA: building, road, sidewalk, vehicle
 
 
 def write_split(
-    root: Path, split: str, sequences: list[str], frames: int, seed: int = 0, classes=CLASSES, table="carla"
+    root: Path,
+    split: str,
+    sequences: list[str],
+    frames: int,
+    seed: int = 0,
+    classes=CLASSES,
+    table="carla",
+    certainty: float | None = None,
 ) -> None:
-    """Write sequences. A voxel with a point has the class of its quarter of the grid; all others are free."""
+    """Write sequences. A voxel with a point has the class of its quarter of the grid; all others are free.
+
+    With `certainty`, the grid also says that each voxel's label has this probability.
+    """
     rng = np.random.default_rng(seed)
     quarter = np.array(classes)[2 * (np.arange(16) >= 8)[:, None] + (np.arange(16) >= 8)[None, :]]
     for name in sequences:
@@ -30,5 +40,12 @@ def write_split(
             occupied = np.zeros(SPEC.size, bool)
             occupied.reshape(-1)[SPEC.flat_index(points)] = True
             writer.write("points", frame, np.pad(points, ((0, 0), (0, 1))))
-            writer.write("evaluation/labels", frame, np.where(occupied, quarter[..., None], 0).astype(np.uint32))
+            labels = np.where(occupied, quarter[..., None], 0).astype(np.uint32)
+            writer.write("evaluation/labels", frame, labels)
             writer.write("evaluation/counts", frame, (rng.random(SPEC.size) < 0.8).astype(np.float32))
+            if certainty is not None:
+                shares = np.zeros(occupied.size, layout.VOTES_DTYPE)
+                shares["voxel"], shares["votes"] = np.arange(occupied.size), layout.CERTAIN
+                shares["label"] = np.where(labels, labels, classes[0]).reshape(-1)
+                writer.write("evaluation/occupied", frame, np.where(occupied, certainty, 1 - certainty))
+                writer.write("evaluation/classes", frame, shares)

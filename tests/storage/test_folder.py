@@ -153,7 +153,10 @@ def test_a_grid_is_removed_and_other_files_in_its_folder_stay(tmp_path: Path) ->
     (root / WHOLE / "evaluation" / "notes.txt").write_text("mine")
     FolderSink(root).sequence(WHOLE).remove_grid("evaluation")
     assert [entry.name for entry in (root / WHOLE / "evaluation").iterdir()] == ["notes.txt"]
-    assert "evaluation_8x4x3/labels" in FolderSource(root).sequences()[WHOLE].fields()
+    fields = FolderSource(root).sequences()[WHOLE].fields()
+    assert {"evaluation_8x4x3/labels", "evaluation_8x4x3/occupied"} <= fields
+    FolderSink(root).sequence(WHOLE).remove_grid("evaluation_8x4x3")  # it has every optional field
+    assert not list((root / WHOLE / "evaluation_8x4x3").iterdir())
     with pytest.raises(FormatError, match="leads elsewhere"):
         FolderSink(root).sequence(WHOLE).remove_grid("../cartesian/velodyne")
 

@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import FolderSource, layout
@@ -33,7 +34,7 @@ def test_the_golden_text_files_are_written_as_they_stand(golden_capture):
         assert encode(decode(data, name)) == data
 
 
-@pytest.mark.parametrize("field", list(layout.SCAN_FIELDS.values()), ids=lambda field: field.name)
+@pytest.mark.parametrize("field", [f for f in layout.SCAN_FIELDS.values() if f.dtype], ids=lambda field: field.name)
 @given(rows=st.integers(0, 7), seed=st.integers(0, 99))
 def test_scan_fields_come_back(field, rows, seed):
     shape = (rows,) if field.columns is None else (rows, field.columns)
@@ -41,6 +42,29 @@ def test_scan_fields_come_back(field, rows, seed):
     data = bytes(field.encode(array, "x"))
     assert len(data) == array.nbytes
     assert np.array_equal(field.decode(data, "x"), array)
+
+
+@pytest.mark.parametrize("part, nbytes", [("occupied", 2), ("flags", 1), ("views", 2)])
+def test_fields_per_voxel_come_back_as_they_are_on_disk(part, nbytes):
+    field = layout.field_named(f"evaluation/{part}")
+    array = np.random.default_rng(0).integers(0, 2 ** (8 * nbytes), (2, 3, 4)).astype(f"<u{nbytes}").view(field.dtype)
+    data = bytes(field.encode(array, "x"))
+    assert data == array.tobytes()
+    assert field.decode(data, "x", (2, 3, 4)).tobytes() == data
+    assert layout.frame_of(field.file(3).partition("/")[2], ".bin") is None  # it is not a file of counts
+
+
+def test_probabilities_are_rounded_to_float16_when_they_are_written():
+    field = layout.field_named("evaluation/occupied")
+    found = field.decode(field.encode(np.array([0, 0.5, 0.9001, 1], np.float32), "x"), "x")
+    assert found.tolist() == [0, 0.5, float(np.float16(0.9001)), 1]
+
+
+def test_flags_and_views_that_do_not_fit_are_refused():
+    with pytest.raises(FormatError, match="expected at most uint8, found uint16"):
+        layout.field_named("evaluation/flags").encode(np.zeros(2, np.uint16), "x")
+    with pytest.raises(FormatError, match="expected at most uint16, found uint32"):
+        layout.field_named("evaluation/views").encode(np.zeros(2, np.uint32), "x")
 
 
 def test_votes_come_back():
@@ -52,6 +76,25 @@ def test_votes_come_back():
         assert (back == votes).all()
     with pytest.raises(FormatError, match=r"v.npz: expected an .npz"):
         field.decode(b"PK nonsense", "v.npz")
+
+
+def test_boxes_come_back_bit_for_bit():
+    field = layout.field_named("boxes")
+    for count in (0, 3):
+        table = np.frombuffer(np.random.default_rng(count).bytes(89 * count), BOXES_DTYPE)
+        data = bytes(field.encode(table, "x"))
+        assert len(data) == 89 * count
+        assert field.decode(data, "x").tobytes() == table.tobytes()
+
+
+def test_boxes_of_another_size_or_type_are_refused():
+    field = layout.field_named("boxes")
+    with pytest.raises(FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(a box each\), found 90"):
+        field.decode(bytes(90), "boxes/0.bin")
+    with pytest.raises(FormatError, match="expected a table of boxes, found float64"):
+        field.encode(np.zeros((2, 13)), "boxes/0.bin")
+    with pytest.raises(FormatError, match=r"found .*shape \(1, 2\)"):
+        field.encode(np.zeros((1, 2), BOXES_DTYPE), "boxes/0.bin")
 
 
 def test_file_names_are_those_of_the_format():

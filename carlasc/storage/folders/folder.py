@@ -98,7 +98,8 @@ class FolderWriter(SequenceWriter):
         return entry.decode(path.read_bytes(), str(path))
 
     def remove_grid(self, grid: str) -> None:
-        """Remove the frames of a grid, then its params.json; other files in its folder stay."""
+        """Remove the report and the frames of a grid, then its params.json; other files in its folder stay."""
+        (self.folder / layout.report_file(grid)).unlink(missing_ok=True)
         parts = [layout.field_named(f"{grid}/{part}").suffix for part in layout.GRID_FIELDS]
         for path in _inside(self.folder, grid).iterdir():
             if any(layout.frame_of(path.name, suffix) is not None for suffix in parts):

@@ -94,7 +94,7 @@ class PublishedSequence(Sequence):
             return
         folder = self._listing[field].folder
         names = self.tree.entries(self._prefix + folder)
-        for sibling in (f for f in self._listing.values() if f.folder == folder):  # a grid's three fields share one
+        for sibling in (f for f in self._listing.values() if f.folder == folder):  # a grid's fields share one
             numbers = [number for name in names if (number := layout.frame_of(name, sibling.suffix)) is not None]
             self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
 
@@ -127,7 +127,10 @@ class PublishedSequence(Sequence):
         texts = (layout.POSES, layout.TIMES, layout.METADATA)
         names = [name for name in texts if self.tree.is_file(self._prefix + name)]
         grids = sorted({field.folder for name, field in self._listing.items() if "/" in name})
-        return (*names, *(layout.params_file(grid) for grid in grids))
+        reports = [
+            layout.report_file(grid) for grid in grids if self.tree.is_file(self._prefix + layout.report_file(grid))
+        ]
+        return (*names, *(layout.params_file(grid) for grid in grids), *reports)
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
@@ -145,7 +148,7 @@ class PublishedSequence(Sequence):
             suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}
             for name in self.tree.entries(self._prefix + folder):
                 frames = [number for suffix in suffixes if (number := layout.frame_of(name, suffix)) is not None]
-                if not frames and not (name == layout.PARAMS and folder not in layout.scan_folders()):
+                if not frames and not (name in (layout.PARAMS, layout.REPORT) and folder not in layout.scan_folders()):
                     unknown.append(f"{folder}/{name}")
         return tuple(sorted(unknown))
 

@@ -43,6 +43,8 @@ def narrow(array: NDArray[Any]) -> NDArray[Any]:
 
 def common_type(first: np.dtype[Any], second: np.dtype[Any]) -> np.dtype[Any]:
     """Return a type that holds the values of both exactly: the wider integer, or float32, from which the integers were narrowed."""
+    if first == second:
+        return first
     if "f" in (first.kind, second.kind):
         return np.dtype("<f4")
     return max(first, second, key=lambda dtype: dtype.itemsize)

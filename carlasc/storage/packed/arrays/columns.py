@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import layout
 from carlasc.storage.packed.arrays.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
@@ -21,6 +22,8 @@ from carlasc.storage.packed.protocol import Options
 
 # Points per chunk: PCodec's bins fit the scene better than in a whole scan, and padding takes bits.
 _PCODEC_STEP = 8192
+_BOXES = 256  # boxes per chunk, at least
+_GEOMETRY = tuple(name for name in BOXES_DTYPE.names or () if BOXES_DTYPE[name].kind == "f")
 Columns = dict[str, NDArray[Any]]
 
 
@@ -176,25 +179,26 @@ class Flow(Packing):
 
 
 class Cells(Packing):
-    """A grid's labels or counts: `values` (F, X, Y, Z), one chunk per frame."""
+    """A field with one value per voxel: `values` (F, X, Y, Z), one chunk per frame."""
 
     kind = "grid"
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
         shuffle = BITSHUFFLE if self.entry.kind == "count" else NO_SHUFFLE
-        return (Column("values", "u1", Encoding(level=8, shuffle=shuffle), self.entry.unit),)
+        dtype = self.entry.dtype if self.entry.kind == "probability" else "u1"
+        return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit),)
 
     def split(self, array: NDArray[Any]) -> Columns:
-        """Narrow the values."""
-        return {"values": narrow(array)}
+        """Narrow the values, except probabilities: they are whole numbers in few frames, and float32 would take more space."""
+        return {"values": array.astype(self.entry.dtype) if self.entry.kind == "probability" else narrow(array)}
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return (X, Y, Z) unsigned integers, or float32 where counts are not whole numbers."""
+        """Return (X, Y, Z) unsigned integers, float32 where counts are not whole numbers, or float16 for probabilities."""
         return columns["values"]
 
 
 class Votes(Packing):
-    """Votes by class: the columns of the table, as `voxel`, `label` and `votes`."""
+    """Votes or probabilities by class: the columns of the table, as `voxel`, `label` and `votes`."""
 
     kind = "votes"
 
@@ -202,7 +206,7 @@ class Votes(Packing):
         return (
             Column("voxel", "<i4", Encoding(shuffle=SHUFFLE), "index"),
             Column("label", "u1", Encoding(), "class"),
-            Column("votes", "<u2", Encoding(shuffle=SHUFFLE), "votes"),
+            Column("votes", "<u2", Encoding(shuffle=SHUFFLE), self.entry.unit),
         )
 
     def split(self, array: NDArray[Any]) -> Columns:
@@ -218,6 +222,35 @@ class Votes(Packing):
         return votes
 
 
+class BoxTable(Packing):
+    """Boxes: the numbers of the table as `geometry` (10, N), and its other columns as they are."""
+
+    kind = "boxes"
+
+    def _columns(self, options: Options) -> tuple[Column, ...]:
+        encoding = Encoding(shuffle=SHUFFLE)
+        return (
+            Column("geometry", "<f8", encoding, self.entry.unit, rows=len(_GEOMETRY), least=_BOXES),
+            Column("track", "<u4", encoding, "object", least=_BOXES),
+            Column("label", "<u4", encoding, "class", least=_BOXES),
+            Column("annotated", "u1", encoding, least=_BOXES),
+        )
+
+    def split(self, array: NDArray[Any]) -> Columns:
+        """Return the columns of the table."""
+        flat = {column.name: np.ascontiguousarray(array[column.name]) for column in self.columns[1:]}
+        return {"geometry": np.stack([array[name] for name in _GEOMETRY])} | flat
+
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return the table."""
+        boxes = np.empty(len(columns["track"]), BOXES_DTYPE)
+        for name, row in zip(_GEOMETRY, columns["geometry"], strict=True):
+            boxes[name] = row
+        for column in self.columns[1:]:
+            boxes[column.name] = columns[column.name]
+        return boxes
+
+
 def packing_of(
     entry: layout.Field, options: Options | None = None, attributes: Mapping[str, Any] | None = None
 ) -> Packing:
@@ -229,4 +262,9 @@ def packing_of(
     return kind(entry, options, attributes)
 
 
-_BY_KIND: dict[layout.Kind, Callable[..., Packing]] = {"position": Points, "vector": Flow, "votes": Votes}
+_BY_KIND: dict[layout.Kind, Callable[..., Packing]] = {
+    "position": Points,
+    "vector": Flow,
+    "votes": Votes,
+    "boxes": BoxTable,
+}

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import layout
 from carlasc.storage.packed.numbers import narrow, quantise
@@ -165,6 +166,25 @@ class VotesTable(TableField):
         return votes
 
 
+class BoxesTable(TableField):
+    """The columns of the field's own table: `track`, `label`, `x`, `y`, `z`, ..."""
+
+    def columns(self, attributes: Attributes) -> dict[str, str]:
+        """Return the table's columns."""
+        return {name: BOXES_DTYPE[name].name for name in BOXES_DTYPE.names or ()}
+
+    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
+        """Return the columns of the table."""
+        return {name: np.ascontiguousarray(array[name]) for name in self.columns(attributes)}
+
+    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
+        """Return the table."""
+        boxes = np.empty(len(columns["track"]), BOXES_DTYPE)
+        for name, column in columns.items():
+            boxes[name] = column
+        return boxes
+
+
 def table_field(name: str) -> TableField:
     """Return how a field is stored in a table.
 
@@ -181,6 +201,8 @@ def table_field(name: str) -> TableField:
             return PictureTable()
         case "votes":
             return VotesTable()
+        case "boxes":
+            return BoxesTable()
         case _:
             return ValuesTable(entry)
 
@@ -195,6 +217,8 @@ def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
         return {"labelled_points": int(np.count_nonzero(array))}
     if field == "flow":
         return {"moving_points": int((array != 0).any(axis=1).sum())}
+    if field == "boxes":
+        return {"boxes": len(array)}
     if field.endswith("/labels"):
         return {f"{field.removesuffix('/labels')}_occupied_voxels": int(np.count_nonzero(array))}
     if field.endswith("/counts"):

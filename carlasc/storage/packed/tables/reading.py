@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.output import TABLES_MARK
@@ -68,8 +69,8 @@ class ParquetSequence(PackedSequence["_Table"]):
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one row group."""
         table = self._field(field)
-        shape = self.grids[field.rpartition("/")[0]].size if field.endswith(("/labels", "/counts")) else None
-        return table.read(frame, shape)
+        per_voxel = layout.field_named(field).per == "voxel"
+        return table.read(frame, self.grids[field.rpartition("/")[0]].size if per_voxel else None)
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""

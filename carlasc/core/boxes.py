@@ -1,0 +1,192 @@
+"""The tracked boxes of one frame: where objects are, how large they are, and which object each one is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    quaternions_of,
+    rotations_of,
+    transform_points,
+)
+from carlasc.errors import FormatError
+
+BOXES_DTYPE = np.dtype(
+    [("track", "<u4"), ("label", "<u4")]
+    + [(name, "<f8") for name in ("x", "y", "z", "qw", "qx", "qy", "qz", "length", "width", "height")]
+    + [("annotated", "u1")]
+)
+"""One row per box, as in the files of the layout: see `Boxes` for what the columns mean."""
+
+_CENTER, _QUATERNION, _SIZE = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("length", "width", "height")
+_UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1, as for the rotations of poses
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The tracked boxes of one frame.
+
+    A box has a frame of its own: the origin is its centre, x points forward along its length, z up along its height.
+
+    Attributes:
+        tracks: (N,) uint32 numbers of the objects, 1 or more, the same throughout a sequence, and the same as in the field
+            `instances` where that exists. No object has two boxes in a frame.
+        labels: (N,) uint32 class ids.
+        centers: (N, 3) float64, metres, sensor frame.
+        quaternions: (N, 4) float64, unit quaternions w, x, y, z of the rotation from the box to the sensor frame. Boxes that are
+            upright in the world are tilted in the frame of a sensor that is.
+        sizes: (N, 3) float64, metres: length, width, height, along x, y, z of the box.
+        annotated: (N,) bool: whether the box was annotated in this frame. Others were filled in, for example between two
+            annotated frames.
+
+    Raises:
+        FormatError: shapes do not match, a number is not finite, a size is not positive, a quaternion is not a rotation, or a
+            track is 0 or occurs twice.
+    """
+
+    tracks: NDArray[np.uint32]
+    labels: NDArray[np.uint32]
+    centers: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    annotated: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        count = len(self.tracks)
+        shapes = {"tracks": (), "labels": (), "centers": (3,), "quaternions": (4,), "sizes": (3,), "annotated": ()}
+        for name, row in shapes.items():
+            array = getattr(self, name)
+            if array.shape != (count, *row):
+                raise FormatError(f"boxes: {name}", expected=f"shape {(count, *row)}", found=str(array.shape))
+        for name in ("tracks", "labels"):
+            if getattr(self, name).dtype.kind != "u":
+                raise FormatError(f"boxes: {name}", expected="unsigned integers", found=str(getattr(self, name).dtype))
+        for name in ("centers", "quaternions", "sizes"):
+            self._check(name, np.isfinite(getattr(self, name)).all(axis=1), "finite numbers")
+        self._check("sizes", (self.sizes > 0).all(axis=1), "positive lengths, widths and heights, in metres")
+        norms = np.linalg.norm(self.quaternions, axis=1)
+        self._check("quaternions", np.abs(norms - 1) <= _UNIT_TOLERANCE, "a rotation: a quaternion of length 1")
+        self._check("tracks", self.tracks > 0, "numbers above 0")
+        first = np.zeros(count, np.bool_)
+        first[np.unique(self.tracks, return_index=True)[1]] = True
+        self._check("tracks", first, "one box per track in a frame")
+
+    def _check(self, name: str, valid: NDArray[np.bool_] | np.bool_, expected: str) -> None:
+        """Raise a FormatError for the first box that is not valid."""
+        if not valid.all():
+            row = int(np.argmin(valid))
+            found = f"{getattr(self, name)[row].tolist()} in box {row} (track {self.tracks[row]})"
+            raise FormatError(f"boxes: {name}", expected=expected, found=found)
+
+    @classmethod
+    def from_poses(
+        cls,
+        tracks: NDArray[np.unsignedinteger],
+        labels: NDArray[np.unsignedinteger],
+        sensor_T_box: NDArray[np.float64],
+        sizes: NDArray[np.floating],
+        annotated: NDArray[np.bool_] | None = None,
+    ) -> Boxes:
+        """Return boxes with the poses (N, 4, 4) `sensor_T_box`; the other arguments are those of the constructor.
+
+        All boxes count as annotated if `annotated` is None.
+
+        Raises:
+            FormatError: as for the constructor. Poses are not checked: `carlasc.core.check_rigid` does that.
+        """
+        return cls(
+            np.asarray(tracks, np.uint32),
+            np.asarray(labels, np.uint32),
+            np.array(sensor_T_box[:, :3, 3], np.float64),
+            quaternions_of(sensor_T_box[:, :3, :3]),
+            np.asarray(sizes, np.float64).reshape(-1, 3),
+            np.ones(len(tracks), np.bool_) if annotated is None else annotated,
+        )
+
+    @classmethod
+    def from_table(cls, table: NDArray[np.void], where: str = "boxes") -> Boxes:
+        """Return the boxes of a table, (N,) `BOXES_DTYPE`; `where` is the file named in errors.
+
+        Raises:
+            FormatError: as for the constructor.
+        """
+
+        def columns(names: tuple[str, ...]) -> NDArray[np.float64]:
+            return np.stack([table[name] for name in names], axis=1)
+
+        try:
+            return cls(
+                np.array(table["track"]),
+                np.array(table["label"]),
+                columns(_CENTER),
+                columns(_QUATERNION),
+                columns(_SIZE),
+                table["annotated"] != 0,
+            )
+        except FormatError as error:
+            raise (error if where == "boxes" else error.within(where)) from error
+
+    def to_table(self) -> NDArray[np.void]:
+        """Return the boxes as a table, (N,) `BOXES_DTYPE`."""
+        table = np.empty(len(self), BOXES_DTYPE)
+        table["track"], table["label"], table["annotated"] = self.tracks, self.labels, self.annotated
+        numbers = np.concatenate([self.centers, self.quaternions, self.sizes], axis=1)
+        for name, column in zip((*_CENTER, *_QUATERNION, *_SIZE), numbers.T, strict=True):
+            table[name] = column
+        return table
+
+    def __len__(self) -> int:
+        return len(self.tracks)
+
+    @property
+    def sensor_T_box(self) -> NDArray[np.float64]:
+        """(N, 4, 4) float64 pose of each box."""
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        poses[:, :3, :3] = rotations_of(self.quaternions)
+        poses[:, :3, 3] = self.centers
+        return poses
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Boxes:
+        """Return the boxes that a mask or indices select."""
+        return Boxes(
+            self.tracks[keep],
+            self.labels[keep],
+            self.centers[keep],
+            self.quaternions[keep],
+            self.sizes[keep],
+            self.annotated[keep],
+        )
+
+    def transform(self, dst_T_sensor: Transform) -> Boxes:
+        """Return the boxes in another frame, for example in the world's: `dst_T_sensor` is (4, 4) and rigid."""
+        return Boxes.from_poses(self.tracks, self.labels, dst_T_sensor @ self.sensor_T_box, self.sizes, self.annotated)
+
+    def contains(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether each point is in each box.
+
+        Args:
+            points: (M, 3) metres, sensor frame.
+            margin_m: distance by which the boxes are grown on all sides; they shrink where it is negative.
+
+        Returns:
+            (N, M) bool.
+        """
+        inside = np.zeros((len(self), len(points)), np.bool_)
+        for row, (pose, half) in enumerate(zip(self.sensor_T_box, self.sizes / 2 + margin_m, strict=True)):
+            near = np.flatnonzero((np.abs(points - self.centers[row]) <= np.linalg.norm(half)).all(axis=1))
+            body = transform_points(invert(pose), points[near])
+            inside[row, near] = (np.abs(body) <= half).all(axis=1)
+        return inside
+
+    def owners(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.int64]:
+        """Return (M,) the row of the box that each of (M, 3) points is in: the smallest of several, -1 where there is none."""
+        owners = np.full(len(points), -1, np.int64)
+        inside = self.contains(points, margin_m)
+        for row in np.argsort(-np.prod(self.sizes, axis=1), kind="stable").tolist():
+            owners[inside[row]] = row
+        return owners
