@@ -3,15 +3,48 @@
 "World" is the frame of the poses, which is the sensor frame of the first scan.
 """
 
-from carlasc.motion.segments import Segment, Standing, segment_by_flow, segment_by_instances, standing_points
-from carlasc.motion.tracks import Track, link_segments
+from carlasc.motion.bodies import Extent, seen_from, usual_shell
+from carlasc.motion.boxes import segment_by_boxes, tracks_from_boxes
+from carlasc.motion.evidence import HORIZON_S, Evidence, Sighting, find_evidence
+from carlasc.motion.ground import ground_points
+from carlasc.motion.linking import Chain, Linker
+from carlasc.motion.movers import Movers, find_movers, follow_movers
+from carlasc.motion.segments import (
+    Segment,
+    Standing,
+    is_fast,
+    segment_by_flow,
+    segment_by_instances,
+    standing_points,
+)
+from carlasc.motion.tracks import BODY_MARGIN_M, LONGEST_M, Track, complete_bodies, link_segments, make_track
 
 __all__ = [
+    "BODY_MARGIN_M",
+    "HORIZON_S",
+    "LONGEST_M",
+    "Chain",
+    "Evidence",
+    "Extent",
+    "Linker",
+    "Movers",
     "Segment",
+    "Sighting",
     "Standing",
     "Track",
+    "complete_bodies",
+    "find_evidence",
+    "find_movers",
+    "follow_movers",
+    "ground_points",
+    "is_fast",
     "link_segments",
+    "make_track",
+    "seen_from",
+    "segment_by_boxes",
     "segment_by_flow",
     "segment_by_instances",
     "standing_points",
+    "tracks_from_boxes",
+    "usual_shell",
 ]

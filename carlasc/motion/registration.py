@@ -31,6 +31,8 @@ _PREDICTED = np.array(
 )  # error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians
 _UNKNOWN = 5.0  # factor of this error while the motion is not known yet
 _ROBUST = 0.3  # fraction of the reach; pairs farther from their plane get less weight
+_SLOW_M_S, _END_POINTS = 1.0, 20  # the ends of slower actors, and of sightings with fewer points, are not compared
+_SAME_WIDTH_M, _ENDS_M = 0.12, 0.12  # greatest difference of the widths of the same ends, and the error of their shift
 _GAIN = 0.3  # weight of the last correction in the motion
 
 
@@ -60,7 +62,8 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
             predicted = states[previous] + velocity * elapsed
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
             points = sightings[index][:: -(-len(sightings[index]) // _POINTS)]
-            states[index] = _register(points, model, _normals(model), predicted, error)
+            shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
+            states[index] = _register(points, model, _normals(model), predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
                 motion = velocity  # the backward pass starts with this estimate
@@ -76,8 +79,20 @@ def _register(
     normals: NDArray[np.float64],
     predicted: NDArray[np.float64],
     error: NDArray[np.float64],
+    previous: NDArray[np.float64],
+    shifts: Sequence[tuple[NDArray[np.float64], float]],
 ) -> NDArray[np.float64]:
-    """Return the state (x, y, z, yaw), near the predicted one, that registers points to the planes of the model."""
+    """Return the state (x, y, z, yaw), near the predicted one, that registers points to the planes of the model.
+
+    Args:
+        points: (N, 3) points of the sighting, metres, world.
+        model: (M, 3) points of the actor, metres, actor frame.
+        normals: (M, 3) normals of the planes around them.
+        predicted: (4,) predicted state.
+        error: (4,) standard deviation of the prediction.
+        previous: (3,) position at the sighting before, metres, world.
+        shifts: directions in which the ends of what is seen moved since then, and how far: see `_shift_of_ends`.
+    """
     state = predicted.copy()
     for iteration in range(_ITERATIONS):
         reach = _FIRST_REACH_M * (_LAST_REACH_M / _FIRST_REACH_M) ** (iteration / (_ITERATIONS - 1))
@@ -86,6 +101,10 @@ def _register(
         pairs = np.flatnonzero(squared < reach**2)
         information = np.diag(1 / error**2)
         pull = information @ (predicted - state)
+        for direction, shift in shifts:
+            row = np.append(direction, 0.0)
+            information = information + np.outer(row, row) / _ENDS_M**2
+            pull = pull + row * (direction @ (previous - state[:3]) + shift) / _ENDS_M**2
         if len(pairs) >= 3:
             arm = model[nearest[pairs]] @ pose[:3, :3].T
             normal = normals[nearest[pairs]] @ pose[:3, :3].T
@@ -98,6 +117,26 @@ def _register(
             pull = pull + (slope * weight[:, None]).T @ off
         state = state + np.linalg.solve(information, pull)
     return state
+
+
+def _shift_of_ends(
+    before: NDArray[np.float64], now: NDArray[np.float64], velocity: NDArray[np.float64]
+) -> list[tuple[NDArray[np.float64], float]]:
+    """Return the directions in which two sightings show the same ends of an actor, (3,) world, and the shift of these ends, in metres.
+
+    A flat face determines no motion along it, but its ends do: the rear of a car that drives ahead shows where the car is across the
+    street. If what is seen has the same width in both sightings, its ends are taken for the same.
+    """
+    speed = float(np.hypot(velocity[0], velocity[1]))
+    if speed < _SLOW_M_S or min(len(before), len(now)) < _END_POINTS:
+        return []
+    ahead = np.array([velocity[0], velocity[1], 0.0]) / speed
+    shifts = []
+    for direction in (ahead, np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])):
+        ends = np.array([np.quantile(points @ direction, (0.02, 0.98)) for points in (before, now)])
+        if abs(np.ptp(ends[1]) - np.ptp(ends[0])) < _SAME_WIDTH_M:
+            shifts.append((direction, float(ends[1].mean() - ends[0].mean())))
+    return shifts
 
 
 def _pose(state: NDArray[np.float64]) -> Transform:

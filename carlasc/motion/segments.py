@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,10 @@ from carlasc.core.scans import Scan
 
 MIN_SPEED_M_S = 0.3  # slower points count as standing, because estimated flow is never exactly zero
 _CELL_M = 0.4  # size of the cells in which moving points are grouped
-_REACH_M = 2.0  # cells of one actor are closer than this, so that a pole in front does not split a vehicle
+_REACH_M = (
+    2.0  # cells of one actor are closer than this along its motion, so that a pole in front does not split a vehicle
+)
+_BESIDE_M = 1.0  # and closer than this across: vehicles in the next lane often have the same velocity
 _SAME_VELOCITY_M_S = 0.5  # flow differs by less within one rigid actor
 
 
@@ -28,6 +31,7 @@ class Segment:
         points: (M, 3) float64 metres, world.
         velocity: (3,) m/s, world; None if the scan has no flow.
         instance: number of the actor; 0 if actors are not numbered.
+        origin: (3,) metres, world: the sensor that saw the points.
     """
 
     frame: int
@@ -36,12 +40,19 @@ class Segment:
     points: NDArray[np.float64]
     velocity: NDArray[np.float64] | None
     instance: int = 0
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @property
     def center(self) -> NDArray[np.float64]:
         """(3,) centre of the points' bounding box, metres, world."""
         center: NDArray[np.float64] = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
         return center
+
+
+def is_fast(flow: NDArray[np.floating], min_speed_m_s: float = MIN_SPEED_M_S) -> NDArray[np.bool_]:
+    """Return which of (N, 3) velocities, m/s, are faster than a speed. A velocity that is not finite is not."""
+    speed2 = np.square(np.asarray(flow, np.float64)).sum(axis=1)
+    return np.isfinite(speed2) & (speed2 > min_speed_m_s**2)
 
 
 def segment_by_flow(
@@ -62,34 +73,43 @@ def segment_by_flow(
     """
     if scan.flow is None or scan.labels is None:
         return []
-    flow = np.nan_to_num(np.asarray(scan.flow, np.float64), posinf=0.0, neginf=0.0)
-    moving = np.flatnonzero((np.square(flow).sum(axis=1) > min_speed_m_s**2) & (scan.labels > 0))
+    moving = np.flatnonzero(is_fast(scan.flow, min_speed_m_s) & (scan.labels > 0))
     if not len(moving):
         return []
     points = transform_points(world_T_sensor, scan.points[moving])
-    velocity = rotate_vectors(world_T_sensor, flow[moving])
+    velocity = rotate_vectors(world_T_sensor, scan.flow[moving])
     labels = scan.labels[moving].astype(np.int64)
     actor = _join(points, velocity, labels)
     return [
-        Segment(frame, int(labels[own[0]]), moving[own], points[own], np.median(velocity[own], axis=0))
+        Segment(
+            frame,
+            int(labels[own[0]]),
+            moving[own],
+            points[own],
+            np.median(velocity[own], axis=0),
+            origin=world_T_sensor[:3, 3],
+        )
         for own in _groups(actor)
     ]
 
 
-def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> list[Segment]:
+def segment_by_instances(
+    frame: int, scan: Scan, world_T_sensor: Transform, *, ground: Collection[int] = ()
+) -> list[Segment]:
     """Return the numbered actors of a scan, moving or not. Their tracks show which of them move.
 
     Args:
         frame: frame number.
         scan: points with labels and instances.
         world_T_sensor: (4, 4) pose of the scan.
+        ground: ids of the ground classes; their points belong to no actor, whatever their number.
 
     Returns:
         Segments in the order of their first point.
     """
     if scan.instances is None or scan.labels is None:
         return []
-    numbered = np.flatnonzero((scan.instances > 0) & (scan.labels > 0))
+    numbered = np.flatnonzero((scan.instances > 0) & (scan.labels > 0) & ~np.isin(scan.labels, sorted(ground)))
     points = transform_points(world_T_sensor, scan.points[numbered])
     flow = None if scan.flow is None else rotate_vectors(world_T_sensor, scan.flow[numbered])
     segments = []
@@ -97,7 +117,8 @@ def segment_by_instances(frame: int, scan: Scan, world_T_sensor: Transform) -> l
         members = numbered[own]
         label = int(np.bincount(scan.labels[members]).argmax())
         velocity = None if flow is None else np.median(flow[own], axis=0)
-        segments.append(Segment(frame, label, members, points[own], velocity, int(scan.instances[members[0]])))
+        number = int(scan.instances[members[0]])
+        segments.append(Segment(frame, label, members, points[own], velocity, number, world_T_sensor[:3, 3]))
     return segments
 
 
@@ -110,12 +131,14 @@ class Standing:
         members: (M,) int64 indices of the points in the scan.
         labels: (M,) their classes.
         points: (M, 3) float64 metres, world.
+        origin: (3,) metres, world: the sensor that saw the points.
     """
 
     frame: int
     members: NDArray[np.int64]
     labels: NDArray[np.int64]
     points: NDArray[np.float64]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def empty(cls, frame: int) -> Standing:
@@ -130,7 +153,7 @@ class Standing:
         )
         if len(own) < max(5, len(segment.members) // 5):
             return None
-        return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3))
+        return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3), origin=self.origin)
 
 
 def standing_points(
@@ -139,10 +162,9 @@ def standing_points(
     """Return the points of a scan that are of one of the classes `labels`, and slower than `min_speed_m_s`."""
     if scan.flow is None or scan.labels is None:
         return Standing.empty(frame)
-    slow = ~(np.square(np.nan_to_num(scan.flow)).sum(axis=1) > min_speed_m_s**2)
-    members = np.flatnonzero(slow & np.isin(scan.labels, sorted(labels)))
+    members = np.flatnonzero(~is_fast(scan.flow, min_speed_m_s) & np.isin(scan.labels, sorted(labels)))
     points = transform_points(world_T_sensor, scan.points[members])
-    return Standing(frame, members, scan.labels[members].astype(np.int64), points)
+    return Standing(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -154,7 +176,7 @@ def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 
 def _join(points: NDArray[np.float64], velocity: NDArray[np.float64], labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the component number of each point: cells of one class and velocity that are closer than `_REACH_M` are joined."""
+    """Return the component number of each point: neighbouring cells of one class and one velocity are joined."""
     keys = np.concatenate(
         [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S), labels[:, None]], axis=1
     ).astype(np.int64)
@@ -163,9 +185,14 @@ def _join(points: NDArray[np.float64], velocity: NDArray[np.float64], labels: ND
     center = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], axis=1) / count[:, None]
     speed = np.stack([np.bincount(cell, velocity[:, a]) for a in range(3)], axis=1) / count[:, None]
     kind = labels[np.unique(cell, return_index=True)[1]]
+    offset = center[:, None] - center[None]
+    ahead = speed / np.maximum(np.linalg.norm(speed, axis=1), 1e-9)[:, None]
+    along2 = np.square(np.einsum("ijk,ik->ij", offset, ahead))
+    across2 = np.square(offset).sum(axis=2) - along2
+    near = (along2 < _REACH_M**2) & (across2 < _BESIDE_M**2)
     joined = (
         (kind[:, None] == kind[None])
-        & (np.square(center[:, None] - center[None]).sum(axis=2) < _REACH_M**2)
+        & (near | near.T)
         & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
     )
     component = np.arange(len(count))

@@ -1,27 +1,24 @@
-"""Tracks: the segments of one actor over time, and the pose of the actor at each frame."""
+"""Tracks: the motion of one actor, its pose at each frame, and its body."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.motion.bodies import Extent, Sizes, measure
+from carlasc.motion.linking import Chain, Linker
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment, Standing
 from carlasc.motion.smoothing import resample
 
-_REACH_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
-_GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
-_SAME_VELOCITY_M_S = 2.0  # maximum change of an actor's velocity between two segments
-_STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
-_MAX_GAP = 15  # maximum number of frames for which an actor may be hidden
-_EXTRAPOLATE = 5  # number of frames by which a track extends beyond its first and its last segment
+_EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last segment
 _STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
-_TRIM = 0.01  # fraction of points that may be outside an actor's box: outliers, points of a neighbour
-_MARGIN_M = 0.1
+LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
+BODY_MARGIN_M = 0.1  # by which the box of an actor is larger than its body
 
 
 @dataclass(frozen=True)
@@ -31,22 +28,26 @@ class Track:
     Attributes:
         label: class of the actor, which is that of most of its points.
         instance: number of the actor; 0 if actors are not numbered.
-        segments: the actor's segments by frame.
+        members: (M,) indices of the actor's points in each scan that saw it, by frame.
         first: frame of `world_T_actor[0]`.
-        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x is forward, and the origin is the centre of its box.
+        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x is forward, and the origin is the centre of its body.
         velocity: (F, 3) m/s, world, at the same frames.
-        lower: (3,) metres, lower corner of the actor's box, actor frame.
+        lower: (3,) metres, lower corner of the actor's whole body, actor frame.
         upper: (3,) metres, upper corner.
+        extent: what was seen of the body.
+        rigid: whether it keeps its shape, as vehicles do.
     """
 
     label: int
     instance: int
-    segments: Mapping[int, Segment]
+    members: Mapping[int, NDArray[np.integer]]
     first: int
     world_T_actor: NDArray[np.float64]
     velocity: NDArray[np.float64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    extent: Extent
+    rigid: bool = True
 
     def pose(self, frame: int) -> Transform | None:
         """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
@@ -60,14 +61,16 @@ class Track:
 
     @property
     def size(self) -> NDArray[np.float64]:
-        """(3,) metres: length, width, height of the box."""
+        """(3,) metres: length, width, height of the body."""
         return self.upper - self.lower
 
     @property
     def moves(self) -> bool:
-        """Whether the actor moves faster and farther at some time than a standing actor seems to."""
+        """Whether the actor moves faster and farther at some time than a standing actor seems to, and is one thing."""
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
-        return bool(fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M)
+        return bool(
+            self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M
+        )
 
 
 def link_segments(
@@ -79,9 +82,6 @@ def link_segments(
 ) -> list[Track]:
     """Link the segments of several scans into tracks.
 
-    Numbered actors are linked by their numbers, others by prediction: a segment continues the track of its class whose
-    predicted position is nearest to it, also after the actor was hidden for some frames.
-
     Args:
         segments: the segments of all scans, in any order.
         times: seconds by frame, for every frame with a segment.
@@ -89,120 +89,80 @@ def link_segments(
         deformable: classes whose actors change their shape; without flow, the centre of their points is followed.
 
     Returns:
-        Tracks in order of their first segment.
+        Tracks in order of their first segment, with whole bodies.
     """
-    ordered = sorted(segments, key=lambda segment: segment.frame)
-    chains = _chains(ordered, times, standing or {})
-    for chain in chains:
-        _extend_backwards(chain, standing or {})
-    return [_make_track(chain, times, deformable) for chain in chains]
-
-
-def _chains(
-    segments: list[Segment], times: Mapping[int, float], standing: Mapping[int, Standing]
-) -> list[list[Segment]]:
-    by_instance: dict[int, list[Segment]] = {}
     by_frame: dict[int, list[Segment]] = {}
     for segment in segments:
-        if segment.instance:
-            by_instance.setdefault(segment.instance, []).append(segment)
-        else:
-            by_frame.setdefault(segment.frame, []).append(segment)
-    chains: list[list[Segment]] = []
-    for frame in sorted(by_frame.keys() | (standing.keys() if by_frame else set())):
-        alive = [chain for chain in chains if frame - _MAX_GAP <= chain[-1].frame < frame]
-        for segment, chain in _match(by_frame.get(frame, []), alive, times):
-            if chain is None:
-                chains.append([segment])
-            else:
-                chain.append(segment)
-        for chain in alive:  # a slow actor that was not found may have stopped
-            if chain[-1].frame < frame and frame in standing and _is_slow(chain[-1]):
-                rest = standing[frame].segment_at(chain[-1])
-                if rest is not None:
-                    chain.append(rest)
-    return [*by_instance.values(), *chains]
+        by_frame.setdefault(segment.frame, []).append(segment)
+    linker = Linker()
+    chains: list[Chain] = []
+    for frame in sorted(by_frame.keys() | (standing or {}).keys()):
+        chains += linker.add(frame, times[frame], by_frame.get(frame, []), (standing or {}).get(frame))
+    chains += linker.finish()
+    return complete_bodies([make_track(chain, times, deformable=deformable) for chain in chains])
 
 
-def _extend_backwards(chain: list[Segment], standing: Mapping[int, Standing]) -> None:
-    """Insert segments before a chain from the scans in which its actor was standing where the chain starts."""
-    if chain[0].instance:
-        return
-    for frame in sorted((frame for frame in standing if frame < chain[0].frame), reverse=True):
-        rest = standing[frame].segment_at(chain[0]) if _is_slow(chain[0]) else None
-        if rest is None:
-            return
-        chain.insert(0, rest)
+def make_track(
+    chain: Sequence[Segment],
+    times: Mapping[int, float],
+    *,
+    deformable: Collection[int] = (),
+    rigid: bool | None = None,
+) -> Track:
+    """Return the track of linked segments: their path, the poses along it, and the box around all points.
 
-
-def _is_slow(segment: Segment) -> bool:
-    return segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
-
-
-def _match(
-    found: list[Segment], alive: list[list[Segment]], times: Mapping[int, float]
-) -> list[tuple[Segment, list[Segment] | None]]:
-    """Pair the segments of one scan with the chains that they continue: nearest prediction first, each chain once."""
-    if not found or not alive:
-        return [(segment, None) for segment in found]
-    candidates = []
-    ends = np.stack([chain[-1].center for chain in alive])
-    for i, segment in enumerate(found):
-        reach = _REACH_M + _MAX_SPEED_M_S * np.array([times[segment.frame] - times[chain[-1].frame] for chain in alive])
-        for j in np.flatnonzero(np.linalg.norm(ends - segment.center, axis=1) < reach).tolist():
-            last = alive[j][-1]
-            cost = _cost(last, segment, times[segment.frame] - times[last.frame])
-            if cost is not None:
-                candidates.append((cost, i, j))
-    taken: dict[int, int] = {}
-    for _, i, j in sorted(candidates):
-        if i not in taken and j not in taken.values():
-            taken[i] = j
-    return [(segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)]
-
-
-def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
-    """Return how much a segment differs from the prediction of its predecessor; None if it cannot be the same actor."""
-    if last.label != segment.label or last.velocity is None or segment.velocity is None:
-        return None
-    change = float(np.linalg.norm(segment.velocity - last.velocity))
-    predicted = last.points + (last.velocity + segment.velocity) / 2 * elapsed_s
-    # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
-    gap = np.maximum(
-        predicted.min(axis=0) - segment.points.max(axis=0), segment.points.min(axis=0) - predicted.max(axis=0)
-    )
-    distance = float(np.linalg.norm(np.maximum(gap, 0.0)))
-    if distance > _GATE_M or change > _SAME_VELOCITY_M_S:
-        return None
-    offset = float(np.linalg.norm(predicted.mean(axis=0) - segment.center))
-    return distance + change + 0.1 * offset
-
-
-def _make_track(chain: list[Segment], times: Mapping[int, float], deformable: Collection[int]) -> Track:
-    """Return the track of linked segments: their path, the poses along it, and the box around all points."""
+    Args:
+        chain: the segments of one actor, in order of time.
+        times: seconds by frame.
+        deformable: classes whose actors change their shape.
+        rigid: whether this one keeps its shape; None: unless it is of one of these classes.
+    """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
+    keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
         sightings = [segment.points for segment in chain]
-        positions, velocities = estimate_path(sightings, seconds, rigid=label not in deformable)
+        positions, velocities = estimate_path(sightings, seconds, rigid=keeps_shape)
         if is_standing(sightings, positions, headings_of(velocities), seconds):
             positions, velocities = np.zeros_like(positions), np.zeros_like(velocities)
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
         positions = _integrate(velocities, seconds, chain)
     headings = headings_of(velocities)
-    positions, lower, upper = _fit_box(chain, positions, headings)
-    first, last = chain[0].frame - _EXTRAPOLATE, chain[-1].frame + _EXTRAPOLATE
-    frames = np.arange(first, last + 1)
-    at = _frame_times(frames, times)
+    positions, extent = _fit_box(chain, positions, headings)
+    frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     path, speed = resample(at, seconds, positions, velocities)
     poses = np.stack([rotation_z(angle) for angle in np.interp(at, seconds, headings)])
     poses[:, :3, 3] = path
-    return Track(label, chain[0].instance, {s.frame: s for s in chain}, first, poses, speed, lower, upper)
+    members = {segment.frame: segment.members.astype(np.int32) for segment in chain}
+    lower, upper = extent.lower - BODY_MARGIN_M, extent.upper + BODY_MARGIN_M
+    return Track(label, chain[0].instance, members, int(frames[0]), poses, speed, lower, upper, extent, keeps_shape)
+
+
+def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
+    """Return tracks in order of their first segment, each with a body as large as similar actors', and not only as what was seen of it."""
+    sizes = Sizes([(track.label, track.extent) for track in tracks if track.rigid])
+    whole = [_with_body(track, sizes) if track.rigid else track for track in tracks]
+    return sorted(whole, key=lambda track: (track.first, track.instance, track.label, *track.world_T_actor[0, :3, 3]))
+
+
+def _with_body(track: Track, sizes: Sizes) -> Track:
+    lower, upper = sizes.complete(track.label, track.extent)
+    middle = (lower + upper) / 2
+    poses = track.world_T_actor.copy()
+    poses[:, :3, 3] += poses[:, :3, :3] @ middle
+    seen = replace(track.extent, lower=track.extent.lower - middle, upper=track.extent.upper - middle)
+    return replace(
+        track,
+        world_T_actor=poses,
+        lower=lower - middle - BODY_MARGIN_M,
+        upper=upper - middle + BODY_MARGIN_M,
+        extent=seen,
+    )
 
 
 def _integrate(
-    velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: list[Segment]
+    velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: Sequence[Segment]
 ) -> NDArray[np.float64]:
     """Integrate velocities by the trapezoidal rule, through the centre of the segment with most points."""
     steps = (velocities[1:] + velocities[:-1]) / 2 * np.diff(seconds)[:, None]
@@ -212,33 +172,38 @@ def _integrate(
 
 
 def _fit_box(
-    chain: list[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Move the path to the centre of the actor, and return it with the corners of the actor's box.
+    chain: Sequence[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], Extent]:
+    """Move the path to the centre of what was seen of the actor, and return it with the extent of its points around it.
 
     The path is known except for a constant offset in the world. If the actor turns, the segments overlap only with the correct
     offset, which is the one that moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
     for _ in range(3):
-        body = []
+        body, sensors = [], []
         for segment, position, heading in zip(chain, positions, headings, strict=True):
             pose = rotation_z(heading)
             pose[:3, 3] = position
             body.append(transform_points(invert(pose), segment.points))
-        points = np.concatenate(body)
-        lower, upper = np.quantile(points, _TRIM, axis=0), np.quantile(points, 1 - _TRIM, axis=0)
-        middle = (lower + upper) / 2
+            sensors.append(transform_points(invert(pose), segment.origin))
+        extent = measure(body, np.stack(sensors))
+        middle = (extent.lower + extent.upper) / 2
         positions = positions + rotation_z(headings[best])[:3, :3] @ middle
-        lower, upper = lower - middle, upper - middle
-    return positions, lower - _MARGIN_M, upper + _MARGIN_M
+        extent = replace(extent, lower=extent.lower - middle, upper=extent.upper - middle)
+    return positions, extent
 
 
-def _frame_times(frames: NDArray[np.int64], times: Mapping[int, float]) -> NDArray[np.float64]:
-    """Return the seconds of frames. Frames without a scan are interpolated, and extrapolated by the mean period."""
+def _frames_around(first: int, last: int, times: Mapping[int, float]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the frames from `_EXTRAPOLATE_S` before `first` to as long after `last`, and their times.
+
+    Frames without a scan are interpolated, and extrapolated by the mean period.
+    """
     known = np.array(sorted(times))
     seconds = np.array([times[int(frame)] for frame in known])
-    period = (seconds[-1] - seconds[0]) / (known[-1] - known[0]) if len(known) > 1 else 0.1
+    period = float(seconds[-1] - seconds[0]) / float(known[-1] - known[0]) if len(known) > 1 else 0.1
+    more = max(1, round(_EXTRAPOLATE_S / period))
+    frames = np.arange(first - more, last + more + 1)
     inside = np.interp(frames, known, seconds)
     before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
-    return inside + (before + after) * period
+    return frames, inside + (before + after) * period

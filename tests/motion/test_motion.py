@@ -86,7 +86,7 @@ def test_two_cars_that_meet_do_not_change_places():
 def test_a_car_that_stops_and_goes_on_is_one_track_from_its_first_to_its_last_scan():
     brakes = MovingBox((10, 5, 0), speed=lambda t: max(0.0, 5 - 2.5 * t) + max(0.0, 2.5 * (t - 4)))
     (track,) = tracks_by_flow([brakes], frames=range(60))
-    assert sorted(track.segments) == list(range(60))
+    assert sorted(track.members) == list(range(60))
     assert carried_error(track, brakes, (0, 15, 30, 45, 59)) < 0.15
 
 

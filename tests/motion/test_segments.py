@@ -89,3 +89,10 @@ class TestStandingPoints:
     def test_moving_points_and_other_classes_are_left_out(self):
         seen = scan((0, 0, CAR, 0.0), (5, 0, CAR, 8.0), (9, 0, 7, 0.0))
         assert standing_points(0, seen, np.eye(4), {CAR}).members.tolist() == list(range(20))
+
+
+def test_ground_points_are_in_no_actor_whatever_their_number():
+    numbered = scan((0, 0, CAR, 8.0), (0.3, 0, 7, 0.0), instances=[3, 3])
+    (whole,) = segment_by_instances(0, numbered, np.eye(4))
+    (segment,) = segment_by_instances(0, numbered, np.eye(4), ground={7})
+    assert (len(whole.members), segment.members.tolist()) == (40, list(range(20)))

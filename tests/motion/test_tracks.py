@@ -1,5 +1,7 @@
 """Which segments become one track, and what the track says between and beyond them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,10 +12,12 @@ TIMES = {frame: 0.1 * frame for frame in range(100)}
 
 
 def segment(frame, x, speed=8.0, *, y=0.0, label=CAR, instance=0, size=(4.0, 2.0, 1.5)):
-    """The corners of a box, and its centre, at a place."""
+    """The corners of a box, and its centre, at a place, seen from behind and beside it: its length and width are known."""
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)] + [[0, 0, 0]]) / 2
     points = corners * size + (x, y, 0.0)
-    return Segment(frame, label, np.arange(9), points, np.array([speed, 0.0, 0.0]), instance)
+    return Segment(
+        frame, label, np.arange(9), points, np.array([speed, 0.0, 0.0]), instance, np.array([x - 10, y - 10, 0])
+    )
 
 
 def drive(frames, speed=8.0, **options):
@@ -44,8 +48,9 @@ def test_a_segment_continues_a_track_of_its_class_velocity_and_place(next_one, t
 
 def test_each_track_continues_with_one_segment_the_nearest():
     first, second = link_segments([segment(0, 0.0), segment(1, 1.0, y=0.9), segment(1, 0.8)], TIMES)
-    assert [found.center[1] for found in first.segments.values()] == [0.0, 0.0]
-    assert [found.center[1] for found in second.segments.values()] == [pytest.approx(0.9)]
+    assert sorted(first.members) == [0, 1] and sorted(second.members) == [1]
+    assert first.pose(1)[1, 3] == 0.0
+    assert second.pose(1)[1, 3] == pytest.approx(0.9)
 
 
 def test_a_track_extends_five_frames_beyond_its_segments_at_constant_velocity():
@@ -61,8 +66,9 @@ def test_a_track_extends_five_frames_beyond_its_segments_at_constant_velocity():
 def test_times_beyond_the_scans_go_on_at_their_mean_period():
     times = {frame: 0.2 * frame for frame in range(10)}
     (track,) = link_segments([segment(frame, 1.6 * frame) for frame in range(10)], times)
-    for frame in (-5, 0, 9, 14):
+    for frame in (-2, 0, 9, 11):
         assert track.pose(frame)[0, 3] == pytest.approx(1.6 * frame)
+    assert track.pose(-3) is None and track.pose(12) is None  # half a second is two frames and a half
 
 
 def test_the_box_holds_the_points_and_a_margin_but_not_single_outliers():
@@ -70,7 +76,7 @@ def test_the_box_holds_the_points_and_a_margin_but_not_single_outliers():
     assert np.allclose(track.size, (4.2, 2.2, 1.7))
     segments = drive(range(40))
     outlier = np.concatenate([segments[20].points, [[16.0, 9.0, 0.0]]])
-    segments[20] = Segment(20, CAR, np.arange(10), outlier, np.array([8.0, 0.0, 0.0]))
+    segments[20] = Segment(20, CAR, np.arange(10), outlier, np.array([8.0, 0.0, 0.0]), origin=segments[20].origin)
     (track,) = link_segments(segments, TIMES)
     assert np.allclose(track.size, (4.2, 2.2, 1.7), atol=0.05)
 
@@ -97,22 +103,47 @@ def test_a_track_is_extended_back_to_where_its_actor_was_standing():
     moving = drive(range(10, 15), 1.0)
     still = {frame: standing(frame, 1.0) for frame in range(10)}
     (track,) = link_segments(moving, TIMES, still)
-    assert sorted(track.segments) == list(range(15))
+    assert sorted(track.members) == list(range(15))
     fast = drive(range(10, 15), 8.0)  # it cannot have been standing a moment before
     (track,) = link_segments(fast, TIMES, {frame: standing(frame, 8.0) for frame in range(10)})
-    assert sorted(track.segments) == list(range(10, 15))
+    assert sorted(track.members) == list(range(10, 15))
 
 
 def test_a_slow_actor_that_stops_is_followed_and_a_fast_one_is_not():
     for speed, last in ((1.0, 19), (8.0, 14)):
         still = {frame: standing(frame, speed * 1.4) for frame in range(15, 20)}
         (track,) = link_segments(drive(range(10, 15), speed), TIMES, still)
-        assert max(track.segments) == last
+        assert max(track.members) == last
 
 
 def test_numbered_actors_are_linked_by_their_numbers_wherever_they_are():
     first, second = link_segments(
         [segment(0, 0.0, instance=3), segment(30, 500.0, instance=3), segment(0, 0.5, instance=4)], TIMES
     )
-    assert (first.instance, len(first.segments)) == (3, 2)
-    assert (second.instance, len(second.segments)) == (4, 1)
+    assert (first.instance, len(first.members)) == (3, 2)
+    assert (second.instance, len(second.members)) == (4, 1)
+
+
+def test_a_body_is_completed_away_from_the_face_that_was_seen():
+    behind = [replace(one, origin=one.center - (10, 0, 0)) for one in drive(range(20))]  # it drives ahead
+    (track,) = link_segments(behind, TIMES)
+    assert np.allclose(track.size, (4.6, 2.2, 1.7))  # 4.4 m, a usual length of cars, and the margins
+    rear = track.pose(10)[0, 3] + track.lower[0] + 0.1
+    assert rear == pytest.approx(8.0 - 2.0)
+    assert np.allclose(track.lower, -track.upper)  # the origin is the centre of the body
+    assert track.extent.size[0] == pytest.approx(4.0)
+
+
+def test_people_are_as_large_as_their_points():
+    people = [
+        replace(one, label=PERSON, origin=one.center - (10, 0, 0)) for one in drive(range(20), size=(0.5, 0.5, 1.7))
+    ]
+    (track,) = link_segments(people, TIMES, deformable={PERSON})
+    assert not track.rigid
+    assert np.allclose(track.size, (0.7, 0.7, 1.9))
+
+
+@pytest.mark.parametrize(("length", "moves"), [(28.0, True), (31.0, False)])
+def test_what_is_longer_than_any_vehicle_is_several_things_and_does_not_move(length, moves):
+    (track,) = link_segments(drive(range(20), size=(length, 2.5, 3.0)), TIMES)
+    assert track.moves == moves

@@ -1,0 +1,241 @@
+"""Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a scan that are in them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.core.scans import Scan
+from carlasc.motion.bodies import Extent
+from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.smoothing import resample, smooth
+from carlasc.motion.tracks import BODY_MARGIN_M, Track
+
+_SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
+_FILLED_IN = 0.3  # weight of a box that was not annotated in its frame
+_STANDING_M = 1.0  # annotated boxes of an object that stands may move this far, but not steadily
+_STEADY_M, _STEADY = 0.3, 5.0  # a shorter way counts if it is so many times as long as its deviation from a line
+_HOLD_S = 1.0  # an object that stands for this long stands in all frames
+_EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last box
+_JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart are different objects with one number
+
+
+@dataclass(frozen=True)
+class _Sightings:
+    """The boxes of one object.
+
+    Attributes:
+        frames: (F,) frame numbers, increasing.
+        seconds: (F,) their times.
+        poses: (F, 4, 4) world_T_box.
+        sizes: (F, 3) metres.
+        labels: (F,) class ids.
+        weights: (F,) how much each box counts.
+    """
+
+    frames: NDArray[np.int64]
+    seconds: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    labels: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+    def part(self, rows: NDArray[np.int64]) -> _Sightings:
+        return _Sightings(*(values[rows] for values in vars(self).values()))
+
+
+def tracks_from_boxes(
+    boxes: Mapping[int, Boxes], poses: Mapping[int, Transform], times: Mapping[int, float]
+) -> list[Track]:
+    """Return the tracks of annotated boxes.
+
+    Whether an object stands is decided over all of its boxes, because annotated boxes of a parked car move by some decimetres. An
+    object that stands has one pose, the median of its boxes, and velocity 0 in all frames of `times`. The poses of others are
+    smoothed, and interpolated where boxes are missing. No points are used.
+
+    Args:
+        boxes: the boxes of each annotated frame, sensor frame.
+        poses: (4, 4) world_T_sensor of at least these frames.
+        times: seconds of all frames of the sequence, increasing.
+
+    Returns:
+        The tracks in order of their numbers, without members: `segment_by_boxes` finds those of a scan. An object whose boxes jump
+        has several tracks with the same number.
+    """
+    found: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
+    for frame in sorted(boxes):
+        for row, track in enumerate(boxes[frame].tracks.tolist()):
+            found.setdefault(track, []).append((frame, row))
+    world = {frame: boxes[frame].transform(poses[frame]) for frame in boxes}
+    return [
+        _make_track(track, part, times)
+        for track in sorted(found)
+        for part in _split_at_jumps(_sightings([(frame, world[frame], row) for frame, row in found[track]], times))
+    ]
+
+
+def segment_by_boxes(
+    frame: int,
+    scan: Scan,
+    world_T_sensor: Transform,
+    tracks: Sequence[Track],
+    *,
+    ground: Collection[int] = (),
+    floor_m: float = 0.15,
+) -> list[Segment]:
+    """Return the points of a scan that are in the boxes of tracks.
+
+    Points of ground classes are in none. A point in the boxes of several tracks belongs to the smallest one.
+
+    Args:
+        frame: frame number.
+        scan: points, with labels if it has any.
+        world_T_sensor: (4, 4) pose of the scan.
+        tracks: tracks, of which those that extend to the frame are used.
+        ground: ids of the ground classes.
+        floor_m: points that are not labelled as the actor's class are taken for the ground up to this height above the bottom
+            of its box, metres.
+
+    Returns:
+        The segments of the tracks that have points in the scan, in the order of the tracks. The label, the number and the velocity are
+        those of the track.
+    """
+    owners = np.full(len(scan), -1, np.int64)
+    usable = np.isfinite(scan.points).all(axis=1)
+    if scan.labels is not None:
+        usable &= ~np.isin(scan.labels, sorted(ground))
+    candidates = np.flatnonzero(usable)
+    points = transform_points(world_T_sensor, scan.points[candidates])
+    for index in np.argsort([-np.prod(track.size) for track in tracks], kind="stable").tolist():
+        track = tracks[index]
+        pose = track.pose(frame)
+        if pose is not None:
+            labels = None if scan.labels is None else scan.labels[candidates]
+            owners[candidates[_inside(track, pose, points, labels, floor_m)]] = index
+    segments = []
+    for index, track in enumerate(tracks):
+        members = np.flatnonzero(owners == index)
+        if len(members):
+            own = transform_points(world_T_sensor, scan.points[members])
+            velocity, origin = track.velocity_at(frame), world_T_sensor[:3, 3]
+            segments.append(Segment(frame, track.label, members, own, velocity, track.instance, origin))
+    return segments
+
+
+def _inside(
+    track: Track,
+    pose: Transform,
+    points: NDArray[np.float64],
+    labels: NDArray[np.unsignedinteger] | None,
+    floor_m: float,
+) -> NDArray[np.int64]:
+    """Return the indices of the points (M, 3), world, that are in a track's box at a pose, and not on the ground below it."""
+    reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)))
+    near = np.flatnonzero((np.abs(points - pose[:3, 3]) <= reach).all(axis=1))
+    body = transform_points(invert(pose), points[near])
+    inside = ((body >= track.lower) & (body <= track.upper)).all(axis=1)
+    above = body[:, 2] > track.lower[2] + BODY_MARGIN_M + floor_m
+    if labels is not None:
+        above |= labels[near] == track.label
+    return near[inside & above]
+
+
+def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _Sightings:
+    """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
+    chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
+    frames = np.array([frame for frame, _, _ in found], np.int64)
+    return _Sightings(
+        frames,
+        np.array([times[frame] for frame in frames.tolist()]),
+        np.concatenate([box.sensor_T_box for box in chosen]),
+        np.concatenate([box.sizes for box in chosen]),
+        np.concatenate([box.labels for box in chosen]).astype(np.int64),
+        np.where(np.concatenate([box.annotated for box in chosen]), 1.0, _FILLED_IN),
+    )
+
+
+def _split_at_jumps(sightings: _Sightings) -> list[_Sightings]:
+    """Split the boxes of a number where no object can get from one to the next."""
+    steps = np.linalg.norm(np.diff(sightings.poses[:, :3, 3], axis=0), axis=1)
+    jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(sightings.seconds)) + 1
+    return [sightings.part(rows) for rows in np.split(np.arange(len(sightings.frames)), jumps)]
+
+
+def _make_track(instance: int, sightings: _Sightings, times: Mapping[int, float]) -> Track:
+    seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
+    headings, tilt = _headings_and_tilt(sightings.poses[:, :3, :3])
+    frames = np.array(sorted(times), np.int64)
+    at = np.array([times[frame] for frame in frames.tolist()])
+    path, speed = smooth(centers, seconds, sightings.weights, _SMOOTH_S)
+    stands = _stands(path, centers, seconds)
+    if stands:
+        path, speed = np.tile(np.median(centers, axis=0), (len(seconds), 1)), np.zeros_like(speed)
+        turns = np.full(len(seconds), np.median(headings))
+    else:
+        turns = smooth(headings[:, None], seconds, sightings.weights, _SMOOTH_S)[0][:, 0]
+    if not stands or seconds[-1] - seconds[0] < _HOLD_S:
+        inside = (at > seconds[0] - _EXTRAPOLATE_S) & (at < seconds[-1] + _EXTRAPOLATE_S)
+        frames = frames[inside]
+    every = np.arange(frames[0], frames[-1] + 1)
+    at = np.interp(every, sorted(times), [times[frame] for frame in sorted(times)])
+    path, speed = resample(at, seconds, path, speed)
+    poses = np.stack([rotation_z(angle) @ tilt for angle in np.interp(at, seconds, turns)])
+    poses[:, :3, 3] = path
+    half = np.median(sightings.sizes, axis=0) / 2
+    return Track(
+        label=int(np.bincount(sightings.labels).argmax()),
+        instance=instance,
+        members={},
+        first=int(frames[0]),
+        world_T_actor=poses,
+        velocity=speed,
+        lower=-half - BODY_MARGIN_M,
+        upper=half + BODY_MARGIN_M,
+        extent=Extent(-half, half, (True, True, True, True), 0),
+    )
+
+
+def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float64], Transform]:
+    """Return the (F,) headings of boxes in radians, unwrapped, and the mean of what is left of their (F, 3, 3) rotations.
+
+    Annotators confuse the front of a box with its back: headings that differ by half a turn count as the same, and most boxes decide.
+    """
+    angles = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+    headings = np.unwrap(angles, period=np.pi)
+    if np.cos(headings - angles).sum() < 0:
+        headings = headings + np.pi
+    upright = np.stack([rotation_z(-angle)[:3, :3] for angle in angles]) @ rotations
+    left, _, right = np.linalg.svd(upright.mean(axis=0))
+    tilt = np.eye(4)
+    tilt[:3, :3] = left @ right
+    return headings, tilt
+
+
+def _stands(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]) -> bool:
+    """Return whether an object stands, from its smoothed path (F, 3) and the (F, 3) centres of its boxes, metres, world."""
+    duration = float(seconds[-1] - seconds[0])
+    if duration <= 0:
+        return True
+    line = np.polynomial.polynomial.polyfit(seconds - seconds.mean(), centers[:, :2], 1)
+    way = float(np.linalg.norm(line[1])) * duration
+    deviation = centers[:, :2] - line[0] - (seconds - seconds.mean())[:, None] * line[1]
+    steady = way > max(_STEADY_M, _STEADY * float(np.sqrt(np.square(deviation).sum(axis=1).mean())))
+    if steady and way / duration > MIN_SPEED_M_S:
+        return False
+    extent = float(np.linalg.norm(np.ptp(path[:, :2], axis=0)))
+    slow = _fastest(path, seconds) < MIN_SPEED_M_S
+    return extent < _STANDING_M or slow
+
+
+def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
+    """Return the greatest mean speed over `_HOLD_S` along a path, in m/s; over all of it if it is shorter."""
+    then = np.minimum(np.searchsorted(seconds, seconds + _HOLD_S), len(seconds) - 1)
+    elapsed = seconds[then] - seconds
+    whole = (elapsed >= min(_HOLD_S, float(seconds[-1] - seconds[0])) - 1e-9) & (elapsed > 0)
+    way = np.linalg.norm(path[then, :2] - path[:, :2], axis=1)
+    return float((way[whole] / elapsed[whole]).max(initial=0.0))

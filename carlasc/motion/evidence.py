@@ -1,0 +1,288 @@
+"""Evidence of motion: points at places that were free space at other times, without flow, instances or labels that say so.
+
+Each point that is not ground is looked up in scans up to `HORIZON_S` before and after. If its place was seen through more often than it was
+seen occupied, or always on one side in time, something was there that moved. Such points are grouped into clusters, and a cluster gets the
+points around it that nothing shows to be static.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.cells import as_pose, cached
+from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.errors import FormatError
+from carlasc.motion.ground import ground_points
+from carlasc.motion.visibility import View, look_up
+
+HORIZON_S = 5.0
+"""Scans up to this many seconds before and after a scan are looked up."""
+
+_OFFSETS_S = (0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
+_AGREEING = 2  # scans that must have seen through a place
+_IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest inwards, saw through it
+_CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
+_MIN_POINTS = 3  # smaller clusters are noise
+_JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and the others are as it is
+_FLAGGED_SHARE = 0.6  # a cluster with this share of moved points is one object, which moved with all its points
+_PERIOD_S = 0.1  # between scans whose times do not rise
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One scan, as evidence of motion needs it.
+
+    Attributes:
+        frame: frame number.
+        points: (N, 3) float32, metres, in the frame of a sensor that is mounted upright.
+        world_T_sensor: (4, 4).
+        seconds: time of the scan.
+        ground: (N,) bool, which points are ground; None to find out from their positions.
+        labels: (N,) class ids; None if the scan has none.
+        explained: (N,) bool, points of actors that are known already; None if there are none. They are never evidence.
+    """
+
+    frame: int
+    points: NDArray[np.float32]
+    world_T_sensor: Transform
+    seconds: float
+    ground: NDArray[np.bool_] | None = None
+    labels: NDArray[np.unsignedinteger] | None = None
+    explained: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise FormatError("points", expected="shape (N, 3)", found=str(self.points.shape))
+        for name in ("ground", "labels", "explained"):
+            values = getattr(self, name)
+            if values is not None and values.shape != (len(self.points),):
+                raise FormatError(name, expected=f"shape ({len(self.points)},)", found=str(values.shape))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What moved in one scan.
+
+    Attributes:
+        frame: frame number.
+        seconds: time of the scan.
+        count: number of points of the scan.
+        clusters: (M,) int64 indices of the points of each thing that moved.
+        points: (M, 3) float64 of the same points, metres, world.
+        labels: class of most points of each cluster; 0 without labels.
+    """
+
+    frame: int
+    seconds: float
+    count: int
+    clusters: tuple[NDArray[np.int64], ...]
+    points: tuple[NDArray[np.float64], ...]
+    labels: tuple[int, ...]
+
+    def thinned(self, most: int = 400) -> Evidence:
+        """Return the same with at most so many `points` for each cluster; `clusters` stay complete."""
+        return replace(self, points=tuple(points[:: -(-len(points) // most)] for points in self.points))
+
+    @property
+    def moved(self) -> NDArray[np.bool_]:
+        """(N,) bool: which points of the scan belong to something that moved."""
+        flags = np.zeros(self.count, np.bool_)
+        for members in self.clusters:
+            flags[members] = True
+        return flags
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A scan in the window."""
+
+    scan: Sighting
+    seconds: float
+    view: View
+
+
+def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -> Iterator[Evidence]:
+    """Yield what moved in each scan of a drive, as soon as the scans of `HORIZON_S` after it were read.
+
+    Only the scans within this time are held, so memory does not grow with the drive.
+
+    Args:
+        scans: the scans in order of time. Times that do not rise are replaced by 0.1 s per scan.
+        movable: classes of objects that can move; points of different ones are not grouped together.
+
+    Yields:
+        The evidence of each scan, in the order of the scans.
+    """
+    window: deque[_Kept] = deque()
+    current, last = 0, -np.inf
+    for scan in scans:
+        seconds = scan.seconds if scan.seconds > last else (last + _PERIOD_S if np.isfinite(last) else 0.0)
+        last = seconds
+        window.append(_Kept(scan, seconds, View.of(scan.points)))
+        while window[-1].seconds - window[current].seconds > HORIZON_S:
+            yield _evidence(window, current, movable)
+            current += 1
+            while window[current].seconds - window[0].seconds > HORIZON_S:
+                window.popleft()
+                current -= 1
+    for index in range(current, len(window)):
+        yield _evidence(window, index, movable)
+
+
+def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> Evidence:
+    own = window[current]
+    scan = own.scan
+    ground = ground_points(scan.points) if scan.ground is None else scan.ground
+    asked = ~ground if scan.explained is None else ~(ground | scan.explained)
+    candidates = np.flatnonzero(asked & np.isfinite(scan.points).all(axis=1))
+    before, after = _others(window, current)
+    world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
+    asked_first, same = _thin(world)
+    verdict = _judge(scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after])
+    moved, left, static = (answers[same] for answers in verdict)
+    kind = np.zeros(len(candidates), np.int64)
+    if scan.labels is not None and movable:
+        labels = scan.labels[candidates].astype(np.int64)
+        kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
+    clusters = [candidates[own] for own in _clusters(world, kind, moved, left, static)]
+    points = [transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64)) for members in clusters]
+    classes = [0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax()) for own in clusters]
+    return Evidence(scan.frame, own.seconds, len(scan.points), tuple(clusters), tuple(points), tuple(classes))
+
+
+def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
+    """Return the positions of the scans to look up, before and after the current one, nearest first."""
+    seconds = np.array([kept.seconds for kept in window]) - window[current].seconds
+    sides: tuple[list[int], list[int]] = ([], [])
+    for side, sign in zip(sides, (-1, 1), strict=True):
+        for offset in _OFFSETS_S:
+            nearest = int(np.argmin(np.abs(seconds - sign * offset)))
+            if (nearest - current) * sign > 0 and nearest not in side:
+                side.append(nearest)
+    return sides
+
+
+def _judge(
+    scan: Sighting, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which candidates were seen through most of the time, which on one side in time only, and which are static."""
+    points = np.ascontiguousarray(scan.points[candidates], np.float32)
+    free, hit = np.zeros((2, 2, len(points)), np.uint32)
+    for side, others in enumerate((before, after)):
+        for bit, other in enumerate(others):
+            pose = as_pose(invert(other.scan.world_T_sensor) @ scan.world_T_sensor)
+            view = other.view
+            look_up(points, pose, view.start, view.slope, view.distance, bit, free[side], hit[side])
+    seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
+    occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)
+    # Bits above the highest hit are those of the scans farther away than all that saw the place occupied.
+    smeared = hit.copy()
+    for shift in (1, 2, 4, 8, 16):
+        smeared |= smeared >> np.uint32(shift)
+    in_a_row = np.bitwise_count(free & ~smeared).max(axis=0)
+    moved = (seen_through >= _AGREEING) & (seen_through > occupied)
+    left = ~moved & (in_a_row >= _IN_A_ROW)
+    return moved, left, ~(moved | left) & (occupied > seen_through)
+
+
+def _thin(world: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first point of each small cell, and the position of each point's cell among them."""
+    cell = np.floor(world / _JUDGED_CELL_M).astype(np.int64) + (1 << 20)
+    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+    _, first, same = np.unique(key, return_index=True, return_inverse=True)
+    return first, same
+
+
+def _clusters(
+    world: NDArray[np.float64],
+    kind: NDArray[np.int64],
+    moved: NDArray[np.bool_],
+    left: NDArray[np.bool_],
+    static: NDArray[np.bool_],
+) -> list[NDArray[np.int64]]:
+    """Group moved points by cells, seen from above, and add the points around them that are not static.
+
+    Args:
+        world: (N, 3) metres.
+        kind: (N,) points of different kinds are not grouped.
+        moved: (N,) points at places that were free most of the time.
+        left: (N,) points at places that were free before or after only. Cells need a good share of them, because a thin surface may
+            be invisible from one side.
+        static: (N,) points at places that were occupied at other times.
+
+    Returns:
+        Indices of the points of each cluster.
+    """
+    either = moved | left
+    flagged = np.flatnonzero(either)
+    if len(flagged) < _MIN_POINTS:
+        return []
+    cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64)
+    low, high = cell[flagged].min(axis=0) - 1, cell[flagged].max(axis=0) + 1
+    inside = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
+    width = high[1] - low[1] + 1
+    cells = int((high[0] - low[0] + 1) * width)
+    layer = np.unique(kind[inside], return_inverse=True)[1]
+    place = layer * cells + (cell[inside, 0] - low[0]) * width + (cell[inside, 1] - low[1])
+    keys, flat = np.unique(place, return_inverse=True)
+    share = np.bincount(flat, either[inside], minlength=len(keys)) / np.bincount(flat, minlength=len(keys))
+    seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
+    component = _join(keys, seeds, int(width))[flat]
+    groups: list[NDArray[np.int64]] = []
+    kept = np.flatnonzero(component >= 0)
+    order = kept[np.argsort(component[kept], kind="stable")]
+    for group in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
+        members = inside[group]
+        core = members[seeds[flat[group]]]
+        count = int(either[members].sum())
+        if count < _MIN_POINTS:
+            continue
+        if count < _FLAGGED_SHARE * len(core):
+            members = members[~static[members]]
+        else:
+            members = np.union1d(core, members[~static[members]])
+        groups.append(np.sort(members))
+    return groups
+
+
+@cached
+def _join(keys: NDArray[np.int64], seeds: NDArray[np.bool_], width: int) -> NDArray[np.int64]:
+    """Return the component of each cell: seeds that touch are one, and other cells belong to a seed they touch; -1 if there is none.
+
+    Args:
+        keys: (C,) row times width plus column of each cell, increasing.
+        seeds: (C,) which cells hold moved points.
+        width: columns per row.
+    """
+    parent = np.arange(len(keys))
+    for i in range(len(keys)):
+        if not seeds[i]:
+            continue
+        for step in (1, width - 1, width, width + 1):
+            j = np.searchsorted(keys, keys[i] + step)
+            if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
+                a, b = i, j
+                while parent[a] != a:
+                    a = parent[a]
+                while parent[b] != b:
+                    b = parent[b]
+                parent[max(a, b)] = min(a, b)
+    component = np.full(len(keys), -1, np.int64)
+    for i in range(len(keys)):
+        if seeds[i]:
+            a = i
+            while parent[a] != a:
+                a = parent[a]
+            component[i] = a
+    for i in range(len(keys)):
+        if not seeds[i]:
+            for step in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+                j = np.searchsorted(keys, keys[i] + step)
+                if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
+                    component[i] = component[j]
+    return component

@@ -1,0 +1,301 @@
+"""Movers: things that moved although no flow, instance or label says so, found in the scans of a drive and followed over time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.motion.evidence import Evidence, Sighting, find_evidence
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
+from carlasc.motion.registration import nearest_points
+from carlasc.motion.segments import Segment
+
+_MAX_GAP_S = 1.0  # a mover may be hidden for this long
+_REACH_M, _MAX_SPEED_M_S = 1.0, 25.0  # maximum gap to the prediction; without one, the farthest that a mover gets
+_FAR_M = 15.0  # fast first test: nothing gets farther between two sightings
+_HISTORY = 6  # sightings that the prediction is made from
+_MIN_SIGHTINGS, _MIN_WAY_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # a mover with less earns no track
+_STRAIGHT = 0.35  # extent of a path over its length; noise goes to and fro
+_MAX_JUMP_M_S = 4.0  # median deviation of the sightings' steps from the path's; more is no one thing
+_PARTS_M = 1.0  # parts of one vehicle are closer to each other
+_PERSON_M = (1.5, 2.3)  # what is narrower and lower than this changes its shape as it moves
+_SAMPLES = 300  # points of a sighting that its path is estimated from
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One thing that moved, over time.
+
+    Attributes:
+        segments: its points in each scan, in order of frames, with its estimated velocity and its number as `instance`.
+        rigid: whether it keeps its shape, as vehicles do.
+    """
+
+    segments: tuple[Segment, ...]
+    rigid: bool
+
+
+@dataclass(frozen=True)
+class Movers:
+    """What moved in a drive.
+
+    Attributes:
+        moved: (M,) int64 indices of the points of each frame that belong to something that moved, tracked or not. They must be left out
+            of other frames.
+        tracked: the movers whose sightings overlay better along an estimated path than standing.
+    """
+
+    moved: Mapping[int, NDArray[np.int64]]
+    tracked: tuple[Mover, ...]
+
+    @property
+    def segments(self) -> list[Segment]:
+        """The segments of all tracked movers, for `link_segments`."""
+        return [segment for mover in self.tracked for segment in mover.segments]
+
+
+def find_movers(
+    scans: Iterable[Sighting],
+    *,
+    movable: Collection[int] = (),
+    deformable: Collection[int] = (),
+    first_instance: int = 1,
+    default_label: int = 0,
+) -> Movers:
+    """Find what moved in the scans of a drive from the free space that other scans saw, and follow it over time.
+
+    Scans are read one by one, and only those of some seconds are held. A block of a drive gives the same evidence as the whole drive, if
+    the scans of `HORIZON_S` before and after it are given too.
+
+    Args:
+        scans: the scans in order of time, in one world frame whose z is up.
+        movable: classes of objects that can move, if the scans have labels.
+        deformable: classes of objects that change their shape as they move. Without labels, the size tells.
+        first_instance: number of the first mover; others follow.
+        default_label: class of movers without labels.
+
+    Returns:
+        The points that moved, and the movers that earned a track.
+    """
+    moved: dict[int, NDArray[np.int64]] = {}
+    evidence = find_evidence(scans, movable=movable)
+    tracked = follow_movers(
+        evidence, moved, deformable=deformable, first_instance=first_instance, default_label=default_label
+    )
+    return Movers(moved, tuple(tracked))
+
+
+def follow_movers(
+    evidence: Iterable[Evidence],
+    moved: dict[int, NDArray[np.int64]],
+    *,
+    deformable: Collection[int] = (),
+    first_instance: int = 1,
+    default_label: int = 0,
+) -> Iterator[Mover]:
+    """Follow what moved from scan to scan, and yield each mover that earned a track when it was seen for the last time.
+
+    Args:
+        evidence: what moved in each scan, in order of time.
+        moved: filled with the indices of the points of each frame that moved, tracked or not.
+        deformable: classes of objects that change their shape as they move. Without labels, the size tells.
+        first_instance: number of the first mover; others follow.
+        default_label: class of movers without labels.
+    """
+    alive: list[_Chain] = []
+    number = first_instance
+    for found in evidence:
+        moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
+        ended = [chain for chain in alive if found.seconds - chain.last.seconds > _MAX_GAP_S]
+        for mover in _earned(ended, deformable, number, default_label):
+            yield mover
+            number += 1
+        alive = [chain for chain in alive if found.seconds - chain.last.seconds <= _MAX_GAP_S]
+        _link(found, alive, deformable)
+    yield from _earned(alive, deformable, number, default_label)
+
+
+def _earned(chains: list[_Chain], deformable: Collection[int], number: int, default_label: int) -> Iterator[Mover]:
+    """Yield the movers of the chains that earn a track, numbered from `number`."""
+    for chain in chains:
+        mover = chain.mover(deformable, number, default_label)
+        if mover is not None:
+            yield mover
+            number += 1
+
+
+@dataclass(frozen=True)
+class _Link:
+    """One sighting of a chain."""
+
+    seconds: float
+    segment: Segment
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, evidence: Evidence, index: int) -> _Link:
+        points = evidence.points[index]
+        segment = Segment(evidence.frame, evidence.labels[index], evidence.clusters[index], points, None)
+        return cls(evidence.seconds, segment, points.min(axis=0), points.max(axis=0))
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        return (self.lower + self.upper) / 2
+
+    @property
+    def is_small(self) -> bool:
+        """Whether it is not larger than a person."""
+        return _is_small(self.upper - self.lower)
+
+    def joined(self, other: _Link) -> _Link:
+        """Return both as one sighting."""
+        segment = replace(
+            self.segment,
+            members=np.concatenate([self.segment.members, other.segment.members]),
+            points=np.concatenate([self.segment.points, other.segment.points]),
+        )
+        lower, upper = np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper)
+        return _Link(self.seconds, segment, lower, upper)
+
+
+class _Chain:
+    """Sightings of one thing in consecutive scans."""
+
+    def __init__(self, first: _Link) -> None:
+        self.links = [first]
+        self.velocity: NDArray[np.float64] | None = (
+            None  # (3,) m/s of the most recent sightings; None if there is one only
+        )
+
+    def append(self, link: _Link) -> None:
+        """Continue the chain."""
+        self.links.append(link)
+        self.velocity = self._velocity()
+
+    @property
+    def last(self) -> _Link:
+        return self.links[-1]
+
+    def _velocity(self) -> NDArray[np.float64]:
+        recent = self.links[-_HISTORY:]
+        seconds = np.array([link.seconds for link in recent])
+        # The faces that are seen change, so lower corner, middle and upper corner are measured, and the least motion counts.
+        offsets = seconds - seconds.mean()
+        corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
+        slopes = np.tensordot(offsets, corners, axes=(0, 0)) / np.square(offsets).sum()
+        least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
+        return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
+
+    def cost(self, link: _Link) -> float | None:
+        """Return how badly a sighting continues the chain; None if it cannot."""
+        last, velocity = self.last, self.velocity
+        if last.segment.label != link.segment.label:
+            return None
+        elapsed = link.seconds - last.seconds
+        shift = np.zeros(3) if velocity is None else velocity * elapsed
+        gap = np.maximum(np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0)
+        offset = link.middle - last.middle - shift
+        reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
+        if np.linalg.norm(gap[:2]) > reach or abs(gap[2]) > _REACH_M or np.linalg.norm(offset[:2]) > 3 * reach + 2.0:
+            return None
+        sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
+        return float(np.linalg.norm(gap) + 0.3 * np.linalg.norm(offset[:2]) + 0.2 * sizes.sum())
+
+    def covers(self, link: _Link) -> bool:
+        """Return whether a sighting is inside the place where the chain's next one is expected."""
+        velocity = self.velocity
+        shift = np.zeros(3) if velocity is None else velocity * (link.seconds - self.last.seconds)
+        lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
+        return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
+
+    def mover(self, deformable: Collection[int], instance: int, default_label: int) -> Mover | None:
+        """Return the thing that moved; None if its sightings do not overlay better along a path than standing."""
+        if len(self.links) < _MIN_SIGHTINGS:
+            return None
+        seconds = np.array([link.seconds for link in self.links])
+        segments = [link.segment for link in self.links]
+        votes = np.bincount([s.label for s in segments], [len(s.members) for s in segments])
+        label = int(votes.argmax()) or default_label
+        sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
+        rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
+        samples = [s.points[:: -(-len(s.points) // _SAMPLES)] for s in segments]
+        positions, velocities = estimate_path(samples, seconds, rigid=rigid)
+        speeds = np.linalg.norm(velocities[:, :2], axis=1)
+        if np.ptp(positions[:, :2], axis=0).max() < _MIN_WAY_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
+            return None
+        length = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum()
+        if np.ptp(positions[:, :2], axis=0).max() < _STRAIGHT * length:
+            return None
+        middles = np.stack([link.middle for link in self.links])
+        steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(seconds)
+        if np.median(steps) > _MAX_JUMP_M_S or is_standing(samples, positions, headings_of(velocities), seconds):
+            return None
+        found = [
+            replace(segment, label=label, velocity=velocity, instance=instance)
+            for segment, velocity in zip(segments, velocities, strict=True)
+        ]
+        return Mover(tuple(found), rigid)
+
+
+def _is_small(size: NDArray[np.float64]) -> bool:
+    return float(np.hypot(size[0], size[1])) < _PERSON_M[0] and float(size[2]) < _PERSON_M[1]
+
+
+def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
+    """Join clusters that are near to each other to one vehicle: rays are far apart on sides that are seen at a grazing angle."""
+    joined = list(links)
+    i = 0
+    while i < len(joined):
+        j = i + 1
+        while j < len(joined):
+            if _are_parts(joined[i], joined[j], deformable):
+                joined[i] = joined[i].joined(joined.pop(j))
+                j = i + 1
+            else:
+                j += 1
+        i += 1
+    return joined
+
+
+def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
+    label = one.segment.label
+    if label != other.segment.label or (np.maximum(one.lower - other.upper, other.lower - one.upper) > _PARTS_M).any():
+        return False
+    if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
+        return False
+    samples = [link.segment.points[:: -(-len(link.segment.points) // _SAMPLES)] for link in (one, other)]
+    return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
+
+
+def _link(evidence: Evidence, alive: list[_Chain], deformable: Collection[int]) -> None:
+    """Continue chains with the clusters of a scan, and start new ones: best first, then parts of what a chain has found already."""
+    links = _join_parts([_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable)
+    costs = []
+    ends = np.array([chain.last.middle for chain in alive]).reshape(-1, 3)
+    for i, link in enumerate(links):
+        for j in np.flatnonzero(np.abs(ends - link.middle).max(axis=1) < _FAR_M).tolist():
+            cost = alive[j].cost(link)
+            if cost is not None:
+                costs.append((cost, i, j))
+    taken: dict[int, int] = {}
+    for _, i, j in sorted(costs):
+        if i not in taken and j not in taken.values():
+            taken[i] = j
+    extra = {
+        i: j
+        for i in range(len(links))
+        if i not in taken
+        for j in set(taken.values())
+        if alive[j].last.segment.label == links[i].segment.label and alive[j].covers(links[i])
+    }
+    for i, j in extra.items():
+        main = next(k for k, chain in taken.items() if chain == j)
+        links[main] = links[main].joined(links[i])
+    fresh = [_Chain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
+    for i, j in taken.items():
+        alive[j].append(links[i])
+    alive.extend(fresh)

@@ -1,0 +1,160 @@
+"""How large an actor is, although no scan saw all of it."""
+
+import numpy as np
+import pytest
+
+from carlasc.motion import Extent, usual_shell
+from carlasc.motion.bodies import Sizes, measure
+
+CAR, BUS, BICYCLE = 10, 11, 12
+EVERY_SIDE = (True, True, True, True)
+REAR, FRONT, LOW, HIGH = (tuple(i == side for i in range(4)) for side in range(4))
+
+
+def extent(size, faces, seen_from=(-20.0, 0.0)):
+    half = np.array(size) / 2
+    return Extent(-half, half, faces, 100, seen_from)
+
+
+def box(count=200, size=(4.0, 1.8, 1.5)):
+    return np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3)) * size
+
+
+@pytest.mark.parametrize(
+    ("sensor", "faces"),
+    [
+        ((-20, 0), REAR),
+        ((20, 0), FRONT),
+        ((0, -20), LOW),
+        ((0, 20), HIGH),
+        ((-20, 20), (True, False, False, True)),
+        ((20, -20), (False, True, True, False)),
+        ((-20, 2), REAR),  # the ray meets the side at less than 15 degrees
+    ],
+)
+def test_a_sensor_sees_the_faces_that_are_turned_to_it(sensor, faces):
+    found = measure([box()], np.array([[*sensor, 1.0]]))
+    assert found.faces == faces
+    assert found.seen_from == pytest.approx(sensor)
+    assert found.points == 200
+    assert np.allclose(found.size, (4.0, 1.8, 1.5), atol=0.15)
+
+
+def test_a_face_counts_from_twelve_points_and_two_percent_of_them():
+    sensors = np.array([[-20.0, 0, 1], [0, 20.0, 1]])
+    for points, seen in ((11, False), (12, True)):
+        assert measure([box(100), box(points)], sensors).faces[3] == seen
+    for points, seen in ((19, False), (21, True)):
+        assert measure([box(1000 - points), box(points)], sensors).faces[3] == seen
+
+
+def test_single_points_far_away_do_not_make_a_body_larger():
+    points = np.concatenate([box(500), [[30.0, 9.0, 4.0], [-30.0, -9.0, -4.0]]])
+    assert np.allclose(measure([points], np.array([[-20.0, 0, 1]])).size, (4.0, 1.8, 1.5), atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("faces", "known"),
+    [
+        (REAR, (False, True)),
+        (FRONT, (False, True)),
+        (LOW, (True, False)),
+        ((True, True, False, False), (True, True)),
+        ((False, False, True, True), (True, True)),
+        ((True, False, True, False), (True, True)),
+        ((False,) * 4, (False, False)),
+    ],
+)
+def test_a_side_shows_the_length_and_an_end_the_width(faces, known):
+    assert extent((4, 2, 1.5), faces).known == known
+
+
+@pytest.mark.parametrize(
+    ("seen", "lower", "upper"),
+    [
+        (extent((1.0, 1.8, 1.5), REAR, (-20.0, 0.0)), (-0.5, -0.9), (3.9, 0.9)),
+        (extent((1.0, 1.8, 1.5), FRONT, (20.0, 0.0)), (-3.9, -0.9), (0.5, 0.9)),
+        (extent((4.4, 0.6, 1.5), LOW, (0.0, -20.0)), (-2.2, -0.3), (2.2, 1.55)),
+        (extent((4.4, 0.6, 1.5), HIGH, (0.0, 20.0)), (-2.2, -1.55), (2.2, 0.3)),
+    ],
+)
+def test_a_body_extends_from_the_face_that_was_seen_away_from_the_sensor(seen, lower, upper):
+    low, high = Sizes([]).complete(CAR, seen)
+    assert np.allclose(low[:2], lower) and np.allclose(high[:2], upper)
+    assert (low[2], high[2]) == (-0.75, 0.75)
+
+
+def test_what_is_known_stays_as_it_was_seen_and_nothing_gets_smaller():
+    for size, faces in (((3.9, 1.7, 1.4), EVERY_SIDE), ((5.5, 1.9, 1.5), REAR), ((4.4, 2.1, 1.5), LOW)):
+        lower, upper = Sizes([]).complete(CAR, extent(size, faces))
+        assert np.allclose(upper - lower, size)
+
+
+def test_an_actor_of_which_no_face_was_seen_well_is_as_large_as_its_points():
+    lower, upper = Sizes([]).complete(CAR, extent((1.0, 0.5, 0.5), (False,) * 4))
+    assert np.allclose(upper - lower, (1.0, 0.5, 0.5))
+
+
+def test_sizes_are_learned_from_three_similar_actors_of_the_same_class():
+    seen = extent((1.0, 1.8, 1.5), REAR)
+    vans = [(CAR, extent((5.2, 1.8 + 0.02 * i, 2.0), EVERY_SIDE)) for i in range(3)]
+    others = [(CAR, extent((5.2, 2.2, 2.0), EVERY_SIDE))] * 3 + [(CAR, extent((5.2, 1.8, 2.0), REAR))] * 3
+    for known, length in ((vans, 5.2), (vans[:2], 4.4), (others, 4.4), ([(BUS, e) for _, e in vans], 4.4)):
+        lower, upper = Sizes(known).complete(CAR, seen)
+        assert upper[0] - lower[0] == pytest.approx(length)
+
+
+def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_side_was_seen():
+    part = extent((1.5, 1.9, 1.5), (True, False, True, False))
+    assert part.known == (True, True) and not part.plausible
+    lower, upper = Sizes([]).complete(CAR, part)
+    assert upper[0] - lower[0] == pytest.approx(4.4)
+    assert lower[0] == pytest.approx(-0.75)
+    examples = [(CAR, part)] * 5  # nor is it an example for others
+    assert np.ptp(Sizes(examples).complete(CAR, extent((1.0, 1.9, 1.5), REAR)), axis=0)[0] == pytest.approx(4.4)
+
+
+@pytest.mark.parametrize(
+    ("seen", "size"),
+    [
+        (extent((0.5, 0.6, 1.7), REAR), (1.8, 0.6, 1.7)),  # a cyclist
+        (extent((1.8, 0.3, 1.7), LOW, (0.0, -20.0)), (1.8, 0.7, 1.7)),
+        (extent((1.0, 2.5, 3.2), REAR), (7.5, 2.5, 3.2)),  # a lorry, by its width
+        (extent((1.0, 2.0, 2.6), REAR), (7.5, 2.0, 2.8)),  # by its height; its top is above what was seen
+        (extent((11.0, 0.4, 2.0), LOW, (0.0, -20.0)), (11.0, 2.5, 2.8)),  # by its length
+    ],
+)
+def test_usual_sizes_are_those_of_two_wheelers_cars_and_lorries(seen, size):
+    lower, upper = Sizes([]).complete(CAR, seen)
+    assert np.allclose(upper - lower, size)
+
+
+class TestUsualShell:
+    def of(self, size, faces=REAR):
+        half = np.array(size) / 2
+        return usual_shell(-half, half, extent(size, faces)), half
+
+    @pytest.mark.parametrize("size", [(4.4, 1.85, 1.5), (10.0, 2.5, 3.2)])
+    def test_it_lies_within_the_box_and_reaches_near_all_sides_but_the_ground(self, size):
+        shell, half = self.of(size)
+        assert shell.dtype == np.float32
+        assert (np.abs(shell) <= half - 0.2).all()
+        assert np.allclose(shell.max(axis=0), half - 0.22, atol=1e-5)
+        assert np.allclose(shell.min(axis=0), -half + (0.22, 0.22, 0.37), atol=1e-5)
+
+    def test_a_cars_cabin_is_narrower_shorter_and_nearer_to_its_rear(self):
+        shell, half = self.of((4.4, 1.85, 1.5))
+        cabin = shell[shell[:, 2] > half[2] - 0.3]
+        body = shell[shell[:, 2] < 0]
+        assert np.abs(cabin[:, 1]).max() < np.abs(body[:, 1]).max()
+        assert cabin[:, 0].min() > body[:, 0].min()
+        assert cabin[:, 0].max() < body[:, 0].max() - 0.5
+
+    def test_a_lorry_is_a_box(self):
+        shell, half = self.of((10.0, 2.5, 3.2))
+        top = shell[shell[:, 2] > half[2] - 0.25]
+        assert np.allclose(np.ptp(top[:, :2], axis=0), (10.0 - 0.44, 2.5 - 0.44), atol=1e-4)
+
+    def test_there_is_none_for_two_wheels_or_what_was_hardly_seen(self):
+        assert self.of((1.8, 0.7, 1.7))[0] is None
+        assert self.of((4.4, 1.85, 1.5), (False,) * 4)[0] is None
