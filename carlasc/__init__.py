@@ -28,11 +28,13 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.captures import simulate as simulate
     from carlasc.converting import convert as convert
     from carlasc.converting import export as export
+    from carlasc.core import Boxes as Boxes
     from carlasc.core import ClassTable as ClassTable
     from carlasc.core import Grid as Grid
     from carlasc.core import GridSpec as GridSpec
     from carlasc.core import Remap as Remap
     from carlasc.core import Scan as Scan
+    from carlasc.core import VoxelFlag as VoxelFlag
     from carlasc.dataset import Dataset as Dataset
     from carlasc.dataset import Flip as Flip
     from carlasc.dataset import collate as collate
@@ -42,6 +44,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.groundtruth import Voting as Voting
     from carlasc.groundtruth import regrid as regrid
     from carlasc.inspection import info as info
+    from carlasc.inspection import report as report
     from carlasc.inspection import stats as stats
     from carlasc.inspection import validate as validate
     from carlasc.metrics import evaluate as evaluate
@@ -83,11 +86,13 @@ _ROOMS = (
 )
 _HOMES = {  # room -> its names that are also names of `carlasc`
     "core": (
+        "Boxes",
         "ClassTable",
         "Grid",
         "GridSpec",
         "Remap",
         "Scan",
+        "VoxelFlag",
     ),
     "storage": (
         "Sink",
@@ -116,6 +121,7 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
     "metrics": ("evaluate", "scores"),
     "inspection": (
         "info",
+        "report",
         "stats",
         "validate",
     ),

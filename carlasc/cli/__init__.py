@@ -22,6 +22,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "info",
     "stats",
     "validate",
+    "report",
     "evaluate",
     "scores",
     "render",

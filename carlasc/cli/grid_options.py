@@ -36,7 +36,7 @@ class Rule(StrEnum):
 
     sensor = "sensor"
     sample = "sample"
-    point = "point"
+    ray = "ray"
 
 
 class Dynamic(StrEnum):
@@ -46,6 +46,25 @@ class Dynamic(StrEnum):
     current = "current"
     drop = "drop"
     tube = "tube"
+
+
+class Motion(StrEnum):
+    """What tells which points move."""
+
+    auto = "auto"
+    boxes = "boxes"
+    instances = "instances"
+    flow = "flow"
+    evidence = "evidence"
+    none = "none"
+
+
+class Complete(StrEnum):
+    """What happens to the parts of an actor that no scan saw."""
+
+    seen = "seen"
+    mirror = "mirror"
+    body = "body"
 
 
 _GRID = "Grid: one of --res, --size and --preset"
@@ -83,7 +102,7 @@ RuleOption = Annotated[
     typer.Option(
         "--voting",
         help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures);"
-        " sample: every sample counts, as in the paper; point: every point counts, free space once per scan (default for scans).",
+        " sample: every sample counts, as in the paper; ray: a voxel is occupied where enough of the rays that enter it end in it (default for scans).",
         rich_help_panel=_GRID,
     ),
 ]
@@ -114,16 +133,42 @@ DynamicOption = Annotated[
         rich_help_panel=SCANS,
     ),
 ]
+MotionOption = Annotated[
+    Motion | None,
+    typer.Option(
+        "--motion",
+        help="What tells which points move. boxes, instances, flow: the field of that name; evidence: free space that other scans saw"
+        " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses (default).",
+        rich_help_panel=SCANS,
+    ),
+]
+CompleteOption = Annotated[
+    Complete | None,
+    typer.Option(
+        "--complete",
+        help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown; mirror: a side is taken from the"
+        " other side (default); body: and what is still missing from the usual shape of vehicles.",
+        rich_help_panel=SCANS,
+    ),
+]
+NoOwnPathOption = Annotated[
+    bool,
+    typer.Option(
+        "--no-own-path",
+        help="What the recording vehicle itself drove through is not taken for free space.",
+        rich_help_panel=SCANS,
+    ),
+]
 
 
-def scans_of(*, window: str | None, dynamic: Dynamic | None, **others: Any) -> FromScans | None:
+def scans_of(*, window: str | None, **others: Any) -> FromScans | None:
     """Return how scans are merged, with the defaults of `FromScans` for what is None; None if everything is."""
     from carlasc.groundtruth import FromScans
 
-    given = others | {
-        "window": None if window is None else _parse_window(window),
-        "dynamic": None if dynamic is None else dynamic.value,
+    given: dict[str, Any] = {
+        name: value.value if isinstance(value, StrEnum) else value for name, value in others.items()
     }
+    given["window"] = None if window is None else _parse_window(window)
     given = {name: value for name, value in given.items() if value is not None}
     return FromScans(**given) if given else None
 

@@ -20,8 +20,11 @@ from carlasc.cli.common import (
 from carlasc.cli.grid_options import (
     SCANS,
     BoundsOption,
+    CompleteOption,
     CoordinatesOption,
     DynamicOption,
+    MotionOption,
+    NoOwnPathOption,
     PresetOption,
     ResOption,
     RuleOption,
@@ -78,6 +81,21 @@ def regrid(
     frames: FramesOption = None,
     workers: Workers = None,
     keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False,
+    keep_evidence: Annotated[
+        bool,
+        typer.Option(
+            "--keep-evidence",
+            help="Also write how certain each voxel is: probabilities, flags and number of scans.",
+            rich_help_panel=SCANS,
+        ),
+    ] = False,
+    min_confidence: Annotated[
+        float,
+        typer.Option(
+            help="Voxels that are neither free nor occupied with at least this probability become unknown.",
+            rich_help_panel=SCANS,
+        ),
+    ] = 0.0,
     name: Annotated[str | None, typer.Option(help="Name of the grid's folder; default: a name by its size.")] = None,
     overwrite: Overwrite = False,
     observe: Annotated[
@@ -94,6 +112,9 @@ def regrid(
     window_m: WindowMOption = None,
     stride: StrideOption = None,
     dynamic: DynamicOption = None,
+    motion: MotionOption = None,
+    complete: CompleteOption = None,
+    no_own_path: NoOwnPathOption = False,
     min_range_m: Annotated[
         float | None, typer.Option(help="Leave out nearer points, in metres.", rich_help_panel=SCANS)
     ] = None,
@@ -118,12 +139,15 @@ def regrid(
     from carlasc.groundtruth import regrid as regrid_sequences
 
     spec = parse_grid(res, size, preset, coordinates, bounds)
-    voting = Voting(None if rule is None else rule.value, free_step_m, keep)
+    voting = Voting(None if rule is None else rule.value, free_step_m, keep, keep_evidence, min_confidence)
     scans = scans_of(
         window=window,
         window_m=window_m,
         stride=stride,
         dynamic=dynamic,
+        motion=motion,
+        complete=complete,
+        own_path=False if no_own_path else None,
         min_range_m=min_range_m,
         max_range_m=max_range_m,
         poses=None if poses is None else poses.value,

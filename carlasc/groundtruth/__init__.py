@@ -1,18 +1,32 @@
 """Ground truth: observations are turned into votes and votes into grids, and a run does so for a whole data set."""
 
 from carlasc.groundtruth.from_grid import resample
-from carlasc.groundtruth.options import Dynamic, FromCapture, FromGrid, FromScans, Observe, PoseSource, Voting
+from carlasc.groundtruth.options import (
+    Complete,
+    Dynamic,
+    FromCapture,
+    FromGrid,
+    FromScans,
+    Motion,
+    Observe,
+    PoseSource,
+    Voting,
+)
 from carlasc.groundtruth.run import FrameFailure, RegridResult, regrid
 from carlasc.groundtruth.voting.ballot import Ballot, VoteRule, Votes, count_votes
+from carlasc.groundtruth.voting.evidence import Evidence
 from carlasc.groundtruth.voting.observations import Observation
 
 __all__ = [
     "Ballot",
+    "Complete",
     "Dynamic",
+    "Evidence",
     "FrameFailure",
     "FromCapture",
     "FromGrid",
     "FromScans",
+    "Motion",
     "Observation",
     "Observe",
     "PoseSource",

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Series
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, get_args
@@ -20,10 +22,12 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.options import FromScans, Observe, Voting
+from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
+from carlasc.groundtruth.voting.evidence import Evidence
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence
+from carlasc.storage.protocol import Sequence, SequenceWriter
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Plan:
         frames: frame numbers of the source.
 
     Raises:
-        ArgumentError: `observe` is of another type.
+        ArgumentError: `observe` is of another type, or cannot say how certain voxels are although `voting` asks for it.
     """
 
     spec: GridSpec
@@ -52,16 +56,31 @@ class Plan:
         if not isinstance(self.observe, kinds):
             names = ", ".join(kind.__name__ for kind in kinds)
             raise ArgumentError("observe", expected=f"one of {names}", found=repr(self.observe))
+        if self.needs_evidence and not (isinstance(self.observe, FromScans) and self.rule == "ray"):
+            name = "keep_evidence" if self.voting.keep_evidence else "min_confidence"
+            kind = type(self.observe).__name__.removeprefix("From").lower()
+            raise ArgumentError(
+                name,
+                expected='grids from scans with the rule "ray", which say how certain each voxel is',
+                found=f"observe={kind}, rule={self.rule}",
+                advice=f"make the grid from scans, or leave out `{name}`",
+            )
 
     @property
     def rule(self) -> VoteRule:
         """The rule by which votes are counted: the one of `voting`, or the default of `observe`."""
-        return self.voting.rule or ("point" if isinstance(self.observe, FromScans) else "sensor")
+        return self.voting.rule or ("ray" if isinstance(self.observe, FromScans) else "sensor")
+
+    @property
+    def needs_evidence(self) -> bool:
+        """Whether frames must say how certain each voxel is: `FrameData.evidence`."""
+        return self.voting.keep_evidence or self.voting.min_confidence > 0
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the grid's fields."""
-        parts = ("labels", "counts", "votes") if self.voting.keep else ("labels", "counts")
-        return tuple(f"{self.grid}/{part}" for part in parts)
+        votes = ("votes",) if self.voting.keep else ()
+        evidence = layout.EVIDENCE_FIELDS if self.voting.keep_evidence else ()
+        return tuple(f"{self.grid}/{part}" for part in ("labels", "counts", *votes, *evidence))
 
 
 @dataclass(frozen=True)
@@ -72,11 +91,27 @@ class FrameData:
         fields: the scan fields that are written beside the grid, by name.
         grid: the grid.
         votes: the votes that decided the grid; None for a resampled grid.
+        evidence: how certain each voxel is; None unless the plan needs it (`Plan.needs_evidence`).
     """
 
     fields: Mapping[str, NDArray[Any]]
     grid: Grid
     votes: Votes | None
+    evidence: Evidence | None = None
+
+
+class Steps:
+    """Counts the steps of a run: scans of the passes before, and frames."""
+
+    def __init__(self, progress: Callable[[int, int], None] | None, done: int, total: int) -> None:
+        self.progress, self.done, self.total = progress, done, total
+        self(0)
+
+    def __call__(self, steps: int) -> None:
+        """Count some more steps."""
+        self.done += steps
+        if self.progress is not None:
+            self.progress(self.done, self.total)
 
 
 class FrameInput(ABC):
@@ -102,6 +137,14 @@ class FrameInput(ABC):
             MissingDataError: a file does not exist.
             FormatError: the content of a file is not valid.
         """
+
+    def thinned(self, plan: Plan) -> Grid | None:
+        """Return the grid without a tenth of the scans of other frames; None if it is not made from scans of other frames."""
+        return None
+
+    def residuals(self) -> Mapping[int, Residual]:
+        """Return how well the sightings of the moving actors in the frame overlay with the next ones, by number of the actor."""
+        return {}
 
 
 class SequenceInput(ABC):
@@ -142,6 +185,36 @@ class SequenceInput(ABC):
     @abstractmethod
     def record(self) -> dict[str, Any]:
         """Return what params.json says about the source. A run with another record does not continue the grid."""
+
+    def prepare(  # noqa: B027 (most sequences need nothing)
+        self,
+        writer: SequenceWriter,
+        *,
+        workers: int,
+        executor: Executor | None,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        """Do what is done once per sequence before its frames are made.
+
+        Args:
+            writer: where the sequence is written, and what is kept beside the grids.
+            workers: number of items that are worked on in parallel.
+            executor: runs the work instead of processes of our own.
+            progress: called with the number of steps since the last call, `steps_before` in all.
+        """
+
+    @property
+    def steps_before(self) -> int:
+        """Number of steps of `prepare`, for progress."""
+        return 0
+
+    def frame(self, number: int) -> FrameInput | None:
+        """Return a frame of the output that an earlier run made, also one that is not chosen now; None if it is not known."""
+        return next((frame for frame in self.frames if frame.number == number), None)
+
+    def summaries(self) -> Series[Mapping[str, Any]] | None:
+        """Return what `prepare` found of each actor, by number; None if no actor is tracked."""
+        return None
 
     def notes(self) -> list[str]:
         """Return remarks for the user of the grids, one line each."""

@@ -10,6 +10,8 @@ from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 
 Dynamic = Literal["align", "current", "drop", "tube"]
+Complete = Literal["seen", "mirror", "body"]
+Motion = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
 PoseSource = Literal["file", "kiss-icp"]
 
 
@@ -30,6 +32,12 @@ class FromScans:
         dynamic: what happens to moving points. "align": each moving actor is completed from all scans, at its position in the
             frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
             were seen, as in SemanticKITTI, and moving actors leave traces.
+        motion: what tells which points move, and how. "boxes", "instances", "flow": the field of the sequence; "evidence": free space:
+            a point moves if other scans saw through its place; "none": nothing is known to move, unless its class says so. "auto" (and
+            None): the best of these fields that exists, and "evidence" for what it misses, unless every point has flow.
+        own_path: count what the recording vehicle drove through as free space.
+        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": a vehicle's side that was
+            not seen is taken from its other side.
         poses: "file": from poses.txt; "kiss-icp": estimated from the scans (needs the extra `kitti`). Estimated poses are
             written only if the sequence has no poses.txt.
         min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
@@ -45,6 +53,9 @@ class FromScans:
     window_m: float | None = None
     stride: int = 1
     dynamic: Dynamic = "align"
+    motion: Motion | None = None
+    own_path: bool = True
+    complete: Complete = "mirror"
     poses: PoseSource = "file"
     min_range_m: float | None = None
     max_range_m: float | None = None
@@ -59,10 +70,19 @@ class FromScans:
             raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
         if self.window_m is not None and not self.window_m > 0:
             raise ArgumentError("window_m", expected="a positive number of metres", found=str(self.window_m))
-        for name, kind in (("dynamic", Dynamic), ("poses", PoseSource)):
+        for name, kind, default in (
+            ("dynamic", Dynamic, "align"),
+            ("motion", Motion, None),
+            ("complete", Complete, "mirror"),
+            ("poses", PoseSource, "file"),
+        ):
             value = getattr(self, name)
-            if value not in get_args(kind):
+            if value not in (*get_args(kind), default):
                 raise ArgumentError(name, expected=f"one of {', '.join(get_args(kind))}", found=repr(value))
+        if self.dynamic == "tube" and self.motion is not None:
+            raise ArgumentError(
+                "motion", expected='none with dynamic "tube", which ignores what moves', found=repr(self.motion)
+            )
         low, high = self.min_range_m or 0.0, math.inf if self.max_range_m is None else self.max_range_m
         if not 0 <= low < high:
             raise ArgumentError(
@@ -95,17 +115,27 @@ class Voting:
 
     Attributes:
         rule: "sensor": at most one vote per sensor (scan), voxel and class, as in the published files; "sample": every sample
-            counts; "point": every point counts, free space once per scan. None: "point" for scans, otherwise "sensor".
+            counts; "ray": a voxel is occupied where enough of the rays that enter it end in it. None: "ray" for scans, otherwise "sensor".
         free_step_m: distance between two free samples on a ray, in metres.
         keep: also write the votes of every class.
+        keep_evidence: also write how certain each voxel is: the fields `occupied`, `classes`, `flags` and `views` of the grid. For scans
+            with the rule "ray" only.
+        min_confidence: voxels that are neither free nor occupied with at least this probability become unknown; 0 to 0.5 keeps all.
+            For scans with the rule "ray" only.
 
     Raises:
-        ArgumentError: an unknown rule, or a distance that is not positive.
+        ArgumentError: an unknown rule, a distance that is not positive, or a confidence outside of 0 <= c < 1.
     """
 
     rule: VoteRule | None = None
     free_step_m: float = 1.5
     keep: bool = False
+    keep_evidence: bool = False
+    min_confidence: float = 0.0
 
     def __post_init__(self) -> None:
         check_rule(self.rule or "sensor", self.free_step_m)
+        if not 0 <= self.min_confidence < 1:
+            raise ArgumentError(
+                "min_confidence", expected="a probability from 0 to below 1", found=str(self.min_confidence)
+            )

@@ -7,24 +7,25 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import RAW, find_captures
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, StorageError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
-from carlasc.groundtruth.inputs import FrameInput, Plan, SequenceInput
+from carlasc.groundtruth.inputs import Plan, SequenceInput, Steps
 from carlasc.groundtruth.options import FromCapture, FromGrid, FromScans, Observe, Voting
-from carlasc.running.processes import count_workers, run_all
+from carlasc.groundtruth.reporting.facts import sample_frames
+from carlasc.groundtruth.reporting.report import Report
+from carlasc.groundtruth.tasks import Done, MakeFrame, MeasureFrame, Task, run_task, write_frame
+from carlasc.running.processes import count_workers, one_pool, run_all
 from carlasc.storage import as_source, layout
-from carlasc.storage.files import to_json
+from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.folders.folder import FolderSink
 from carlasc.storage.protocol import SequenceWriter, Sink, Source
 from carlasc.storage.resuming import (
@@ -35,13 +36,10 @@ from carlasc.storage.resuming import (
     agree_times,
     check_grid,
     check_name,
-    check_scan,
 )
 
-RULE = 1
-"""Version of the rule by which grids are made. It changes only when the same input gives other grids."""
-
-Outputs = dict[str, NDArray[Any]]
+RULES = {"capture": 1, "scans": 2, "grid": 1}
+"""Version of the rule by which grids are made, by what observes the scene. It changes only when the same input gives other grids."""
 
 
 @dataclass(frozen=True)
@@ -89,26 +87,8 @@ class _Job:
     inputs: SequenceInput
     writer: SequenceWriter
     documents: dict[str, bytes]
+    params: dict[str, Any]
     replaces: bool
-
-
-@dataclass(frozen=True)
-class _Task:
-    """One frame of one job. It holds paths and settings, and pickles into a worker."""
-
-    job: int
-    frame: FrameInput
-    plan: Plan
-    writer: SequenceWriter
-
-
-@dataclass(frozen=True)
-class _Done:
-    """The result of a task: its outputs if the writer cannot write in workers, its error if it failed."""
-
-    task: _Task
-    outputs: Outputs = field(default_factory=dict)
-    error: str | None = None
 
 
 def regrid(
@@ -125,7 +105,7 @@ def regrid(
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RegridResult:
-    """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and times.
+    """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and times, and a report of each grid.
 
     Frames that exist already are skipped. If they were made with other settings, the run stops before it writes anything. A frame that
     cannot be read is reported in the result, and the other frames are made. The work is done in processes that import the main
@@ -162,26 +142,34 @@ def regrid(
     plan = Plan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
     jobs = [_prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)]
 
-    with ExitStack() as writers:
+    with ExitStack() as open_things:
+        pool = open_things.enter_context(one_pool(workers, executor))
         for job in jobs:
             _begin(job, grid)
-            writers.enter_context(job.writer)
-        tasks = _unfinished(jobs, plan)
+            open_things.enter_context(job.writer)
+        tasks = [_tasks(number, job, plan) for number, job in enumerate(jobs)]
         total = sum(len(job.inputs.frames) for job in jobs)
-        skipped, failures = total - len(tasks), []
-        if progress:
-            progress(skipped, total)
-        with closing(run_all(_run_task, tasks, workers=workers, executor=executor)) as results:
-            for number, done in enumerate(results, skipped + 1):
-                job = jobs[done.task.job]
-                if done.error is not None:
-                    failures.append(FrameFailure(job.inputs.location, done.task.frame.source_frame, done.error))
-                _write(job.writer, done.task.frame.number, done.outputs)
-                if progress:
-                    progress(number, total)
+        unfinished = sum(len(missing) for missing, _ in tasks)
+        skipped, failures = total - unfinished, list[FrameFailure]()
+        passes = sum(job.inputs.steps_before for job, parts in zip(jobs, tasks, strict=True) if any(parts))
+        steps = Steps(progress, skipped, total + passes)
+        for job, (missing, existing) in zip(jobs, tasks, strict=True):
+            if missing or existing:
+                job.inputs.prepare(job.writer, workers=workers, executor=pool, progress=steps)
+            parts: list[Done] = []
+            with closing(run_all(run_task, [*missing, *existing], workers=workers, executor=pool)) as results:
+                for done in results:
+                    if isinstance(done.task, MakeFrame):
+                        if done.error is not None:
+                            frame = done.task.frame.source_frame
+                            failures.append(FrameFailure(job.inputs.location, frame, done.error))
+                        write_frame(job.writer, done.task.frame.number, done.outputs)
+                        steps(1)
+                    parts.append(replace(done, outputs={}))
+            _write_report(job, plan, parts)
 
     grids = tuple(f"{job.writer.location}/{grid}" for job in jobs)
-    made = len(tasks) - len(failures)
+    made = unfinished - len(failures)
     notes = tuple(note for job in jobs for note in job.inputs.notes())
     return RegridResult(grids, spec, made, skipped, tuple(failures), time.perf_counter() - start, notes)
 
@@ -246,8 +234,11 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) 
     """Compare what exists with what this run makes, and stop before anything is written if they do not agree."""
     writer = sink.sequence("/".join(part for part in (inputs.path, plan.spec.coordinates) if part))
     how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
-    record = {"format": RECORD_FORMAT, "rule": RULE, **inputs.record(), **how}
-    params = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
+    how |= {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
+    made_from = inputs.record()
+    record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
+    settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
+    params = parse_json(to_json(settings), plan.grid)  # as it is read again
     numbers = [frame.number for frame in inputs.frames]
     exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
     documents = {
@@ -257,7 +248,7 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) 
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    return _Job(inputs, writer, needed, replaces=exists and overwrite)
+    return _Job(inputs, writer, needed, params, replaces=exists and overwrite)
 
 
 def _begin(job: _Job, grid: str) -> None:
@@ -268,49 +259,50 @@ def _begin(job: _Job, grid: str) -> None:
         job.writer.write_document(document, data)
 
 
-def _unfinished(jobs: list[_Job], plan: Plan) -> list[_Task]:
-    """Return a task for each frame that lacks a file."""
-    return [
-        _Task(index, frame, plan, job.writer)
-        for index, job in enumerate(jobs)
-        for frame in job.inputs.frames
-        if not all(job.writer.has(name, frame.number) for name in (*frame.fields(), *plan.fields()))
+def _tasks(number: int, job: _Job, plan: Plan) -> tuple[list[Task], list[Task]]:
+    """Return the tasks of a sequence: to make each frame that lacks a file, and to measure for the report what exists.
+
+    Nothing is measured if nothing is made and the report is complete.
+    """
+    inputs, writer, classes = job.inputs, job.writer, job.inputs.metadata.classes
+    report = _report_of(job, plan.grid)
+    reported = set() if report is None else set(report.frames)
+    needed = {frame.number: (*frame.fields(), *plan.fields()) for frame in inputs.frames}
+    missing = {n for n, fields in needed.items() if not all(writer.has(name, n) for name in fields)}
+    existing = (needed.keys() | reported) - missing
+    if not missing and existing == reported:
+        return [], []
+    sampled = sample_frames(sorted(existing | missing))
+    made: list[Task] = [
+        MakeFrame(number, frame, plan, writer, classes, frame.number in sampled)
+        for frame in inputs.frames
+        if frame.number in missing
     ]
+    measured: list[Task] = [
+        MeasureFrame(number, other, inputs.frame(other), plan, writer, classes, other in sampled)
+        for other in sorted(existing)
+    ]
+    return made, measured
 
 
-def _run_task(task: _Task) -> _Done:
-    """Make one frame, in a worker, and write it there if its writer can."""
+def _report_of(job: _Job, grid: str) -> Report | None:
+    """Return the report that an earlier run with the same settings left; None if there is none."""
+    data = job.writer.read_document(layout.report_file(grid))
     try:
-        outputs = _make(task.frame, task.plan)
-        if not task.writer.concurrent:
-            return _Done(task, outputs)
-        _write(task.writer, task.frame.number, outputs)
-    except (ConflictError, StorageError):
-        raise  # every other frame would raise the same
-    except MemoryError as error:
-        raise CarlascError(
-            str(task.plan.spec), problem="out of memory", advice="use a coarser grid, or fewer processes (`workers`)"
-        ) from error
-    except (CarlascError, OSError) as error:
-        return _Done(task, error=str(error))
-    return _Done(task)
+        report = None if data is None else Report.from_json(data, layout.report_file(grid))
+    except FormatError:
+        return None
+    return report if report is not None and report.settings == job.params else None
 
 
-def _make(frame: FrameInput, plan: Plan) -> Outputs:
-    """Make everything that is written for a frame, the grid last."""
-    data = frame.make(plan)
-    outputs: Outputs = {**data.fields, f"{plan.grid}/labels": data.grid.labels}
-    if data.grid.counts is not None:
-        outputs[f"{plan.grid}/counts"] = data.grid.counts
-    if plan.voting.keep and data.votes is not None:
-        outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
-    return outputs
-
-
-def _write(writer: SequenceWriter, frame: int, outputs: Outputs) -> None:
-    """Write a frame's files. Scan fields that exist already must be equal to this run's."""
-    for name, array in outputs.items():
-        if name in layout.SCAN_FIELDS and writer.has(name, frame):
-            check_scan(writer, name, frame, array)
-        else:
-            writer.write(name, frame, array)
+def _write_report(job: _Job, plan: Plan, results: list[Done]) -> None:
+    """Write the report of a sequence's grid, if anything was made or measured."""
+    facts = [done.facts for done in results if done.facts is not None]
+    names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(plan.grid))
+    found = {name: job.writer.read_document(name) for name in names}
+    documents = {name: data for name, data in found.items() if data is not None}
+    if facts:
+        report = Report.make(
+            plan.grid, facts, job.params, job.inputs.metadata.classes, documents, actors=job.inputs.summaries()
+        )
+        job.writer.write_document(layout.report_file(plan.grid), report.to_json())

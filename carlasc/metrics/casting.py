@@ -75,6 +75,78 @@ def cast_rays(
     return found, depth
 
 
+def follow_rays(
+    solid: NDArray[np.uint8], spec: GridSpec, origin: NDArray[np.floating], points: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Follow measured rays through a grid: where each first meets something, and what it passes before the measured point.
+
+    Args:
+        solid: (X, Y, Z) bits that say what a voxel holds; 0 lets the ray pass.
+        spec: geometry of the grid, Cartesian.
+        origin: (3,) metres, where the rays start, in the frame of the grid.
+        points: (N, 3) metres, measured points, all inside the grid.
+
+    Returns:
+        (N,) float64 distance in metres from the origin to the middle of the ray's path through its first solid voxel, which may be
+        behind the point; infinite if the ray leaves the grid without one. And (N,) uint8 bits of all voxels that the ray passes before the
+        point, without the voxel of the point and its 26 neighbours.
+
+    Raises:
+        ArgumentError: the grid is cylindrical.
+    """
+    if spec.coordinates != "cartesian":
+        raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
+    ends, lower, voxel = np.asarray(points, np.float64), np.array(spec.lower), spec.voxel_size
+    first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
+    start, size = (np.asarray(origin, np.float64) - lower) / voxel, np.array(spec.size)
+    lengths = np.linalg.norm(ends - origin, axis=1)
+    _follow(np.ascontiguousarray(solid), size, start, (ends - lower) / voxel, lengths, first, passed)
+    return first, passed
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[no-untyped-def]
+    """Walk every ray from voxel to voxel, in units of voxels; the parameter t is 0 at the origin and 1 at the point."""
+    step, cell, last = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
+    crossing, between = np.empty(3), np.empty(3)
+    for r in range(len(ends)):
+        inside = True
+        for axis in range(3):
+            step[axis] = ends[r, axis] - start[axis]
+            inside = inside and 0 <= start[axis] < size[axis]
+        t = 0.0 if inside else _entry(start, step, size)
+        if t < 0 or lengths[r] == 0:
+            continue
+        for axis in range(3):
+            place = start[axis] + t * step[axis]
+            cell[axis] = min(max(int(np.floor(place)), 0), size[axis] - 1)
+            last[axis] = min(max(int(np.floor(ends[r, axis])), 0), size[axis] - 1)
+            forward = step[axis] > 0
+            crossing[axis] = (cell[axis] + forward - start[axis]) / step[axis] if step[axis] != 0 else np.inf
+            between[axis] = np.abs(1 / step[axis]) if step[axis] != 0 else np.inf
+        while True:
+            axis = 0
+            if crossing[1] < crossing[axis]:
+                axis = 1
+            if crossing[2] < crossing[axis]:
+                axis = 2
+            leave = crossing[axis]
+            value = solid[cell[0], cell[1], cell[2]]
+            if value:
+                if first[r] == np.inf:
+                    first[r] = (t + leave) / 2 * lengths[r]
+                away = max(abs(cell[0] - last[0]), abs(cell[1] - last[1]), abs(cell[2] - last[2]))
+                if leave < 1 and away > 1:
+                    passed[r] |= value
+            t = leave
+            if t >= 1 and first[r] < np.inf:
+                break
+            cell[axis] += 1 if step[axis] > 0 else -1
+            crossing[axis] += between[axis]
+            if not 0 <= cell[axis] < size[axis]:
+                break
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-def]
     """Walk every ray from voxel to voxel (Amanatides and Woo), in units of voxels; the distance along the ray is in metres."""

@@ -46,7 +46,11 @@ def run_all(
         CarlascError: a worker process died.
     """
     workers = count_workers(workers)
-    if executor is not None:
+    if isinstance(executor, _Processes):
+        yield from (
+            _submit_all(executor, _Task(function), items, 2 * workers) if len(items) > 1 else map(function, items)
+        )
+    elif executor is not None:
         yield from _submit_all(executor, function, items, 2 * workers)
     elif min(workers, len(items)) <= 1:
         yield from map(function, items)
@@ -89,6 +93,23 @@ def _submit_all(
     finally:
         for future in pending:
             future.cancel()
+
+
+@contextmanager
+def one_pool(workers: int, executor: Executor | None) -> Iterator[Executor | None]:
+    """Yield an executor for several calls of `run_all`, so that its processes start only once.
+
+    It is `executor` if that is given, and None, which `run_all` takes for work in this process, with one worker.
+
+    Args:
+        workers: number of processes.
+        executor: does the work instead; it is left open.
+    """
+    if executor is not None or workers <= 1:
+        yield executor
+    else:
+        with _own_processes(workers) as pool:
+            yield pool
 
 
 @contextmanager

@@ -54,6 +54,7 @@ def test_every_option_reaches_the_run(capture):
     assert (record["free_step_m"], record["voting"], record["frames"]) == (0.5, "sample", "101:")
     assert sorted(name.split("/")[-1] for name in read_tree(capture / "out/cartesian/mine")) == [
         *("000000.bin", "000000.label", "000000.votes.npz", "000001.bin", "000001.label", "000001.votes.npz"),
+        "carlasc-report.json",
         "params.json",
     ]
 

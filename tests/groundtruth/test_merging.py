@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
-from carlasc.groundtruth import FromScans, Voting
+from carlasc.groundtruth import FromScans
+from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import STATIC, Merger, PreparedScan
-from carlasc.groundtruth.from_scans.sequences import free_weight
-from carlasc.groundtruth.inputs import Plan
-from carlasc.motion import Segment, Track
+from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
+from carlasc.groundtruth.from_scans.regions import STATIC
+from carlasc.groundtruth.voting.observations import NOWHERE
+from carlasc.motion import Extent, Track
 from carlasc.storage import FolderSink, FolderSource, layout
 
 ROAD, VEHICLE, PEDESTRIAN = CARLA.id_of("Road"), CARLA.id_of("Vehicle"), CARLA.id_of("Pedestrian")
@@ -31,33 +31,44 @@ def sensor_pose(frame):
     return translation((0.0, 0.0, 0.01 * frame))
 
 
+def instant(frame):
+    return Instant(frame, 0.1 * frame, sensor_pose(frame))
+
+
 def scan(frame, label=VEHICLE):
     """A scan of three points: one of the road, one of the actor, and one of a wall behind the actor."""
     actor = actor_pose(frame)[:3, 3]
     world = np.array([[3.0, 8.0, -1.5], actor, 2 * actor])
     points = transform_points(invert(sensor_pose(frame)), world).astype(np.float32)
-    return PreparedScan.of(frame, points, np.array([ROAD, label, 1], np.uint16), sensor_pose(frame))
+    labels = np.array([ROAD, label, 1], np.uint16)
+    return PreparedScan.of(frame, points, labels, sensor_pose(frame), seconds=0.1 * frame, moving=np.array([1]))
 
 
-def track(label=VEHICLE, half=(1.0, 0.5, 1.0), frames=FRAMES):
+def track(label=VEHICLE, half=(1.0, 0.5, 1.0), frames=FRAMES, faces=(True, True, True, True)):
     poses = np.stack([actor_pose(frame) for frame in frames])
-    segments = {
-        frame: Segment(frame, label, np.array([1]), actor_pose(frame)[None, :3, 3], np.array([0, 2.0, 0]))
-        for frame in frames
-    }
+    members = {frame: np.array([1], np.int32) for frame in frames}
     velocity = np.tile([0, 2.0, 0], (len(poses), 1))
-    return Track(label, 0, segments, frames[0], poses, velocity, -np.array(half), np.array(half))
+    lower, upper = -np.array(half), np.array(half)
+    extent = Extent(lower, upper, faces, 100)
+    return Track(
+        label, 0, members, frames[0], poses, velocity, lower, upper, extent, rigid=label not in CARLA.deformable
+    )
 
 
 def merger(label=VEHICLE, dynamic="align", tracks=None):
     scans = {frame: scan(frame, label) for frame in FRAMES}
-    moving = {frame: np.array([1]) for frame in FRAMES}
-    return Merger(scans, [track(label)] if tracks is None else tracks, moving, CARLA, dynamic)
+    tracks = [track(label)] if tracks is None else tracks
+    return Merger(scans, Actors.of(tracks), CARLA, dynamic)
+
+
+def regions_of(merging, frame=15):
+    return merging.regions(instant(frame), FRAMES, SPEC)
 
 
 def observe(merging, frame=15, window=FRAMES):
     """Return the observations of the static scene and of the actor."""
-    seen = list(merging.observations(frame, window, merging.regions(frame, SPEC)))
+    now = instant(frame)
+    seen = list(merging.observations(now, window, merging.regions(now, window, SPEC)))
     return seen[: len(window)], seen[len(window) :]
 
 
@@ -103,35 +114,94 @@ def test_which_moving_points_vote(dynamic, own, others):
 
 
 def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
-    merging = Merger({frame: scan(frame) for frame in FRAMES}, [track()], {}, CARLA, "align")
-    assert merging.static(3).tolist() == [True, False, True]
+    unmarked = {frame: replace(scan(frame), moving=np.empty(0, np.int64)) for frame in FRAMES}
+    assert Merger(unmarked, Actors(), CARLA, "align").static(3).tolist() == [True, True, True]
+    assert Merger(unmarked, Actors.of([track()]), CARLA, "align").static(3).tolist() == [True, False, True]
+    untracked = Actors(moving={3: np.array([2])})
+    assert Merger(unmarked, untracked, CARLA, "align").static(3).tolist() == [True, True, False]
 
 
 def test_a_track_that_never_moves_is_part_of_the_static_scene():
     still = track()
     still.velocity[:] = 0
-    assert merger(tracks=[still]).tracks == []
-    assert not merger(tracks=[still]).regions(15, SPEC).any()
+    merging = merger(tracks=[still])
+    assert not merging.actors.tracks
+    assert not regions_of(merging).actors
 
 
-def test_a_region_has_the_voxels_that_the_box_touches_at_the_frame():
+def test_a_region_has_the_voxels_that_the_body_touches_at_the_frame():
     centers = SPEC.centers().reshape(-1, 3)
     merging = merger()
     for frame in (0, 15, 30):
         offset = np.abs(centers - transform_points(invert(sensor_pose(frame)), actor_pose(frame)[None, :3, 3]))
         expected = (offset < np.array([1.0, 0.5, 1.0]) + 0.25).all(axis=1)
-        assert np.array_equal(merging.regions(frame, SPEC) == 1, expected)
-    assert not merger(tracks=[track(frames=range(10, 20))]).regions(25, SPEC).any()
-    assert not merger(dynamic="current").regions(15, SPEC).any()
+        assert np.array_equal(regions_of(merging, frame).of_voxel == 1, expected)
+    assert not regions_of(merger(tracks=[track(frames=range(10, 20))]), 25).actors
+    assert not regions_of(merger(dynamic="current")).actors
 
 
-def test_where_boxes_overlap_the_smaller_one_takes_precedence():
+def test_where_bodies_overlap_the_smaller_one_takes_precedence():
     small, large = track(PEDESTRIAN, (0.3, 0.3, 0.3)), track(VEHICLE, (2.0, 2.0, 1.0))
-    for tracks, number in (([small, large], 1), ([large, small], 2)):
-        regions = merger(tracks=tracks).regions(15, SPEC)
+    for tracks, number in (([small, large], 0), ([large, small], 1)):
+        regions = regions_of(merger(tracks=tracks))
         voxel = SPEC.flat_index(transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3]))
-        assert regions[voxel] == number
-        assert {1, 2} <= set(regions.tolist())
+        (region,) = regions.of_voxel[voxel].tolist()
+        assert regions.actors[region] == number
+        assert sorted(regions.actors.values()) == [0, 1]
+        assert {*regions.actors} <= set(regions.of_voxel.tolist())
+
+
+@pytest.mark.parametrize("dynamic", ["align", "current"])
+def test_moving_points_without_a_body_have_a_region_in_which_the_frames_own_rays_alone_vote(dynamic):
+    merging = merger(dynamic=dynamic, tracks=[])
+    regions = regions_of(merging)
+    place = transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
+    assert not regions.actors
+    assert np.flatnonzero(regions.of_voxel != STATIC).tolist() == SPEC.flat_index(place).tolist()
+    static, actors = observe(merging)
+    assert not actors
+    assert [one.free_region for one in static] == [None if frame == 15 else STATIC for frame in FRAMES]
+
+
+@pytest.mark.parametrize("dynamic", ["drop", "tube"])
+def test_other_rules_have_no_regions(dynamic):
+    assert not regions_of(merger(dynamic=dynamic)).of_voxel.any()
+
+
+def test_a_frame_without_its_own_scan_has_bodies_and_no_points():
+    regions = merger().regions(instant(15), [frame for frame in FRAMES if frame != 15], SPEC)
+    assert list(regions.actors.values()) == [0]
+    assert not merger(tracks=[]).regions(instant(15), [14, 16], SPEC).of_voxel.any()
+
+
+def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
+    merging = merger()
+    merging.scans[20].points[1] += np.float32([0.0, 0.3, 0.1])
+    now = instant(15)
+    for mirrored, plain in zip(
+        list(merging.mirrored(now, [20], regions_of(merging))), observe(merging, window=[20])[1], strict=True
+    ):
+        actor_T_grid = invert(invert(sensor_pose(15)) @ actor_pose(15))
+        one = transform_points(actor_T_grid @ plain.grid_T_sensor, plain.points)
+        other = transform_points(actor_T_grid @ mirrored.grid_T_sensor, mirrored.points)
+        assert np.abs(one * [1, -1, 1] - other).max() < 1e-5
+        assert mirrored.hit_region == mirrored.free_region == 1
+    assert not list(merger(PEDESTRIAN).mirrored(now, FRAMES, regions_of(merger(PEDESTRIAN))))
+
+
+def test_what_passes_is_where_it_was_seen_and_frees_nothing():
+    now = instant(15)
+    passing = list(merger().passing(now, FRAMES))
+    assert len(passing) == 30  # not the frame's own
+    for frame, one in zip([f for f in FRAMES if f != 15], passing, strict=True):
+        assert one.free_region == NOWHERE and one.labels.tolist() == [VEHICLE]
+        place = transform_points(sensor_pose(15) @ one.grid_T_sensor, one.points)
+        assert np.abs(place - actor_pose(frame)[:3, 3]).max() < 1e-5
+
+
+def test_the_scans_of_an_instant_are_those_within_a_quarter_of_a_second():
+    assert len(list(merger().recent(instant(15), FRAMES))) == 5
+    assert len(list(merger().recent(instant(0), FRAMES))) == 3
 
 
 def around(turn, points):
@@ -192,44 +262,42 @@ class TestFeed:
         assert feed.window_of(0) == [0, *range(2, 60, 2)]  # 1 m apart, and at least 59 / 30 m
         assert self.feed(tmp_path / "near", window=(-59, 59), window_m=10.0).window_of(30) == list(range(20, 41))
 
-    def test_scans_without_labels_are_one_class_of_geometry(self, tmp_path):
-        assert set(self.feed(tmp_path).read(0).prepared.labels.tolist()) == {CARLA.id_of("Other")}
-        kitti = self.feed(tmp_path / "kitti", metadata=b'{"classes": "semantickitti"}')
-        assert set(kitti.read(0).prepared.labels.tolist()) == {SEMANTICKITTI.id_of("other-object")}
+    def test_scans_without_labels_are_one_class_of_geometry_on_ground_that_is_found(self, tmp_path):
+        x, y = np.meshgrid(np.arange(-20, 21.0), np.arange(-20, 21.0))
+        floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.8), np.zeros(x.size)])
+        points = np.concatenate([floor, [[6.2, 0.3, 0.5, 0.0]]]).astype(np.float32)
+        labels = self.feed(tmp_path, range(6), points).read(0).labels
+        assert labels[-1] == CARLA.id_of("Other")
+        assert np.mean(np.isin(labels[:-1], sorted(CARLA.ground))) > 0.9
+        kitti = self.feed(tmp_path / "kitti", range(6), points, metadata=b'{"classes": "semantickitti"}')
+        assert kitti.read(0).labels[-1] == SEMANTICKITTI.id_of("other-object")
 
     def test_unlabelled_points_are_left_out(self, tmp_path):
         feed = self.feed(tmp_path)
         FolderSink(tmp_path).sequence("Val/Street/cartesian").write("labels", 3, np.array([0, ROAD], np.uint32))
         (feed.sequence,) = FolderSource(tmp_path).sequences().values()
-        assert feed.read(3).prepared.labels.tolist() == [ROAD]
+        assert feed.read(3).labels.tolist() == [ROAD]
 
     def test_ranges_are_those_of_carlasc_json_unless_they_are_given(self, tmp_path):
         metadata = b'{"min_range_m": 5.0, "max_range_m": 20.0}'
-        assert len(self.feed(tmp_path, metadata=metadata).read(0).prepared.points) == 0
+        assert len(self.feed(tmp_path, metadata=metadata).read(0).points) == 0
         feed = self.feed(tmp_path, metadata=metadata, min_range_m=4.0, max_range_m=30.0)
-        assert len(feed.read(0).prepared.points) == 2  # the bounds are inside
+        assert len(feed.read(0).points) == 2  # the bounds are inside
 
-    def test_scans_are_forgotten_when_no_window_of_a_block_needs_them(self, tmp_path):
+    def test_as_many_scans_are_kept_as_a_window_has(self, tmp_path):
         feed = self.feed(tmp_path, window=(-2, 2))
         first = feed.read(0)
-        for frame in range(1, 29):
+        for frame in range(1, 6):
             feed.read(frame)
-        assert feed.read(0) is first  # 25 frames of a block and two on either side
-        for frame in range(30, 59):
+        assert feed.read(0) is first  # read again, so it is now the most recent one
+        for frame in range(6, 12):
             feed.read(frame)
         assert feed.read(0) is not first
 
-
-@pytest.mark.parametrize(("rule", "dynamic"), [(None, "align"), ("point", "drop"), ("sensor", "align"), (None, "tube")])
-def test_free_space_is_outweighed_by_few_points_of_static_classes_and_many_of_movable_ones(tmp_path, rule, dynamic):
-    feed = TestFeed().feed(tmp_path, frames=range(1), dynamic=dynamic)
-    flat = replace(SPEC, size=(40, 40, 16))
-    plan = Plan(flat, "evaluation", feed.options, Voting(rule), FrameRange())
-    weight = free_weight(plan, feed)
-    if rule == "sensor":
-        assert weight is None
-    elif dynamic == "tube":
-        assert weight is not None and not weight.any()
-    else:
-        assert weight is not None  # the side of a voxel is 0.5 m wide and 0.25 m high
-        assert weight[[ROAD, VEHICLE, PEDESTRIAN]].tolist() == [0.375, 4.0, 4.0]
+    def test_ground_is_found_only_where_labels_do_not_name_it(self, tmp_path):
+        folder = FolderSink(tmp_path).sequence("Val/Street/cartesian")
+        assert self.feed(tmp_path, frames=range(6)).finds_ground
+        for frame, labels in ((3, [1, 1]), (4, [ROAD, 1])):
+            folder.write("labels", frame, np.array(labels, np.uint32))
+            (sequence,) = FolderSource(tmp_path).sequences().values()
+            assert ScanFeed(sequence, FromScans()).finds_ground == (ROAD not in labels)

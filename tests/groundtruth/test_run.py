@@ -48,7 +48,7 @@ def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, varia
 def test_what_we_add_stands_beside_the_published_files_only(golden_capture, tmp_path):
     regrid(golden_capture, GridSpec.published(), tmp_path, workers=1)
     added = set(read_tree(tmp_path / "cartesian")) - set(read_tree(golden_capture / "cartesian"))
-    assert added == {f"instances/{frame:06d}.label" for frame in range(3)}
+    assert added == {*(f"instances/{frame:06d}.label" for frame in range(3)), "evaluation/carlasc-report.json"}
     instances = np.fromfile(tmp_path / "cartesian/instances/000001.label", "<u4")
     assert np.array_equal(instances, Capture(golden_capture).read(0, 101).scan.instances)
 
@@ -295,7 +295,7 @@ def test_arguments_that_are_not_valid_are_refused_before_anything_is_written(tmp
     [
         ({"free_step_m": 0}, "free_step_m: expected a positive number"),
         ({"free_step_m": float("nan")}, "free_step_m: expected a positive number"),
-        ({"rule": "majority"}, "rule: expected sensor, sample or point, found 'majority'"),
+        ({"rule": "majority"}, "rule: expected sensor, sample or ray, found 'majority'"),
     ],
 )
 def test_voting_checks_itself(settings, message):

@@ -4,12 +4,14 @@ import json
 
 import numpy as np
 import pytest
+from helpers import passing
 from helpers.captures import make_recording, read_tree, write_capture
 
 from carlasc.captures.raw import CaptureWriter
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError, FormatError
 from carlasc.groundtruth import Voting, regrid
+from carlasc.storage import layout
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
 GRID = "cartesian/evaluation_32x32x4"
@@ -75,6 +77,20 @@ def test_a_grid_of_carlasc_0_1_0_is_continued_and_compared(made):
         regrid(made, SMALL, workers=1)
 
 
+def test_a_grid_that_carlasc_0_1_0_made_from_scans_is_not_continued_since_scans_give_other_grids_now(tmp_path):
+    street = passing.write_sequence(tmp_path, frames=4)
+    regrid(street, passing.SPEC, name="mine", workers=1)
+    path = street / "cartesian/mine/params.json"
+    params = json.loads(path.read_bytes())
+    record = {key: value for key, value in params["carlasc"].items() if key not in ("format", "rule")}
+    path.write_text(json.dumps(params | {"carlasc": {"version": "0.1.0", **record}}))
+    before = read_tree(street)
+    with pytest.raises(ConflictError, match="carlasc.rule 1 where this run has 2"):
+        regrid(street, passing.SPEC, name="mine", workers=1)
+    assert read_tree(street) == before
+    assert regrid(street, passing.SPEC, name="mine", workers=1, overwrite=True).made == 4
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("newer", [2, -1, "two"])
 def test_a_record_of_a_newer_format_is_refused_with_the_advice_to_upgrade(made, newer, overwrite):
@@ -100,8 +116,14 @@ def test_overwriting_leaves_nothing_of_the_old_grid(made, tmp_path_factory):
     for root in (made, clean):
         result = regrid(root, SMALL, workers=1, voting=Voting(free_step_m=0.5), frames=(100, 102), overwrite=True)
         assert result.made == 2
-    ours = {name: data for name, data in read_tree(made).items() if name.startswith(GRID)}
-    assert ours == {name: data for name, data in read_tree(clean).items() if name.startswith(GRID)}
+    ours, theirs = (
+        {name: data for name, data in read_tree(root).items() if name.startswith(GRID)} for root in (made, clean)
+    )
+    reports = [json.loads(files.pop(f"{GRID}/{layout.REPORT}")) for files in (ours, theirs)]
+    assert ours == theirs
+    for report in reports:
+        del report["documents"]  # poses.txt has a line for frames that the grid does not have
+    assert reports[0] == reports[1]
     assert len(ours) == 5
 
 

@@ -55,6 +55,23 @@ def test_what_no_vehicle_can_do_is_refused_unless_forced(tmp_path, poses, messag
     check_trajectory(sequence, FromScans(force=True))
 
 
+def test_times_say_how_long_a_vehicle_drove_and_turned(tmp_path):
+    poses = [pose @ turn for pose, turn in zip(straight(100), turning(5), strict=True)]  # of 2 Hz: 20 m/s and 1 rad/s
+    check_trajectory(write(tmp_path / "slow", poses, times=[0.5 * frame for frame in range(6)]), FromScans())
+    with pytest.raises(FormatError, match="found a jump of 100 m/s and 3.6 rad/s at frame 1 .5 in all."):
+        check_trajectory(
+            write(tmp_path / "without", [p @ t for p, t in zip(straight(100), turning(3.6), strict=True)]), FromScans()
+        )
+    fast = write(tmp_path / "fast", straight(10), times=[0.01 * frame for frame in range(6)])
+    with pytest.raises(FormatError, match="found a jump of 100 m/s and 0.0 rad/s at frame 1 .5 in all."):
+        check_trajectory(fast, FromScans())
+
+
+def test_one_scan_has_no_speed(tmp_path):
+    check_trajectory(write(tmp_path, straight(10, 1)), FromScans())
+    check_trajectory(write(tmp_path / "timed", straight(10, 1), times=[0.0]), FromScans())
+
+
 def test_missing_scans_leave_a_vehicle_time_to_drive_and_to_turn(tmp_path):
     poses = [pose @ turn for pose, turn in zip(straight(20, 30), turning(1, 30), strict=True)]
     check_trajectory(write(tmp_path / "gap", poses, frames=[0, 1, 12, 29]), FromScans())

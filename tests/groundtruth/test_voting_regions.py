@@ -4,7 +4,7 @@ import pytest
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.ballot import Ballot, count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.observations import NOWHERE, Observation
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
 
@@ -50,30 +50,63 @@ def test_regions_are_forgotten_by_the_next_observation():
     assert (both.free == tally([observation(2)]).free).all()
 
 
-def test_every_point_counts_and_free_space_once():
+def test_every_sample_counts_with_the_rule_ray_as_with_sample():
     observations = [observation(seed) for seed in range(3)]
-    point, sensor, sample = (tally(observations, vote) for vote in ("point", "sensor", "sample"))
-    assert (point.free == sensor.free).all()
-    assert occupied(point) == occupied(sample)
+    ray, sensor, sample = (tally(observations, rule) for rule in ("ray", "sensor", "sample"))
+    assert (ray.free == sample.free).all()
+    assert occupied(ray) == occupied(sample)
+    assert (ray.free >= sensor.free).all() and (ray.free > sensor.free).any()
 
 
-def test_a_vote_for_free_space_weighs_what_the_class_says():
-    votes = tally([observation(seed) for seed in range(3)], "point")
-    things, free = votes.occupied_counts(), votes.free
-    nothing = votes.to_grid(np.zeros(25))
-    assert ((nothing.labels > 0) == (things > 0)).all()
-    assert (nothing.counts == things + free).all()
-    weight = np.where(np.arange(25) == 10, 3.0, 0.5)
-    weighed = votes.to_grid(weight)
-    expected = np.where(things > weight[nothing.labels] * free, nothing.labels, 0)
-    assert (weighed.labels == expected).all()
-    assert 0 < np.count_nonzero(weighed.labels) < np.count_nonzero(nothing.labels)
+@pytest.mark.parametrize("rule", ["sensor", "sample", "ray"])
+def test_votes_stay_in_their_regions_with_every_rule(rule):
+    regions = np.random.default_rng(4).integers(0, 3, SPEC.num_voxels).astype(np.uint16)
+    whole = tally([observation(5)], rule)
+    part = tally([observation(5, hit_region=1, free_region=2)], rule, regions)
+    assert (part.free.reshape(-1) == np.where(regions == 2, whole.free.reshape(-1), 0)).all()
+    assert occupied(part) == {key: n for key, n in occupied(whole).items() if regions[key[0]] == 1}
+
+
+def test_rays_of_a_region_that_has_no_voxels_leave_only_their_points():
+    regions = np.zeros(SPEC.num_voxels, np.uint16)
+    votes = tally([observation(free_region=NOWHERE)], "ray", regions)
+    assert not votes.free.any()
+    assert occupied(votes) == occupied(tally([observation()], "ray"))
+
+
+def views_of(observations, rule="ray", regions=None):
+    ballot = Ballot(SPEC, rule=rule, free_step_m=0.7, regions=regions, count_views=True)
+    for one in observations:
+        ballot.add(one)
+    return ballot.views
+
+
+def seen_by(one):
+    """Return which voxels one observation votes in."""
+    votes = tally([one], "ray")
+    return ((votes.free > 0) | (votes.occupied_counts() > 0)).astype(int)
+
+
+def test_views_count_the_observations_that_saw_a_voxel_however_often_each_did():
+    observations = [observation(seed, count=150) for seed in range(3)]
+    views = views_of(observations)
+    assert (views == sum(seen_by(one) for one in observations)).all()
+    assert set(np.unique(views)) == {0, 1, 2, 3}
+    assert (views_of([observations[0], observations[0]]) == 2 * seen_by(observations[0])).all()
+
+
+def test_views_are_a_copy():
+    ballot = Ballot(SPEC, rule="ray", count_views=True)
+    ballot.add(observation())
+    before = ballot.views
+    ballot.add(observation(1))
+    assert before.max() == 1 and ballot.views.max() == 2
 
 
 def test_regions_that_do_not_fit_are_refused():
     with pytest.raises(ArgumentError, match="regions: expected"):
         Ballot(SPEC, regions=np.zeros(3, np.uint16))
     with pytest.raises(ArgumentError, match="regions: expected"):
-        Ballot(SPEC, rule="sample", regions=np.zeros(SPEC.num_voxels, np.uint16))
+        Ballot(SPEC, rule="ray", regions=np.zeros(SPEC.num_voxels + 1, np.uint16))
     with pytest.raises(ArgumentError, match="observation: expected no region, as the ballot has none"):
         count_votes([observation(free_region=0)], SPEC)

@@ -25,8 +25,8 @@ def test_a_free_step_that_is_no_positive_number_is_refused(free_step_m: float) -
 
 
 def test_an_unknown_rule_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="expected sensor, sample or point, found 'ray'"):
-        count_votes([], GridSpec.published(), rule="ray")  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="expected sensor, sample or ray, found 'point'"):
+        count_votes([], GridSpec.published(), rule="point")  # type: ignore[arg-type]
 
 
 def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:

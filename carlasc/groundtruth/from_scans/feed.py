@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence as Sequence_
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 from uuid import uuid4
@@ -16,15 +17,19 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite
-from carlasc.errors import FormatError
-from carlasc.groundtruth.from_scans.merging import Merger, PreparedScan
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion import (
     Segment,
+    Sighting,
     Standing,
     Track,
-    link_segments,
+    ground_points,
+    is_fast,
+    segment_by_boxes,
     segment_by_flow,
     segment_by_instances,
     standing_points,
@@ -32,25 +37,29 @@ from carlasc.motion import (
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
-BLOCK = 25  # frames that share their tracks; blocks have fixed bounds, so a grid does not depend on the range of a run
+_SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
+_SAMPLES = 5  # scans that are looked at to see whether labels name the ground
 _PARTS = 30  # with `window_m`, scans are at least this fraction of it apart
 
 
 @dataclass(frozen=True)
-class ScanContent:
-    """What merging needs of one scan.
+class ScanMotion:
+    """The actors of one scan.
 
     Attributes:
-        prepared: the scan, prepared for voting.
-        moving: (M,) indices of its moving points.
-        segments: its actors.
-        standing: its standing points of classes that may move.
+        frame: frame number.
+        segments: actors that may move.
+        standing: standing points of classes that may move.
     """
 
-    prepared: PreparedScan
-    moving: NDArray[np.int64]
+    frame: int
     segments: tuple[Segment, ...]
     standing: Standing
+
+    def thinned(self) -> ScanMotion:
+        """Return the same actors with at most `_SIGHTING_POINTS` points each; `members` stay complete."""
+        segments = (replace(s, points=s.points[:: -(-len(s.points) // _SIGHTING_POINTS)]) for s in self.segments)
+        return replace(self, segments=tuple(segments))
 
 
 class ScanFeed:
@@ -73,8 +82,8 @@ class ScanFeed:
         self.classes = metadata.classes
         self.min_range_m = options.min_range_m if options.min_range_m is not None else metadata.min_range_m or 0.0
         self.max_range_m = options.max_range_m if options.max_range_m is not None else metadata.max_range_m or np.inf
-        self._scans: OrderedDict[int, ScanContent] = OrderedDict()
-        self._merger: tuple[int, Merger] | None = None
+        self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
+        self._merger: Merger | None = None
         self._lock = threading.RLock()  # an executor may be of threads
         self._key = uuid4().hex
 
@@ -87,14 +96,64 @@ class ScanFeed:
         return self.sequence.frames("points")
 
     @cached_property
-    def motion_source(self) -> str | None:
-        """The field that motion is estimated from: "instances", "flow", "labels" (what moves, not how), or None."""
-        fields = self.sequence.fields()
-        if "labels" not in fields:
-            return None
-        if "instances" in fields:
-            return "instances"
-        return "flow" if "flow" in fields else "labels" if self.classes.moving else None
+    def times(self) -> dict[int, float]:
+        """Seconds since the first frame, by frame with points."""
+        return {frame: self.time(frame) for frame in self.frames.tolist()}
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether the scans have labels."""
+        return "labels" in self.sequence.fields()
+
+    @cached_property
+    def finds_ground(self) -> bool:
+        """Whether ground points have to be found, because no labels name them: none of some scans has points of a ground class."""
+        if not self.classes.ground:
+            return False
+        ground = sorted(self.classes.ground)
+        labelled = self.sequence.frames("labels")  # some scans may have none
+        chosen = labelled[np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int))] if len(labelled) else []
+        return not any(np.isin(self.sequence.read("labels", int(frame)), ground).any() for frame in chosen)
+
+    @cached_property
+    def motion(self) -> tuple[str, ...]:
+        """What tells how things move: "boxes", "instances" or "flow", and "evidence"; nothing if all points stay where they were seen.
+
+        Raises:
+            MissingDataError: the options ask for a field that the sequence does not have.
+        """
+        asked, fields = self.options.motion or "auto", self.sequence.fields()
+        if self.options.dynamic == "tube" or asked == "none":
+            return ()
+        if asked == "evidence":
+            return ("evidence",)
+        usable = [
+            name
+            for name in ("boxes", "instances", "flow")
+            if name in fields and (name == "boxes" or "labels" in fields)
+        ]
+        if asked == "auto":
+            return (*usable[:1], *(() if "flow" in usable else ("evidence",)))
+        if asked not in usable:
+            raise MissingDataError(
+                self.sequence.location,
+                expected=f"{asked} in the sequence",
+                found=", ".join(usable) or "no field that shows motion",
+                advice='use `motion="evidence"`, which needs points and poses only',
+            )
+        return (asked,)
+
+    @property
+    def needs_actors(self) -> bool:
+        """Whether the actors must be known before a frame can be made: flow and classes show what moves now without them."""
+        return self.options.dynamic == "align" if self.motion == ("flow",) else bool(self.motion)
+
+    @property
+    def reads(self) -> int:
+        """Number of scans that are read to find the actors: fields and evidence of motion are looked at one after the other."""
+        if not self.needs_actors:
+            return 0
+        return len(self.frames) * (any(name != "evidence" for name in self.motion) + ("evidence" in self.motion))
 
     def window_of(self, frame: int) -> list[int]:
         """Return the frames whose scans are merged into a frame, including the frame itself."""
@@ -120,7 +179,7 @@ class ScanFeed:
         return [
             other
             for other in self.window_of(frame)
-            if np.linalg.norm(self.pose(other)[:3, 3] - here[:3, 3]) <= across + self.read(other).prepared.reach_m
+            if np.linalg.norm(self.pose(other)[:3, 3] - here[:3, 3]) <= across + self.read(other).reach_m
         ]
 
     def _by_distance(self, frame: int, others: NDArray[np.int64]) -> Iterator[int]:
@@ -141,73 +200,98 @@ class ScanFeed:
         """Return (4, 4) first_T_sensor."""
         return self.sequence.read_pose(frame)
 
-    def merger(self, frame: int) -> Merger:
-        """Return the merger of the block that contains a frame."""
+    def merger(self, actors: Actors, frame: int) -> Merger:
+        """Return what merges scans into a frame, given the actors of its window. Its caches are kept from frame to frame."""
         with self._lock:
-            block = frame // BLOCK
-            if self._merger is None or self._merger[0] != block:
-                self._merger = (block, self._make_merger(block))
-            return self._merger[1]
+            if self._merger is None:
+                self._merger = Merger(_Scans(self), actors, self.classes, self.options.dynamic)
+            self._merger.actors = actors
+            self._merger.forget_before(frame + self.options.window[0])
+            return self._merger
 
-    def _make_merger(self, block: int) -> Merger:
-        """Link the moving segments of all scans in the windows of the block's frames."""
-        first, last = self.options.window
-        near = self.frames[(self.frames >= block * BLOCK + first) & (self.frames < (block + 1) * BLOCK + last)].tolist()
-        tracks: list[Track] = []
-        moving: dict[int, NDArray[np.int64]] = {}
-        if self.options.dynamic != "tube" and self.motion_source is not None:
-            scans = [self.read(frame) for frame in near]
-            moving = {frame: scan.moving for frame, scan in zip(near, scans, strict=True)}
-            if (
-                self.options.dynamic == "align" or self.motion_source == "instances"
-            ):  # only tracks show which of these move
-                segments = [segment for scan in scans for segment in scan.segments]
-                times = {frame: self._time(frame) for frame in near}
-                standing = {frame: scan.standing for frame, scan in zip(near, scans, strict=True)}
-                tracks = link_segments(segments, times, standing, deformable=self.classes.deformable)
-        return Merger(_Scans(self), tracks, moving, self.classes, self.options.dynamic)
+    def instant(self, frame: int) -> Instant:
+        """Return the time and the place of a frame."""
+        return Instant(frame, self.time(frame), self.pose(frame))
 
-    def _time(self, frame: int) -> float:
+    def time(self, frame: int) -> float:
+        """Return seconds since the first frame."""
         if layout.TIMES in self.sequence.documents():
             return self.sequence.read_time(frame)
         return frame * layout.FRAME_PERIOD_S
 
-    def read(self, frame: int) -> ScanContent:
-        """Read a scan and its moving actors; the most recent ones are cached."""
+    def read(self, frame: int) -> PreparedScan:
+        """Read a scan for merging; the most recent ones are cached."""
         with self._lock:
             if frame not in self._scans:
                 self._scans[frame] = self._read(frame)
                 first, last = self.options.window
-                while len(self._scans) > BLOCK + last - first:
+                while len(self._scans) > last - first + 2:
                     self._scans.popitem(last=False)
             self._scans.move_to_end(frame)
             return self._scans[frame]
 
-    def _read(self, frame: int) -> ScanContent:
+    def _read(self, frame: int) -> PreparedScan:
+        scan = self._voting_points(frame)
+        moving = np.isin(_labels(scan), sorted(self.classes.moving))
+        if "flow" in self.motion and scan.flow is not None:
+            moving |= is_fast(scan.flow, self.options.min_speed_m_s)
+        return PreparedScan.of(
+            frame, scan.points, _labels(scan), self.pose(frame), seconds=self.time(frame), moving=np.flatnonzero(moving)
+        )
+
+    def sighting(self, frame: int, boxes: Sequence_[Track]) -> Sighting:
+        """Return a scan as evidence of motion needs it; points of actors that the sequence's own fields show are marked.
+
+        Args:
+            frame: frame number.
+            boxes: the tracks of the sequence's boxes.
+        """
         scan, pose = self._voting_points(frame), self.pose(frame)
-        prepared = PreparedScan.of(frame, scan.points, _labels(scan), pose)
-        segments: list[Segment] = []
+        explained = np.zeros(len(scan), np.bool_)
+        for segment in self.segments(frame, boxes).segments:
+            explained[segment.members] = True
+        ground = np.isin(_labels(scan), sorted(self.classes.ground))
+        labels = _labels(scan) if self.has_labels else None
+        return Sighting(frame, scan.points, pose, self.time(frame), ground, labels, explained)
+
+    def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
+        """Return the actors of a scan, as the sequence's own fields show them.
+
+        Args:
+            frame: frame number.
+            boxes: the tracks of the sequence's boxes.
+        """
+        scan, pose = self._voting_points(frame), self.pose(frame)
+        found: list[Segment] = []
         standing = Standing.empty(frame)
-        moving = np.flatnonzero(np.isin(_labels(scan), sorted(self.classes.moving)))
-        if self.motion_source == "instances":
-            segments = segment_by_instances(frame, scan, pose)
-        elif self.motion_source == "flow":
+        if "boxes" in self.motion:
+            found = segment_by_boxes(frame, scan, pose, boxes, ground=self.classes.ground)
+        elif "instances" in self.motion:
+            found = segment_by_instances(frame, scan, pose, ground=self.classes.ground)
+        elif "flow" in self.motion:
             speed = self.options.min_speed_m_s
-            segments = segment_by_flow(frame, scan, pose, min_speed_m_s=speed)
-            moving = np.concatenate([moving, *(segment.members for segment in segments)])
+            found = segment_by_flow(frame, scan, pose, min_speed_m_s=speed)
             standing = standing_points(frame, scan, pose, self.classes.movable, min_speed_m_s=speed)
-        return ScanContent(prepared, moving, tuple(segments), standing)
+        return ScanMotion(frame, tuple(found), standing)
 
     def _voting_points(self, frame: int) -> Scan:
         """Read a scan without the points that do not vote: unlabelled, too near or too far."""
         scan = self.sequence.scan(frame)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
-            scan = Scan(scan.points, np.full(len(scan), self.classes.geometry_id, np.uint32))
+            scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
+        if self.finds_ground:
+            scan = replace(scan, labels=self._with_ground(scan.points, _labels(scan)))
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
         distance = np.sqrt(np.square(scan.points).sum(axis=1))
         return scan.select((labels > 0) & (distance >= self.min_range_m) & (distance <= self.max_range_m))
+
+    def _with_ground(self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:
+        """Return labels in which geometry without a class that lies on the ground has a ground class, so that it votes as ground does."""
+        found = np.asarray(labels, np.uint32).copy()
+        found[ground_points(points) & (labels == self.classes.geometry_id)] = min(self.classes.ground)
+        return found
 
 
 class _Scans(Mapping[int, PreparedScan]):
@@ -217,7 +301,7 @@ class _Scans(Mapping[int, PreparedScan]):
         self._feed = feed
 
     def __getitem__(self, frame: int) -> PreparedScan:
-        return self._feed.read(frame).prepared
+        return self._feed.read(frame)
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._feed.frames.tolist())

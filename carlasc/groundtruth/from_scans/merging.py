@@ -7,7 +7,7 @@ time of the frame. Free space that other scans saw of the static scene does not 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +16,35 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.regions import STATIC, Regions
 from carlasc.groundtruth.options import Dynamic
-from carlasc.groundtruth.voting.observations import Observation
-from carlasc.motion import Track
+from carlasc.groundtruth.voting.observations import NOWHERE, Observation
+from carlasc.motion import Track, usual_shell
 
-STATIC = 0  # region of the voxels that belong to no actor
-_DEFORMABLE_WINDOW = 8  # a person's shape is used for this many frames before and after
+_DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
+_RECENT_S = 0.25  # what scans saw within this time before and after a frame is so at the frame
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Instant:
+    """The frame that a grid is made for.
+
+    Attributes:
+        frame: its number.
+        seconds: its time.
+        world_T_grid: (4, 4) pose of the grid.
+    """
+
+    frame: int
+    seconds: float
+    world_T_grid: Transform
+
+    @property
+    def grid_T_world(self) -> Transform:
+        """(4, 4), the inverse of the grid's pose."""
+        return invert(self.world_T_grid)
 
 
 @dataclass(frozen=True)
@@ -34,6 +57,8 @@ class PreparedScan:
         labels: (N,) uint16; 0 casts no vote.
         world_T_sensor: (4, 4).
         reach_m: distance of the farthest point, metres.
+        seconds: time of the scan.
+        moving: (M,) indices of the points that move by their flow or their class, on a track or not.
         order: (N,) int32, indices of the points by increasing azimuth.
         azimuth: (N,) float32, radians, in this order.
     """
@@ -43,18 +68,30 @@ class PreparedScan:
     labels: NDArray[np.uint16]
     world_T_sensor: Transform
     reach_m: float
+    seconds: float
+    moving: NDArray[np.int64]
     order: NDArray[np.int32]
     azimuth: NDArray[np.float32]
 
     @classmethod
     def of(
-        cls, frame: int, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger], world_T_sensor: Transform
+        cls,
+        frame: int,
+        points: NDArray[np.float32],
+        labels: NDArray[np.unsignedinteger],
+        world_T_sensor: Transform,
+        *,
+        seconds: float = 0.0,
+        moving: NDArray[np.int64] | None = None,
     ) -> PreparedScan:
         """Prepare the voting points of a scan."""
         azimuth = np.arctan2(points[:, 1], points[:, 0])
         order = np.argsort(azimuth, kind="stable").astype(np.int32)
         reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
-        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, order, azimuth[order])
+        moving = np.empty(0, np.int64) if moving is None else moving
+        return cls(
+            frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, order, azimuth[order]
+        )
 
     def rays_through(
         self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
@@ -104,99 +141,130 @@ class Merger:
 
     Args:
         scans: prepared scans by frame.
-        tracks: the actors' motion; actors that never move are part of the static scene.
-        moving: (M,) indices of the moving points of each scan, on a track or not.
+        actors: what moves.
         classes: class table of the labels.
         dynamic: what happens to moving points.
     """
 
     def __init__(
-        self,
-        scans: Mapping[int, PreparedScan],
-        tracks: Iterable[Track],
-        moving: Mapping[int, NDArray[np.int64]],
-        classes: ClassTable,
-        dynamic: Dynamic,
+        self, scans: Mapping[int, PreparedScan], actors: Actors, classes: ClassTable, dynamic: Dynamic
     ) -> None:
-        self.scans, self.moving, self.classes, self.dynamic = scans, moving, classes, dynamic
-        self.tracks = [track for track in tracks if track.moves]
-        self._hits: dict[int, NDArray[np.bool_]] = {}
+        self.scans, self.actors, self.classes, self.dynamic = scans, actors, classes, dynamic
+        self._static: dict[int, NDArray[np.bool_]] = {}
         self._carried: dict[tuple[int, int], Observation | None] = {}
 
-    def regions(self, frame: int, spec: GridSpec) -> NDArray[np.uint16]:
-        """Return (V,) uint16: the number of the actor whose box contains each voxel at a frame, STATIC elsewhere.
+    def forget_before(self, frame: int) -> None:
+        """Remove what is kept of scans before a frame."""
+        self._static = {key: value for key, value in self._static.items() if key >= frame}
+        self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
-        A box contains all voxels that it touches. Where boxes overlap, the smaller one takes precedence.
-        """
-        regions = np.zeros(spec.num_voxels, np.uint16)
-        if self.dynamic != "align":
-            return regions
-        world_T_grid = self.scans[frame].world_T_sensor
-        centers = spec.from_axes(spec.centers())
-        columns, heights = centers[:, :, 0, :2].reshape(-1, 2), centers[0, 0, :, 2]
-        across, up = _half_cells(spec, columns)
-        by_column = regions.reshape(len(columns), len(heights))
-        for i in sorted(range(len(self.tracks)), key=lambda i: -float(np.prod(self.tracks[i].size))):
-            track, pose = self.tracks[i], self.tracks[i].pose(frame)
-            if pose is None:
-                continue
-            actor_T_grid = invert(pose) @ world_T_grid
-            turned = np.abs(actor_T_grid[:3, :3])
-            middle = invert(actor_T_grid)[:2, 3]
-            reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
-            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
-            cells = np.column_stack([np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))])
-            slack = np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1) + up * turned[:, 2]
-            body = transform_points(actor_T_grid, cells)
-            inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
-            by_column[near] = np.where(inside.reshape(len(near), len(heights)), np.uint16(i + 1), by_column[near])
+    def regions(self, now: Instant, window: Collection[int], spec: GridSpec) -> Regions:
+        """Return which voxels belong to which actor: those that its body touches, and those of moving points without a body."""
+        regions = Regions.empty(spec)
+        if self.dynamic == "align":
+            tracks = self.actors.tracks.items()
+            present = [(number, track, pose) for number, track in tracks if (pose := track.pose(now.frame)) is not None]
+            regions = Regions.of_bodies(spec, now.world_T_grid, present)
+        if self.dynamic in ("align", "current") and now.frame in window:
+            scan = self.scans[now.frame]
+            moving = scan.points[~self.static(now.frame)]
+            regions = regions.with_points(spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving))
         return regions
 
-    def observations(self, frame: int, window: Iterable[int], regions: NDArray[np.uint16]) -> Iterator[Observation]:
-        """Yield the observations of a frame's grid: each scan of the static scene, then each actor's scans in its box.
+    def observations(self, now: Instant, window: Iterable[int], regions: Regions) -> Iterator[Observation]:
+        """Yield the observations of a frame's grid: each scan of the static scene, then each actor's scans in its body.
 
         Static surfaces vote everywhere, so the road below an actor is kept. Free space that was seen at other times does not count
-        inside an actor's box. The frame's own rays always count.
+        inside an actor's body. The frame's own rays always count.
         """
-        window = list(window)
-        grid_T_world = invert(self.scans[frame].world_T_sensor)
+        window, grid_T_world = list(window), now.grid_T_world
         for other in window:
-            scan, own = self.scans[other], other == frame
+            scan, own = self.scans[other], other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
             hits = None if everything else self.static(other)
             yield Observation(
                 scan.points, scan.labels, grid_T_world @ scan.world_T_sensor, hits, free_region=None if own else STATIC
             )
-        for number in np.unique(regions[regions != STATIC]).tolist():
-            track = self.tracks[number - 1]
+        for region, number in regions.actors.items():
             for other in window:
-                bends = track.label in self.classes.deformable and abs(other - frame) > _DEFORMABLE_WINDOW
-                carried = None if bends or other == frame else self._carry(number - 1, other)
-                pose = track.pose(frame)
+                carried = None if other == now.frame else self._carry(number, other, now)
+                pose = self.actors.tracks[number].pose(now.frame)
                 if carried is not None and pose is not None:
                     yield replace(
                         carried,
                         grid_T_sensor=grid_T_world @ pose @ carried.grid_T_sensor,
-                        free_region=number,
-                        hit_region=number,
+                        free_region=region,
+                        hit_region=region,
                     )
+
+    def mirrored(self, now: Instant, window: Iterable[int], regions: Regions) -> Iterator[Observation]:
+        """Yield what the scans of actors would have seen if they had looked at the actors' other side.
+
+        Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body.
+        """
+        window, grid_T_world = list(window), now.grid_T_world
+        for region, number in regions.actors.items():
+            track = self.actors.tracks[number]
+            pose = track.pose(now.frame)
+            if not track.rigid or pose is None:
+                continue
+            for other in window:
+                carried = self._carry(number, other, now)
+                if carried is not None:
+                    yield replace(
+                        carried,
+                        points=carried.points * np.array([1, -1, 1], np.float32),
+                        grid_T_sensor=grid_T_world @ pose @ _MIRROR @ carried.grid_T_sensor @ _MIRROR,
+                        free_region=region,
+                        hit_region=region,
+                    )
+
+    def passing(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the moving points of each scan where that scan saw them. No ray votes for free space."""
+        for other in window:
+            scan = self.scans[other]
+            moving = ~self.static(other)
+            if other != now.frame and moving.any():
+                pose = now.grid_T_world @ scan.world_T_sensor
+                yield Observation(scan.points[moving], scan.labels[moving], pose, free_region=NOWHERE)
+
+    def recent(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the scans of the instant: those just before and after the frame."""
+        for other in window:
+            scan = self.scans[other]
+            if abs(scan.seconds - now.seconds) <= _RECENT_S:
+                yield Observation(scan.points, scan.labels, now.grid_T_world @ scan.world_T_sensor)
+
+    def shells(self, now: Instant, regions: Regions) -> Iterator[Observation]:
+        """Yield the surface of each vehicle as it usually is, for what no scan saw of it. No ray votes for free space."""
+        for region, number in regions.actors.items():
+            track = self.actors.tracks[number]
+            pose = track.pose(now.frame)
+            points = usual_shell(track.lower, track.upper, track.extent) if track.rigid else None
+            if points is not None and pose is not None:
+                labels = np.full(len(points), track.label, np.uint16)
+                yield Observation(points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE)
 
     def static(self, frame: int) -> NDArray[np.bool_]:
         """Return (N,) bool: the points of a scan that do not belong to anything that moves."""
-        if frame not in self._hits:
-            hits = np.ones(len(self.scans[frame].points), np.bool_)
-            hits[self.moving.get(frame, [])] = False
-            for track in self.tracks:
-                if frame in track.segments:
-                    hits[track.segments[frame].members] = False
-            self._hits[frame] = hits
-        return self._hits[frame]
+        if frame not in self._static:
+            scan = self.scans[frame]
+            static = np.ones(len(scan.points), np.bool_)
+            static[scan.moving] = False
+            static[self.actors.moving.get(frame, [])] = False
+            for track in self.actors.tracks.values():
+                static[track.members.get(frame, [])] = False
+            self._static[frame] = static
+        return self._static[frame]
 
-    def _carry(self, index: int, frame: int) -> Observation | None:
-        """Return a scan's rays through an actor's box, in the actor's frame; None if there are none."""
-        key = (index, frame)
+    def _carry(self, number: int, other: int, now: Instant) -> Observation | None:
+        """Return a scan's rays through an actor's body, in the actor's frame; None if there are none, or it had another shape then."""
+        track = self.actors.tracks[number]
+        if not track.rigid and abs(self.scans[other].seconds - now.seconds) > _DEFORMABLE_S:
+            return None
+        key = (number, other)
         if key not in self._carried:
-            self._carried[key] = self._cut(self.tracks[index], frame)
+            self._carried[key] = self._cut(track, other)
         return self._carried[key]
 
     def _cut(self, track: Track, frame: int) -> Observation | None:
@@ -208,15 +276,6 @@ class Merger:
         rays = scan.rays_through(actor_T_sensor, track.lower, track.upper)
         if not len(rays):
             return None
-        hits = self.static(frame)[rays]
-        if frame in track.segments:
-            hits = hits | np.isin(rays, track.segments[frame].members)
-        return Observation(scan.points[rays], scan.labels[rays], actor_T_sensor, hits)
-
-
-def _half_cells(spec: GridSpec, columns: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
-    """Return half the greatest width of the cells of each column, (C,), and half their height, in metres."""
-    size = spec.voxel_size
-    if spec.coordinates == "cartesian":
-        return np.full(len(columns), max(size[0], size[1]) / 2), float(size[2] / 2)
-    return np.maximum(size[0], np.hypot(columns[:, 0], columns[:, 1]) * size[1]) / 2, float(size[2] / 2)
+        own = np.zeros(len(scan.points), np.bool_)
+        own[track.members.get(frame, [])] = True
+        return Observation(scan.points[rays], scan.labels[rays], actor_T_sensor, own[rays])

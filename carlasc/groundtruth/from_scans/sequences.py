@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Series
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import MissingDataError
+from carlasc.core.geometry import transform_points
+from carlasc.core.grids import Grid
+from carlasc.errors import CarlascError, MissingDataError
+from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
+from carlasc.groundtruth.from_scans.motion_pass import FIRST_MOVER, find_actors, key_of
 from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
 from carlasc.groundtruth.inputs import (
     FrameData,
@@ -24,54 +32,74 @@ from carlasc.groundtruth.inputs import (
     scan_fields,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.voting.ballot import Ballot
+from carlasc.groundtruth.reporting.actors import Residual
+from carlasc.motion import LONGEST_M
 from carlasc.storage import as_source, layout
-from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
-# Points per square metre of surface that outweigh one scan that saw free space there.
-_STATIC_POINTS_M2, _MOVABLE_POINTS_M2 = 3.0, 32.0
+TRACKS = "tracks.npz"
+"""The document that keeps the actors of a sequence beside its grids. It may be deleted: the next run makes it again."""
+_TENTH = 10
+
+
+@dataclass(frozen=True)
+class ScanWindow:
+    """What a worker needs of a sequence for one frame: its scans, and the actors in the window of the frame."""
+
+    feed: ScanFeed
+    actors: Actors
 
 
 @dataclass(frozen=True)
 class ScanFrame(FrameInput):
-    """One frame of a sequence, with the scans that vote on it."""
+    """One frame of a sequence, with the scans that vote on it, and the actors in them."""
 
-    feed: ScanFeed
+    inputs: ScanSequence | ScanWindow
     number: int
     source_frame: int
 
+    def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
+        feed = self.inputs.feed
+        first, last = feed.options.window
+        near = self.inputs.actors.between(self.number + first, self.number + last)
+        return type(self), (ScanWindow(feed, near), self.number, self.source_frame)
+
     def fields(self) -> tuple[str, ...]:
         """Return the names of the scan fields that the frame has."""
-        return scan_fields(self.feed.sequence, self.number)
+        return scan_fields(self.inputs.feed.sequence, self.number)
 
     def make(self, plan: Plan) -> FrameData:
         """Read the frame's own files, and count the votes of the scans in its window."""
-        fields = {name: self.feed.sequence.read(name, self.number) for name in self.fields()}
-        merger, spec = self.feed.merger(self.number), plan.spec
-        window = self.feed.reaching(self.number, spec)
-        regions = merger.regions(self.number, spec)
-        ballot = Ballot(spec, self.feed.classes, rule=plan.rule, free_step_m=plan.voting.free_step_m, regions=regions)
-        for observation in merger.observations(self.number, window, regions):
-            ballot.add(observation)
-        votes = ballot.votes()
-        return FrameData(fields, votes.to_grid(free_weight(plan, self.feed)), votes)
+        feed = self.inputs.feed
+        fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
+        merged = merge_frame(plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec))
+        return FrameData(fields, merged.grid, merged.votes, merged.evidence)
 
+    def thinned(self, plan: Plan) -> Grid:
+        """Return the grid without every tenth of the scans of other frames."""
+        feed = self.inputs.feed
+        window = feed.reaching(self.number, plan.spec)
+        others = [frame for frame in window if frame != self.number]
+        left_out = set(others[_TENTH // 2 :: _TENTH])
+        kept = [frame for frame in window if frame not in left_out]
+        return merge_frame(plan, feed, self.inputs.actors, self.number, kept).grid
 
-def free_weight(plan: Plan, feed: ScanFeed) -> NDArray[np.float64] | None:
-    """Return (K,) how many points of each class one scan that saw free space outweighs; None unless the rule is "point".
-
-    Most scans that graze a thin surface see free space in its voxels, so a few points are enough for static classes. An actor may have
-    left during the window, so movable classes need more points. Smaller voxels contain fewer points.
-    """
-    if plan.rule != "point":
-        return None
-    classes = feed.classes
-    if feed.options.dynamic == "tube":
-        return np.zeros(classes.num_channels)
-    face_m2 = float(plan.spec.voxel_size[0] * plan.spec.voxel_size[2])
-    weight = np.full(classes.num_channels, _STATIC_POINTS_M2 * face_m2)
-    weight[sorted(classes.movable)] = _MOVABLE_POINTS_M2 * face_m2
-    return weight
+    def residuals(self) -> Mapping[int, Residual]:
+        """Return how well the sightings of the moving actors in the frame overlay with the next ones, by number of the actor."""
+        feed, frame, found = self.inputs.feed, self.number, {}
+        last = frame + feed.options.window[1]
+        for number, track in self.inputs.actors.tracks.items():
+            later = min((other for other in track.members if frame < other <= last), default=None)
+            here, there = track.pose(frame), None if later is None else track.pose(later)
+            own, others = track.members.get(frame, ()), () if later is None else track.members[later]
+            if later is None or here is None or there is None or not len(own) or not len(others):
+                continue
+            one, other = (
+                transform_points(feed.pose(f), feed.read(f).points[list(members)].astype(np.float64))
+                for f, members in ((frame, own), (later, others))
+            )
+            found[number] = Residual.between(one, other, here, there)
+        return found
 
 
 class ScanSequence(StoredSequence):
@@ -80,6 +108,7 @@ class ScanSequence(StoredSequence):
     def __init__(self, sequence: Sequence, plan: Plan, options: FromScans) -> None:
         super().__init__(sequence, plan)
         self.options = options
+        self.actors = Actors()
 
     @cached_property
     def feed(self) -> ScanFeed:
@@ -96,13 +125,51 @@ class ScanSequence(StoredSequence):
 
     def _find_frames(self) -> tuple[FrameInput, ...]:
         chosen = choose_frames(self.plan.frames, self.sequence.frames("points"), self.location)
-        return tuple(ScanFrame(self.feed, number, number) for number in chosen)
+        return tuple(ScanFrame(self, number, number) for number in chosen)
+
+    def frame(self, number: int) -> FrameInput | None:
+        """Return a frame of the sequence, chosen or not; None if it has no scan."""
+        return ScanFrame(self, number, number) if number in self.feed.frames else None
+
+    @property
+    def steps_before(self) -> int:
+        """Number of scans that the pass that finds the actors reads."""
+        return self.feed.reads
+
+    def prepare(
+        self,
+        writer: SequenceWriter,
+        *,
+        workers: int,
+        executor: Executor | None,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        """Find the actors of the sequence, or read those that an earlier run found."""
+        if not self.feed.needs_actors:
+            return
+        key = key_of(self.feed)
+        kept = _read_actors(writer, key)
+        if kept is None:
+            self.actors = find_actors(self.feed, workers=workers, executor=executor, progress=progress)
+            writer.write_document(TRACKS, self.actors.to_bytes(key))
+            return
+        self.actors = kept
+        if progress is not None:
+            progress(self.steps_before)
+
+    def summaries(self) -> Series[Mapping[str, Any]] | None:
+        """Return what was found of each actor, by number; None if no actor is tracked."""
+        return self.actors.summary if self.feed.needs_actors else None
 
     def record(self) -> dict[str, Any]:
         """Return how scans are merged."""
         options = self.options
-        record: dict[str, Any] = {"observe": "scans", "motion": self.feed.motion_source or "none"}
+        record: dict[str, Any] = {"observe": "scans", "motion": "+".join(self.feed.motion) or "none"}
         record |= {"dynamic": options.dynamic}
+        if options.dynamic == "align":
+            record |= {"complete": options.complete}
+        if not options.own_path:
+            record |= {"own_path": False}
         record |= {} if options.poses == "file" else {"poses": options.poses}
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}
         record |= {} if options.window_m is None else {"window_m": options.window_m}
@@ -115,15 +182,39 @@ class ScanSequence(StoredSequence):
         return None if has_own and self.options.poses != "file" else self.feed.sequence.poses
 
     def notes(self) -> list[str]:
-        """Return what the scans lack."""
-        where, dynamic = self.location, self.options.dynamic
-        if "labels" not in self.sequence.fields():
-            return [f"{where}: the scans have no labels: grids contain geometry only, in one class"]
-        if self.feed.motion_source is None and dynamic != "tube":
-            return [f"{where}: neither flow nor instances show what moves: everything was treated as static"]
-        if self.feed.motion_source == "labels" and dynamic == "align":
-            return [f"{where}: labels show what moves, but not how: moving points were left out of other frames"]
-        return []
+        """Return what the scans lack, and what was found in spite of it."""
+        where, dynamic, notes = self.location, self.options.dynamic, []
+        if not self.feed.has_labels:
+            notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
+        elif not self.feed.motion and dynamic != "tube":
+            notes.append(f"{where}: nothing shows what moves: everything was treated as static")
+        if "evidence" in self.feed.motion and (self.actors.tracks or self.actors.moving):
+            found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
+            left_out = sum(len(points) for points in self.actors.moving.values())
+            notes.append(
+                f"{where}: free space shows {found} actors that move although nothing else says so; {left_out} more points that moved"
+                " were left out of other frames"
+            )
+        wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
+        if wrong:
+            notes.append(
+                f"{where}: {wrong} actors are larger than any vehicle, so their numbers or boxes are wrong: their points were treated as static"
+            )
+        if len(self.feed.frames) == 1:
+            notes.append(f"{where}: there is one scan only: nothing is merged, and what it did not see is unknown")
+        return notes
+
+
+def _read_actors(writer: SequenceWriter, key: str) -> Actors | None:
+    """Return the actors that an earlier run kept; None if there are none, or they were made from something else."""
+    data = writer.read_document(TRACKS)
+    if data is None:
+        return None
+    try:
+        actors, made_from = Actors.from_bytes(data, TRACKS)
+    except CarlascError:  # of another version, or damaged: it is only a copy of what the scans say
+        return None
+    return actors if made_from == key else None
 
 
 def scan_sequences(source: str | os.PathLike[str] | Source, plan: Plan, options: FromScans) -> list[SequenceInput]:

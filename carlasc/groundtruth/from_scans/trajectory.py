@@ -55,7 +55,10 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
 
 def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> None:
     poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
-    elapsed_s = np.diff(frames) * layout.FRAME_PERIOD_S
+    if layout.TIMES in sequence.documents():
+        elapsed_s = np.diff([sequence.read_time(int(frame)) for frame in frames])
+    else:
+        elapsed_s = np.diff(frames) * layout.FRAME_PERIOD_S
     speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / elapsed_s
     traces = np.einsum("fij,fij->f", poses[1:, :3, :3], poses[:-1, :3, :3])
     turn = np.arccos(np.clip((traces - 1) / 2, -1, 1)) / elapsed_s

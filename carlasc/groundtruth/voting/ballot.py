@@ -22,7 +22,7 @@ from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.observations import Observation
 from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
-VoteRule = Literal["sensor", "sample", "point"]
+VoteRule = Literal["sensor", "sample", "ray"]
 
 OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
 
@@ -41,8 +41,8 @@ def count_votes(
         observations: the voters, all in one grid frame.
         spec: geometry of the grid.
         classes: class table of the labels.
-        rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample": every sample counts;
-            "point": every point counts, free space at most once per observation and voxel.
+        rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample" and "ray": every sample
+            counts (they differ in what the votes decide: see `carlasc.groundtruth.voting.evidence`).
         free_step_m: distance between two free samples on a ray, in metres.
 
     Raises:
@@ -62,7 +62,7 @@ def check_rule(rule: str, free_step_m: float) -> None:
         ArgumentError: an unknown rule, or a distance that is not positive.
     """
     if rule not in get_args(VoteRule):
-        raise ArgumentError("rule", expected="sensor, sample or point", found=repr(rule))
+        raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
     if not (math.isfinite(free_step_m) and free_step_m > 0):
         raise ArgumentError("free_step_m", expected="a positive number of metres", found=str(free_step_m))
 
@@ -75,9 +75,10 @@ class Ballot:
     Args:
         spec: geometry of the grid.
         classes: class table of the labels.
-        rule: "sensor", "sample" or "point", as in `count_votes`.
+        rule: "sensor", "sample" or "ray", as in `count_votes`.
         free_step_m: distance between two free samples on a ray, in metres.
-        regions: (V,) uint16, region of each voxel, for observations that vote in one region only; not with "sample".
+        count_views: also count how many observations saw each voxel; not with "sensor".
+        regions: (V,) uint16, region of each voxel, for observations that vote in one region only.
 
     Raises:
         ArgumentError: an unknown rule, a distance that is not positive, or regions that do not fit.
@@ -91,6 +92,7 @@ class Ballot:
         rule: VoteRule = "sensor",
         free_step_m: float = 1.5,
         regions: NDArray[np.uint16] | None = None,
+        count_views: bool = False,
     ) -> None:
         from carlasc.core.cells import Cells
         from carlasc.groundtruth.voting import kernel
@@ -98,21 +100,21 @@ class Ballot:
         check_rule(rule, free_step_m)
         if regions is not None and regions.shape != (spec.num_voxels,):
             raise ArgumentError("regions", expected=f"shape ({spec.num_voxels},)", found=str(regions.shape))
-        if regions is not None and rule == "sample":
-            raise ArgumentError("regions", expected='None with the rule "sample"', found="an array")
         self.spec, self.classes, self.rule, self.free_step_m = spec, classes, rule, float(free_step_m)
         self.num_observations = 0
-        free_once = rule != "sample"
+        once = rule == "sensor"
+        viewed = spec.num_voxels + 1 if count_views else 0
         self._cells = Cells.of(spec)
         self._tally = kernel.Tally(
-            rule == "sensor",
-            free_once,
-            free=np.zeros(spec.num_voxels + 1, np.uint32 if free_once else np.int64),
-            passed=np.zeros(spec.num_voxels + 1 if free_once else 0, np.uint8),
+            once,
+            free=np.zeros(spec.num_voxels + 1, np.uint32),
+            passed=np.zeros(spec.num_voxels + 1 if once else 0, np.uint8),
             heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
             candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
             used=np.zeros(1, np.int64),
-            regions=np.empty(0, np.uint16) if regions is None else np.ascontiguousarray(regions, np.uint16),
+            regions=np.empty(0, np.uint16) if regions is None else np.append(regions, np.uint16(kernel.OUTSIDE)),
+            views=np.zeros(viewed, np.uint16),
+            viewers=np.full(viewed, kernel.NONE, np.int32),
         )
 
     def add(self, observation: Observation) -> None:
@@ -152,6 +154,11 @@ class Ballot:
         )
         self.num_observations += 1
 
+    @property
+    def views(self) -> NDArray[np.uint16]:
+        """(X, Y, Z) uint16: number of observations that saw each voxel; a copy. Only with `count_views`."""
+        return self._tally.views[:-1].reshape(self.spec.size).copy()
+
     def votes(self) -> Votes:
         """Return the votes so far, as a copy that later observations do not change."""
         candidates = self._tally.candidates[: self._tally.used[0]]
@@ -186,23 +193,14 @@ class Votes:
     free: NDArray[Any]
     occupied: NDArray[Any]
 
-    def to_grid(self, free_weight: NDArray[np.floating] | None = None) -> Grid:
-        """Return the grid: the class that the votes decide for each voxel, and the sum of its votes.
-
-        Args:
-            free_weight: (K,) by class: the number of occupied votes that one vote for free space outweighs. A voxel takes the class
-                with most occupied votes if all its occupied votes together are more than this number times its free votes, and
-                class 0 otherwise. None: free space is a class like the others; the class with most votes wins, and ties go to the
-                lowest id.
-        """
-        free = self.free.reshape(-1)
-        if free_weight is None:
-            labels, counts = self._elect(free)
-        else:
-            labels, occupied = self._elect(np.zeros_like(free))
-            labels[occupied <= free_weight[labels] * free] = 0
-            counts = occupied + free
+    def to_grid(self) -> Grid:
+        """Return the grid: the class with most votes of each voxel, free space included, and the sum of its votes. Ties go to the lowest id."""
+        labels, counts = self._elect(self.free.reshape(-1))
         return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
+
+    def elect_occupied(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return (V,) the class with most votes of each voxel, without free space, and (V,) the sum of these votes; 0 and 0 without any."""
+        return self._elect(np.zeros(self.spec.num_voxels, self.free.dtype))
 
     def _elect(self, free: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return (V,) the class with most votes, ties to the lowest id, and (V,) the sum of the votes; `free` are those of class 0."""

@@ -36,6 +36,7 @@ from carlasc.groundtruth.voting.rule import sample_voxel, unit_ray
 BLOCK = 256  # number of rays whose coordinates fit into the L1 cache
 NONE = -1  # end of a voxel's list of candidates
 ANYWHERE = -1  # region of votes that count in all regions
+OUTSIDE = np.iinfo(np.uint16).max  # region of samples outside the grid
 
 CANDIDATE_DTYPE = np.dtype(
     [("votes", np.int64), ("voxel", np.int32), ("next", np.int32), ("voter", np.int32), ("label", np.uint16)],
@@ -48,24 +49,34 @@ class Tally(NamedTuple):
     """The votes of V voxels.
 
     Attributes:
-        once: whether an observation has at most one vote per voxel and class.
-        free_once: whether an observation has at most one vote per voxel for free space.
+        once: whether an observation has at most one vote per voxel and class, free space included.
         free: (V + 1,) votes for free space; the last element counts samples outside the grid.
-        passed: (V + 1,) uint8, 1 for voxels that the current observation saw free; all 0 between observations. Only with `free_once`.
+        passed: (V + 1,) uint8, 1 for voxels that the current observation saw free; all 0 between observations. Empty if every sample counts.
         heads: (V,) int32, index of the first candidate of each voxel, or NONE.
         candidates: (C,) CANDIDATE_DTYPE, the candidates of all voxels.
         used: (1,) int64, number of candidates in use.
-        regions: (V,) uint16, region of each voxel; empty if the grid has no regions.
+        regions: (V + 1,) uint16, region of each voxel, and OUTSIDE for the last element; empty if the grid has no regions.
+        views: (V + 1,) uint16, number of observations that saw each voxel; empty if they are not counted.
+        viewers: (V + 1,) int32, the last observation that saw each voxel, or NONE; empty if views are not counted.
     """
 
     once: bool
-    free_once: bool
     free: NDArray[Any]
     passed: NDArray[np.uint8]
     heads: NDArray[np.int32]
     candidates: NDArray[Any]
     used: NDArray[np.int64]
     regions: NDArray[np.uint16]
+    views: NDArray[np.uint16]
+    viewers: NDArray[np.int32]
+
+
+@inlined
+def count_view(voxel: int, voter: int, tally: Tally) -> None:
+    """Count that an observation saw a voxel, if views are counted."""
+    if len(tally.views) and tally.viewers[voxel] != voter:
+        tally.viewers[voxel] = voter
+        tally.views[voxel] += np.uint16(1)
 
 
 @jit
@@ -89,6 +100,7 @@ def vote_occupied(
             _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
         if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
             vote_for(voxel, labels[i], voter, tally)
+            count_view(voxel, voter, tally)
 
 
 @inlined
@@ -121,14 +133,19 @@ def vote_free(
     view: View,
     cells: Cells,
     free_step_m: float,
+    voter: int,
+    region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of a block's free samples, which lie between the sensor and the points."""
+    """Add the votes of a block's free samples, which lie between the sensor and the points.
+
+    If each sample counts, only those in `region` are added; otherwise all are marked in `passed`.
+    """
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
         if rays.state[i] == UNSURE:
             vote_free_by_rule(
-                points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, tally
+                points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, region, tally
             )
         if rays.state[i] != SURE:
             continue
@@ -153,18 +170,33 @@ def vote_free(
                     if voxels[j] == DOUBTFUL:
                         point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
                         voxels[j] = sample_voxel(point[0], point[1], point[2], step + j, free_step_m, pose, cells)[1]
-            if tally.free_once:
+            if tally.once:
                 for j in range(number):
                     tally.passed[np.uint32(voxels[j])] = 1
-            else:
+            elif region == ANYWHERE:
                 for j in range(number):
                     tally.free[np.uint32(voxels[j])] += 1
+            else:
+                for j in range(number):
+                    tally.free[np.uint32(voxels[j])] += tally.regions[np.uint32(voxels[j])] == region
+            if len(tally.views):
+                for j in range(number):
+                    if region == ANYWHERE or tally.regions[voxels[j]] == region:
+                        count_view(voxels[j], voter, tally)
             step += CHUNK
 
 
 @jit
 def vote_free_by_rule(
-    x: np.float32, y: np.float32, z: np.float32, pose: Pose, view: View, cells: Cells, free_step_m: float, tally: Tally
+    x: np.float32,
+    y: np.float32,
+    z: np.float32,
+    pose: Pose,
+    view: View,
+    cells: Cells,
+    free_step_m: float,
+    region: int,
+    tally: Tally,
 ) -> None:
     """Add the votes of one ray's free samples by rule.py alone, clipped to the grid with a wide margin."""
     norm, ux, uy, uz = unit_ray(x, y, z)
@@ -180,9 +212,9 @@ def vote_free_by_rule(
     kept = step < 2.0**52  # above it, step + 1 may be equal to step
     while kept and step <= last + 1.0:
         kept, voxel = sample_voxel(x, y, z, step, free_step_m, pose, cells)
-        if tally.free_once:
+        if tally.once:
             tally.passed[voxel] = 1
-        else:
+        elif region == ANYWHERE or tally.regions[voxel] == region:
             tally.free[voxel] += 1
         step += 1.0
 
@@ -253,10 +285,10 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
             place_points(rays, view, hits)
             own = hit_labels[begin : begin + BLOCK]
             vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
-            vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
-        if tally.free_once:
+            vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
+        if tally.once:
             if free_region != ANYWHERE:
-                for v in range(len(tally.regions)):
+                for v in range(len(tally.passed)):
                     tally.passed[v] &= np.uint8(tally.regions[v] == free_region)
             for v in range(len(tally.passed)):
                 tally.free[v] += tally.passed[v]

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError
 
+NOWHERE = 65534
+"""A region without voxels: rays with it do not vote."""
+
 
 @dataclass(frozen=True)
 class Observation:

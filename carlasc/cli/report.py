@@ -1,0 +1,101 @@
+"""`carlasc report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from carlasc.cli.common import Json, Workers, console, print_json, progress_bar, report_failures
+
+if TYPE_CHECKING:
+    from carlasc.groundtruth.reporting.actors import Actor
+    from carlasc.inspection.reports import ReportResult
+
+_SHOWN = 12
+
+
+def report(
+    source: Annotated[
+        str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, or a URL.")
+    ] = ".",
+    grid: Annotated[str | None, typer.Option(help="Only the grid of this name; default: all grids.")] = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Also write the reports as one page for a browser.")
+    ] = None,
+    remake: Annotated[
+        bool, typer.Option("--remake", help="Make the reports from the files, also where a run left some.")
+    ] = False,
+    holdout: Annotated[
+        bool, typer.Option("--holdout", help="Add the scores of held-out rays (see `carlasc validate --holdout`).")
+    ] = False,
+    save: Annotated[
+        bool, typer.Option("--save", help="Write the reports beside their grids, if carlasc made these.")
+    ] = False,
+    everything: Annotated[bool, typer.Option("--all", help="Print all actors, not only the first twelve.")] = False,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """Print the report of each grid: what is in it, how it was made, how well actors were tracked, how it changes with fewer scans.
+
+    `carlasc regrid` leaves a report beside each grid. Grids without one are read and measured.
+    """
+    from carlasc.inspection.report_page import write_report_page
+    from carlasc.inspection.reports import report as read_reports
+
+    with progress_bar("report", unit="steps") as progress:
+        result = read_reports(
+            source, grid=grid, remake=remake, holdout=holdout, save=save, workers=workers, progress=progress
+        )
+    if html is not None:
+        write_report_page(result, html)
+    if as_json:
+        print_json(result.to_dict())
+    else:
+        _print(result, everything=everything)
+        if html is not None:
+            typer.echo(f"page: {html}")
+    frames = sum(len(one.frames) for one in result.reports.values()) + len(result.failures)
+    report_failures([(failure.frame, failure.message) for failure in result.failures], frames)
+
+
+def _print(result: ReportResult, *, everything: bool) -> None:
+    from rich.text import Text
+
+    from carlasc.inspection.report_page import describe
+
+    out = console()
+    for name, one in result.reports.items():
+        out.print(Text(name, style="bold"), soft_wrap=True)
+        rows = describe(one)
+        width = max(len(label) for label, _ in rows)
+        for label, text in rows:
+            out.print(Text(f"  {label:<{width}}  {text}"), soft_wrap=True)
+        if one.actors:
+            _print_actors(one.actors, everything=everything)
+
+
+def _print_actors(actors: tuple[Actor, ...], *, everything: bool) -> None:
+    from carlasc.cli.tables import print_table
+
+    shown = actors if everything else actors[:_SHOWN]
+    header = ["Actor", "Instance", "Frames", "Sightings", "Points", "m/s", "Size m", "Residual m", "Standing m"]
+    rows = [
+        [
+            actor.label,
+            str(actor.instance or ""),
+            f"{actor.first}..{actor.last}",
+            str(actor.sightings),
+            str(actor.points),
+            f"{actor.speed_m_s:.1f}",
+            " x ".join(f"{side:.1f}" for side in actor.size_m),
+            "" if actor.residual_m is None else f"{actor.residual_m:.2f}",
+            "" if actor.residual_standing_m is None else f"{actor.residual_standing_m:.2f}",
+        ]
+        for actor in shown
+    ]
+    out = console()
+    print_table(out, header, rows, turn=False)
+    if len(actors) > len(shown):
+        out.print(f"... and {len(actors) - len(shown)} more (--all prints them)", highlight=False)

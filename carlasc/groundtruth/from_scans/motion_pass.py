@@ -1,0 +1,259 @@
+"""The pass over the scans of a sequence that finds its actors, before the first grid is made.
+
+Scans are read in batches, by several workers; segments are linked as they come, and the track of an actor is estimated when it was seen for
+the last time. So memory does not grow with the length of a drive, except for the result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import invert, transform_points
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.feed import ScanFeed, ScanMotion
+from carlasc.motion import (
+    HORIZON_S,
+    Chain,
+    Evidence,
+    Linker,
+    Segment,
+    Track,
+    complete_bodies,
+    find_evidence,
+    follow_movers,
+    make_track,
+    seen_from,
+    tracks_from_boxes,
+)
+from carlasc.running.processes import run_all
+from carlasc.storage import layout
+from carlasc.storage.folders.folder import FolderSequence
+
+VERSION = 1
+"""Version of the estimate of motion. It changes only when the same input gives other tracks."""
+
+_BATCH = 200  # frames that are read before their finished tracks are estimated
+_MOVERS = 32  # movers whose tracks are estimated in one piece
+_BLOCK = 100  # frames whose evidence is found in one piece
+FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class _FindSegments:
+    """Finds the actors of one scan, in a worker."""
+
+    feed: ScanFeed
+    boxes: tuple[Track, ...]
+
+    def __call__(self, frame: int) -> ScanMotion:
+        return self.feed.segments(frame, self.boxes).thinned()
+
+
+@dataclass(frozen=True)
+class _FindEvidence:
+    """Finds what else moved in the scans of a block, in a worker: it needs the scans of some seconds before and after them."""
+
+    feed: ScanFeed
+    boxes: tuple[Track, ...]
+
+    def __call__(self, block: tuple[int, ...]) -> list[Evidence]:
+        times = self.feed.times
+        near = [f for f, s in times.items() if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S]
+        scans = (self.feed.sighting(frame, self.boxes) for frame in near)
+        chosen = set(block)
+        found = find_evidence(scans, movable=self.feed.classes.movable)
+        return [evidence.thinned() for evidence in found if evidence.frame in chosen]
+
+
+@dataclass(frozen=True)
+class _MakeTrack:
+    """Estimates the track of one actor, in a worker."""
+
+    times: dict[int, float]
+    deformable: frozenset[int]
+
+    def __call__(self, actor: tuple[Chain, bool | None]) -> Track:
+        chain, rigid = actor
+        return make_track(chain, self.times, deformable=self.deformable, rigid=rigid)
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """The pass over one sequence.
+
+    Attributes:
+        feed: its scans.
+        workers: number of scans, blocks or tracks that are worked on in parallel.
+        executor: runs the work instead of processes of our own.
+        progress: called with the number of scans that were read since the last call.
+    """
+
+    feed: ScanFeed
+    workers: int
+    executor: Executor | None
+    progress: Callable[[int], None] | None
+
+    def run(self) -> Actors:
+        boxes = _box_tracks(self.feed)
+        moving_boxes = tuple(track for track in boxes if track.moves)
+        tracks = self._boxed(boxes, moving_boxes) if boxes else self._linked()
+        moving: dict[int, NDArray[np.integer]] = {}
+        if "evidence" in self.feed.motion:
+            movers, moving = self._movers(moving_boxes)
+            tracks += movers
+        return Actors.of(tracks if boxes else complete_bodies(tracks), moving)
+
+    def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+        with closing(run_all(function, items, workers=self.workers, executor=self.executor)) as results:
+            yield from results
+
+    def _count(self, scans: int) -> None:
+        if self.progress is not None:
+            self.progress(scans)
+
+    def _linked(self) -> list[Track]:
+        """Return the tracks of the actors that flow or instances show."""
+        frames, times = list(self.feed.times), self.feed.times
+        linker, tracks = Linker(), list[Track]()
+        if not {"flow", "instances"} & set(self.feed.motion):
+            if "boxes" in self.feed.motion:  # but no frame has one
+                self._count(len(frames))
+            return tracks
+        for begin in range(0, len(frames), _BATCH):
+            ended: list[Chain] = []
+            for scan in self._each(_FindSegments(self.feed, ()), frames[begin : begin + _BATCH]):
+                ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.standing)
+                self._count(1)
+            if begin + _BATCH >= len(frames):
+                ended += linker.finish()
+            tracks += self._estimate([(chain, None) for chain in ended])
+        return tracks
+
+    def _boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
+        """Return the tracks of annotated boxes, with the points that are in them."""
+        segments: dict[int, list[Segment]] = {}
+        for scan in self._each(_FindSegments(self.feed, moving), list(self.feed.times)):
+            for segment in scan.segments:
+                segments.setdefault(segment.instance, []).append(replace(segment, points=segment.points[:0]))
+            self._count(1)
+        return [_with_members(track, segments.get(track.instance, [])) for track in boxes]
+
+    def _movers(self, boxes: tuple[Track, ...]) -> tuple[list[Track], dict[int, NDArray[np.integer]]]:
+        """Return the tracks of what moved although no field shows it, and the moved points of each frame that belong to none."""
+        frames = list(self.feed.times)
+        blocks = [tuple(frames[begin : begin + _BLOCK]) for begin in range(0, len(frames), _BLOCK)]
+
+        def evidence() -> Iterator[Evidence]:
+            for block in self._each(_FindEvidence(self.feed, boxes), blocks):
+                for found in block:
+                    yield found
+                    self._count(1)
+
+        classes = self.feed.classes
+        label = 0 if self.feed.has_labels else classes.geometry_id
+        moved: dict[int, NDArray[np.int64]] = {}
+        movers = follow_movers(
+            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_MOVER, default_label=label
+        )
+        tracks: list[Track] = []
+        while batch := list(islice(movers, _MOVERS)):
+            # their paths are estimated again: velocities alone would drift
+            chains = [([replace(s, velocity=None) for s in mover.segments], mover.rigid) for mover in batch]
+            tracks += self._estimate(chains)
+        return tracks, _untracked(moved, tracks)
+
+    def _estimate(self, actors: Sequence[tuple[Chain, bool | None]]) -> list[Track]:
+        return list(self._each(_MakeTrack(self.feed.times, self.feed.classes.deformable), actors))
+
+
+def find_actors(
+    feed: ScanFeed,
+    *,
+    workers: int = 1,
+    executor: Executor | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Actors:
+    """Find the actors of a sequence.
+
+    Args:
+        feed: the scans of the sequence.
+        workers: number of scans that are read in parallel.
+        executor: runs the work instead of processes of our own.
+        progress: called with the number of scans that were read since the last call.
+
+    Raises:
+        FormatError: a scan is not valid.
+    """
+    return _Pass(feed, workers, executor, progress).run()
+
+
+def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict[int, NDArray[np.integer]]:
+    """Return the moved points of each frame that belong to no track."""
+    tracked: dict[int, list[NDArray[np.integer]]] = {}
+    for track in tracks:
+        for frame, members in track.members.items():
+            tracked.setdefault(frame, []).append(members)
+    nothing = np.empty(0, np.int64)
+    return {
+        frame: np.setdiff1d(points, np.concatenate([nothing, *tracked.get(frame, [])])).astype(np.int32)
+        for frame, points in moved.items()
+    }
+
+
+def _with_members(track: Track, segments: list[Segment]) -> Track:
+    """Return the track of a box with the points that are in it, and the faces that they show."""
+    present = [(segment, pose) for segment in segments if (pose := track.pose(segment.frame)) is not None]
+    if not present:
+        return track
+    counts = np.array([len(segment.members) for segment, _ in present])
+    sensors = np.stack([transform_points(invert(pose), segment.origin) for segment, pose in present])
+    members = {segment.frame: segment.members.astype(np.int32) for segment, _ in present}
+    return replace(track, members=members, extent=seen_from(track.extent.lower, track.extent.upper, counts, sensors))
+
+
+def _box_tracks(feed: ScanFeed) -> list[Track]:
+    """Return the tracks of the sequence's boxes, if motion is taken from them."""
+    if "boxes" not in feed.motion:
+        return []
+    frames = feed.sequence.frames("boxes").tolist()
+    boxes = {frame: found for frame in frames if (found := feed.sequence.boxes(frame)) is not None}
+    return tracks_from_boxes(boxes, {frame: feed.pose(frame) for frame in boxes}, feed.times)
+
+
+def key_of(feed: ScanFeed) -> str:
+    """Return a digest of what the actors of a sequence depend on: its scans, poses and times, and the options.
+
+    The contents of scans are not read: a scan that is replaced is noticed by the time of the folder that holds it.
+    """
+    options, sequence = feed.options, feed.sequence
+    about: dict[str, Any] = {
+        "version": VERSION,
+        "motion": feed.motion,
+        "min_speed_m_s": options.min_speed_m_s,
+        "range_m": [feed.min_range_m, str(feed.max_range_m)],
+        "frames": feed.frames.tolist(),
+        "poses": hashlib.sha256(sequence.poses.tobytes()).hexdigest(),
+        "times": sequence.times.tolist() if layout.TIMES in sequence.documents() else None,
+        "folders": _changed(sequence.folder) if isinstance(sequence, FolderSequence) else None,
+    }
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+
+def _changed(folder: Path) -> dict[str, int]:
+    """Return when files were last added to or replaced in the folders of a sequence's scans, in nanoseconds."""
+    names = {field.folder for field in layout.SCAN_FIELDS.values()}
+    return {name: (folder / name).stat().st_mtime_ns for name in sorted(names) if (folder / name).is_dir()}

@@ -1,0 +1,348 @@
+"""The report of a grid as a value: carlasc-report.json, which every run writes beside the grid."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from hashlib import blake2b
+from itertools import groupby
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.errors import FormatError
+from carlasc.groundtruth.reporting.actors import Actor, actors_of
+from carlasc.groundtruth.reporting.facts import FrameFacts, digest_of_bytes
+from carlasc.storage.files import parse_json, to_json
+
+REPORT_FORMAT = 1
+"""Version of carlasc-report.json: of its keys, and of what they mean."""
+LEFT_OUT = 0.1
+"""Share of the scans that is left out where convergence is measured."""
+_SHORT = 8  # hexadecimal digits of the digest of one frame
+_ABSENT = "-" * _SHORT
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The voxels of all frames together.
+
+    Attributes:
+        voxels: number of voxels.
+        known: number of known voxels, which have at least one vote.
+        classes: number of known voxels of each class that occurs, by name; free space is the class with id 0.
+        occupied: number of known voxels that are not free.
+        mean_votes: mean number of votes of a known voxel, the nearest to its number of views that a grid keeps; None without counts.
+        votes: number of known voxels with 1 vote, 2 to 3, 4 to 7, and so on, up to the last bin that is not empty.
+    """
+
+    voxels: int
+    known: int
+    classes: Mapping[str, int]
+    occupied: int
+    mean_votes: float | None
+    votes: tuple[int, ...]
+
+    @property
+    def known_share(self) -> float:
+        """Share of the voxels that are known."""
+        return self.known / self.voxels if self.voxels else 0.0
+
+    @property
+    def occupied_share(self) -> float:
+        """Share of the known voxels that are occupied."""
+        return self.occupied / self.known if self.known else 0.0
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How grids change if a tenth of the scans of other frames is left out, on some frames.
+
+    Attributes:
+        frames: number of frames on which this was tried.
+        known: number of voxels that are known with and without these scans.
+        changed: how many of them have another label without.
+    """
+
+    frames: int
+    known: int
+    changed: int
+
+    @property
+    def changed_share(self) -> float:
+        """Share of the voxels known in both whose label changes."""
+        return self.changed / self.known if self.known else 0.0
+
+
+@dataclass(frozen=True)
+class Digests:
+    """Digests (BLAKE2b) of one field.
+
+    Attributes:
+        all: 32 hexadecimal digits for the field as a whole.
+        frames: 8 digits for each frame of the report, in their order; "--------" for a frame without the field.
+    """
+
+    all: str
+    frames: str
+
+    def of(self, row: int) -> str | None:
+        """Return the digits of the row-th frame of the report; None if it does not have the field."""
+        digits = self.frames[_SHORT * row : _SHORT * (row + 1)]
+        return None if digits == _ABSENT else digits
+
+
+@dataclass(frozen=True)
+class FileDigest:
+    """The digest of a text file. Lines may be added to poses.txt and times.txt later, so the number of bytes belongs to it.
+
+    Attributes:
+        size: size of the file, in bytes.
+        digest: digest of these bytes, 32 hexadecimal digits.
+    """
+
+    size: int
+    digest: str
+
+    @classmethod
+    def of(cls, data: bytes) -> Self:
+        """Return the digest of a file."""
+        return cls(len(data), digest_of_bytes(data).hex())
+
+    def matches(self, data: bytes) -> bool:
+        """Return whether a file starts with the bytes that the digest is of."""
+        return self.of(data[: self.size]) == self
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a grid of one sequence holds, how it was made, and digests of its files.
+
+    Attributes:
+        grid: name of the grid's folder.
+        frames: numbers of the frames that the report covers, sorted.
+        settings: content of params.json.
+        coverage: known and occupied voxels, and their votes.
+        convergence: how grids change if scans are left out; None for grids that are not made from scans.
+        actors: moving actors that were tracked; None if none were looked for.
+        inferred_share: share of the known voxels that were inferred, not seen; None if the grid does not say.
+        holdout: held-out scores, as `carlasc.inspection.HeldOutScores.to_dict` returns them; None if they were not measured.
+        digests: digests of each field beside the grid and of the grid, by name.
+        documents: digest of each text file that belongs to the grid, by name.
+        versions: versions of carlasc, NumPy, Numba and Python that made the report.
+    """
+
+    grid: str
+    frames: tuple[int, ...]
+    settings: Mapping[str, Any]
+    coverage: Coverage
+    convergence: Convergence | None
+    actors: tuple[Actor, ...] | None
+    inferred_share: float | None
+    holdout: Mapping[str, Any] | None
+    digests: Mapping[str, Digests]
+    documents: Mapping[str, FileDigest]
+    versions: Mapping[str, str]
+
+    @classmethod
+    def make(
+        cls,
+        grid: str,
+        facts: Iterable[FrameFacts],
+        settings: Mapping[str, Any],
+        classes: ClassTable,
+        documents: Mapping[str, bytes],
+        *,
+        actors: Sequence[Mapping[str, Any]] | None = None,
+        holdout: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Make a report.
+
+        Args:
+            grid: name of the grid's folder.
+            facts: what was measured of each frame, in any order.
+            settings: content of params.json.
+            classes: class table of the grid's labels.
+            documents: the text files that belong to the grid, by name.
+            actors: what was found of each actor, by number; None if none were looked for.
+            holdout: as in the attributes.
+        """
+        rows = sorted(facts, key=lambda row: row.frame)
+        frames = tuple(row.frame for row in rows)
+        changes = [row.changes for row in rows if row.changes is not None]
+        names = sorted({name for row in rows for name in row.digests})
+        return cls(
+            grid=grid,
+            frames=frames,
+            settings=dict(settings),
+            coverage=_coverage(rows, settings, classes),
+            convergence=Convergence(len(changes), sum(c.known for c in changes), sum(c.changed for c in changes))
+            if changes
+            else None,
+            actors=None if actors is None else actors_of(actors, (row.residuals for row in rows), classes),
+            inferred_share=_inferred(rows),
+            holdout=holdout,
+            digests={name: _digests(rows, name) for name in names},
+            documents={name: FileDigest.of(data) for name, data in sorted(documents.items())},
+            versions=_versions(),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        coverage, convergence = self.coverage, self.convergence
+        own = f"{self.grid}/"
+        digests = {name: asdict(value) for name, value in self.digests.items()}
+        return {
+            "format": REPORT_FORMAT,
+            "grid": self.grid,
+            "frames": [list(span) for span in _spans(self.frames)],
+            "settings": dict(self.settings),
+            "coverage": {
+                **asdict(coverage),
+                "classes": dict(coverage.classes),
+                "votes": list(coverage.votes),
+                "known_share": coverage.known_share,
+                "occupied_share": coverage.occupied_share,
+            },
+            "convergence": None
+            if convergence is None
+            else {"left_out": LEFT_OUT, **asdict(convergence), "changed_share": convergence.changed_share},
+            "actors": None if self.actors is None else [_plain(actor) for actor in self.actors],
+            "inferred_share": self.inferred_share,
+            "holdout": None if self.holdout is None else dict(self.holdout),
+            "inputs": {name: value for name, value in digests.items() if not name.startswith(own)},
+            "outputs": {name: value for name, value in digests.items() if name.startswith(own)},
+            "documents": {name: asdict(value) for name, value in self.documents.items()},
+            "versions": dict(self.versions),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], where: str = "report") -> Self:
+        """Return the report that `to_dict` describes; `where` is the file named in errors.
+
+        Raises:
+            FormatError: the values are not those of a report, or a newer version of carlasc wrote them.
+        """
+        version = values.get("format")
+        if version != REPORT_FORMAT:
+            newer = isinstance(version, int) and version > REPORT_FORMAT
+            raise FormatError(
+                where,
+                expected=f"a report of format {REPORT_FORMAT}",
+                found=f"format {version}",
+                advice="upgrade carlasc" if newer else "make it again with `remake=True`",
+            )
+        try:
+            coverage, convergence, actors = values["coverage"], values["convergence"], values["actors"]
+            return cls(
+                grid=str(values["grid"]),
+                frames=tuple(frame for start, stop in values["frames"] for frame in range(start, stop)),
+                settings=dict(values["settings"]),
+                coverage=Coverage(
+                    coverage["voxels"],
+                    coverage["known"],
+                    dict(coverage["classes"]),
+                    coverage["occupied"],
+                    coverage["mean_votes"],
+                    tuple(coverage["votes"]),
+                ),
+                convergence=None
+                if convergence is None
+                else Convergence(convergence["frames"], convergence["known"], convergence["changed"]),
+                actors=None if actors is None else tuple(_actor(actor) for actor in actors),
+                inferred_share=values["inferred_share"],
+                holdout=values["holdout"],
+                digests={
+                    name: Digests(value["all"], value["frames"])
+                    for name, value in {**values["inputs"], **values["outputs"]}.items()
+                },
+                documents={name: FileDigest(**value) for name, value in values["documents"].items()},
+                versions=dict(values["versions"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise FormatError(
+                where, expected="a report", found=f"something else ({type(error).__name__}: {error})"
+            ) from error
+
+    def to_json(self) -> bytes:
+        """Return the bytes of carlasc-report.json."""
+        return to_json(self.to_dict())
+
+    @classmethod
+    def from_json(cls, data: bytes, where: str) -> Self:
+        """Read carlasc-report.json; `where` is the file named in errors.
+
+        Raises:
+            FormatError: it holds something else.
+        """
+        return cls.from_dict(parse_json(data, where), where)
+
+
+def short(digest: bytes) -> str:
+    """Return the digits by which `Digests.frames` knows the digest of a frame."""
+    return digest.hex()[:_SHORT]
+
+
+def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: ClassTable) -> Coverage:
+    by_class: NDArray[np.int64] = sum((row.classes for row in rows), start=np.zeros(classes.num_channels, np.int64))
+    votes = sum((row.votes for row in rows), start=np.zeros(1, np.int64))
+    known, total = sum(row.known for row in rows), sum(row.votes_sum for row in rows)
+    voxels = len(rows) * int(np.prod(settings["grid_size"], dtype=np.int64))
+    return Coverage(
+        voxels=voxels,
+        known=known,
+        classes={classes.names.get(i, str(i)): int(by_class[i]) for i in np.flatnonzero(by_class).tolist()},
+        occupied=known - int(by_class[0]),
+        mean_votes=round(total / known, 4) if known and total else None,
+        votes=tuple(np.trim_zeros(votes, "b").tolist()),
+    )
+
+
+def _inferred(rows: list[FrameFacts]) -> float | None:
+    """Return the share of the known voxels that were inferred; None if a frame does not say."""
+    counts, known = [row.inferred for row in rows if row.inferred is not None], sum(row.known for row in rows)
+    return sum(counts) / known if known and len(counts) == len(rows) else None
+
+
+def _digests(rows: list[FrameFacts], name: str) -> Digests:
+    whole, frames = blake2b(digest_size=16), []
+    for row in rows:
+        digest = row.digests.get(name)
+        frames.append(_ABSENT if digest is None else short(digest))
+        if digest is not None:
+            whole.update(row.frame.to_bytes(8, "little") + digest)
+    return Digests(whole.hexdigest(), "".join(frames))
+
+
+def _versions() -> dict[str, str]:
+    import numba
+
+    from carlasc import __version__
+
+    return {
+        "carlasc": __version__,
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return half-open ranges of consecutive frame numbers."""
+    runs = [[frame for _, frame in run] for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0])]
+    return [(run[0], run[-1] + 1) for run in runs]
+
+
+def _plain(actor: Actor) -> dict[str, Any]:
+    return {**asdict(actor), "size_m": list(actor.size_m), "seen_m": list(actor.seen_m)}
+
+
+def _actor(values: Mapping[str, Any]) -> Actor:
+    sizes = {}
+    for name in ("size_m", "seen_m"):
+        length, width, height = values[name]
+        sizes[name] = (length, width, height)
+    return Actor(**{**values, **sizes})

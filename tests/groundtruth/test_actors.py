@@ -1,0 +1,218 @@
+"""What moves in a sequence: found in one pass, kept beside the grids, and used again."""
+
+import numpy as np
+import pytest
+from helpers import passing
+from helpers.captures import read_tree
+
+import carlasc
+from carlasc import FromScans
+from carlasc.errors import FormatError
+from carlasc.groundtruth.from_scans import sequences
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
+from carlasc.groundtruth.from_scans.sequences import TRACKS
+from carlasc.motion import Extent, Track
+from carlasc.storage import layout
+
+FRAMES = 12
+
+
+def track(first=3, frames=10, speed=8.0, label=10, instance=7, rigid=True):
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = 0.1 * speed * np.arange(frames)
+    half = np.array([2.0, 0.9, 0.7])
+    members = {first + i: np.arange(i, dtype=np.int32) for i in range(frames)}
+    extent = Extent(-half, half - 0.5, (True, False, True, False), 300, (-9.0, 4.0))
+    return Track(
+        label, instance, members, first, poses, np.tile([speed, 0.0, 0.0], (frames, 1)), -half, half, extent, rigid
+    )
+
+
+def assert_equal(one, other):
+    assert list(one.tracks) == list(other.tracks)
+    for a, b in zip(one.tracks.values(), other.tracks.values(), strict=True):
+        for name in ("label", "instance", "first", "rigid"):
+            assert getattr(a, name) == getattr(b, name)
+        for name in ("world_T_actor", "velocity", "lower", "upper"):
+            assert np.array_equal(getattr(a, name), getattr(b, name))
+        assert (a.extent.faces, a.extent.points, a.extent.seen_from) == (
+            b.extent.faces,
+            b.extent.points,
+            b.extent.seen_from,
+        )
+        assert np.array_equal(a.extent.lower, b.extent.lower) and np.array_equal(a.extent.upper, b.extent.upper)
+        assert list(a.members) == list(b.members)
+        assert all(np.array_equal(a.members[frame], b.members[frame]) for frame in a.members)
+    assert list(one.moving) == list(other.moving)
+    assert all(np.array_equal(one.moving[frame], other.moving[frame]) for frame in one.moving)
+    assert [dict(summary) for summary in one.summary] == [dict(summary) for summary in other.summary]
+
+
+ACTORS = Actors.of(
+    [track(), track(speed=0.0), track(first=0, frames=4, label=4, instance=1 << 33, rigid=False)],
+    {2: np.array([5, 9]), 4: np.array([], np.int64), 8: np.array([1])},
+)
+
+
+class TestKept:
+    def test_those_that_move_are_kept_and_all_are_summed_up(self):
+        assert list(ACTORS.tracks) == [0, 2]
+        assert [summary["moves"] for summary in ACTORS.summary] == [True, False, True]
+        assert ACTORS.summary[0] | {"size_m": None} == {
+            "label": 10, "instance": 7, "first": 3, "last": 12, "scans": 10, "points": 45, "moves": True,
+            "speed_m_s": 8.0, "size_m": None, "seen_m": [3.5, 1.3, 0.9], "faces": 2,
+        }  # fmt: skip
+
+    @pytest.mark.parametrize("actors", [ACTORS, Actors(), Actors.of([], {3: np.array([2])}), Actors.of([track()])])
+    def test_what_is_kept_is_read_back_with_what_it_was_made_from(self, actors):
+        back, key = Actors.from_bytes(actors.to_bytes("a key"), "here")
+        assert key == "a key"
+        assert_equal(back, actors)
+
+    @pytest.mark.parametrize("size", [0, 1, 100, -200, -1])
+    def test_a_damaged_file_is_one_error_that_names_it(self, size):
+        data = ACTORS.to_bytes("key")[:size]
+        with pytest.raises(FormatError, match="^tracks.npz: expected tracks written by regrid, found .*: remove it$"):
+            Actors.from_bytes(data, "tracks.npz")
+
+    @pytest.mark.parametrize("position", [60, 300, 1000])
+    def test_a_file_with_a_damaged_part_is_refused(self, position):
+        data = bytearray(ACTORS.to_bytes("key"))
+        data[position : position + 20] = bytes(20)
+        with pytest.raises(FormatError, match="expected tracks written by regrid"):
+            Actors.from_bytes(bytes(data), "tracks.npz")
+
+    def test_a_worker_gets_what_concerns_its_window(self):
+        near = ACTORS.between(5, 8)
+        assert list(near.tracks) == [0]
+        assert sorted(near.tracks[0].members) == [5, 6, 7, 8]
+        assert np.array_equal(near.tracks[0].world_T_actor, ACTORS.tracks[0].world_T_actor)
+        assert sorted(near.moving) == [8]
+        assert not ACTORS.between(30, 40).tracks and not ACTORS.between(30, 40).moving
+
+
+@pytest.fixture
+def street(tmp_path):
+    return passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Count the passes over a sequence."""
+    made = []
+
+    def find(*args, **options):
+        made.append(1)
+        return find_actors(*args, **options)
+
+    monkeypatch.setattr(sequences, "find_actors", find)
+    return made
+
+
+def run(street, name="mine", frames=None, workers=1, **options):
+    result = carlasc.regrid(
+        street, passing.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=workers
+    )
+    assert result.failures == ()
+    return {file: data for file, data in read_tree(street / "cartesian" / name).items() if file[:1].isdigit()}
+
+
+class TestPass:
+    def test_it_is_made_once_for_several_grids_and_runs(self, street, passes):
+        run(street, frames=(0, 2))
+        assert len(passes) == 1
+        kept = (street / "cartesian" / TRACKS).read_bytes()
+        run(street, frames=(0, 4))
+        run(street, "other", frames=(0, 2), window=(-2, 2))
+        assert len(passes) == 1
+        assert (street / "cartesian" / TRACKS).read_bytes() == kept
+
+    def test_kept_actors_give_the_same_grids_as_new_ones(self, street, passes):
+        first, again = run(street, "first", (4, 6)), run(street, "again", (4, 6))
+        (street / "cartesian" / TRACKS).unlink()
+        assert first == again == run(street, "new", (4, 6))
+        assert len(passes) == 2
+
+    def test_it_is_made_again_after_a_scan_was_replaced(self, street, passes):
+        run(street, "before", (4, 6))
+        path = street / "cartesian" / layout.field_named("points").file(5)
+        copy = path.with_suffix(".new")
+        points = np.fromfile(path, "<f4").reshape(-1, 4)
+        (points * np.float32([1, 1, 1.001, 1])).tofile(copy)
+        copy.replace(path)
+        run(street, "after", (4, 6))
+        assert len(passes) == 2
+
+    @pytest.mark.parametrize("data", [b"", b"not an archive", Actors().to_bytes("of another drive")])
+    def test_it_is_made_again_if_what_is_kept_is_damaged_or_of_something_else(self, street, passes, data):
+        (street / "cartesian" / TRACKS).write_bytes(data)
+        run(street, frames=(4, 5))
+        assert len(passes) == 1
+        assert Actors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), TRACKS)[0].tracks
+
+    def test_other_options_of_motion_need_another_one(self, street, passes):
+        run(street, "fields", (4, 5))
+        run(street, "evidence", (4, 5), motion="evidence")
+        assert len(passes) == 2
+        run(street, "tube", (4, 5), dynamic="tube")
+        run(street, "none", (4, 5), motion="none")
+        assert len(passes) == 2  # nothing is asked about motion
+
+    def test_two_workers_find_the_same_as_one(self, street):
+        one = run(street, "one", (3, 6))
+        kept = (street / "cartesian" / TRACKS).read_bytes()
+        (street / "cartesian" / TRACKS).unlink()
+        assert one == run(street, "two", (3, 6), workers=2)
+        assert_equal(
+            Actors.from_bytes(kept, "")[0], Actors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), "")[0]
+        )
+
+    def test_a_grid_does_not_depend_on_the_frames_of_the_run(self, street):
+        assert run(street, "alone", (5, 6))["000005.label"] == run(street, "all")["000005.label"]
+
+    @pytest.mark.parametrize(
+        ("options", "scans"),
+        [
+            ({}, 2 * FRAMES),  # fields, and then free space
+            ({"motion": "instances"}, FRAMES),
+            ({"dynamic": "tube"}, 0),
+        ],
+    )
+    def test_progress_counts_every_scan_that_is_read_and_every_frame(self, street, options, scans):
+        for name in ("first", "again"):  # with a pass, and with actors that are kept
+            steps = []
+            carlasc.regrid(
+                street,
+                passing.SPEC,
+                name=name,
+                frames=(4, 6),
+                observe=FromScans(**options),
+                workers=1,
+                progress=lambda *step, steps=steps: steps.append(step),
+            )
+            done, totals = zip(*steps, strict=True)
+            assert set(totals) == {scans + 2}
+            assert list(done) == sorted(set(done)) and (done[0], done[-1]) == (0, scans + 2)
+
+
+def test_the_key_depends_on_what_the_actors_are_made_from(street):
+    (sequence,) = carlasc.open(street).sequences().values()
+    keys = {
+        key_of(ScanFeed(sequence, FromScans(**options)))
+        for options in (
+            {},
+            {"motion": "instances"},
+            {"min_speed_m_s": 0.5},
+            {"max_range_m": 20.0},
+            {"min_range_m": 2.0},
+        )
+    }
+    assert len(keys) == 5
+    assert key_of(ScanFeed(sequence, FromScans())) == key_of(
+        ScanFeed(sequence, FromScans(window=(-2, 2), complete="seen"))
+    )
+    moved = sequence.poses.copy()
+    moved[3, 0, 3] += 0.01
+    assert key_of(ScanFeed(sequence.with_poses(moved), FromScans())) not in keys

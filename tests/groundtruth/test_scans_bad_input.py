@@ -1,0 +1,163 @@
+"""Scans that are wrong in some way: the run goes on where it can, keeps the road, and says what was done."""
+
+import numpy as np
+import pytest
+from helpers import passing
+
+import carlasc
+from carlasc import FromScans
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.storage import FolderSink, layout
+
+FRAMES, FRAME = 21, 10
+GROUND = sorted(CARLA.ground)
+VEHICLE = CARLA.id_of("Vehicle")
+
+
+def make(street, name="x", frames=(FRAME, FRAME + 1), **options):
+    result = carlasc.regrid(street, passing.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=1)
+    assert result.failures == ()
+    return result
+
+
+def grid_of(street, name="x", frame=FRAME):
+    (sequence,) = carlasc.open(street).sequences().values()
+    return sequence.grid(name, frame)
+
+
+def change(street, field, function, frames=range(FRAMES)):
+    """Replace a field of some frames by what a function makes of it."""
+    (sequence,) = carlasc.open(street).sequences().values()
+    writer = FolderSink(street.parents[1]).sequence("Val/Street/cartesian")
+    for frame in frames:
+        writer.write(field, frame, function(frame, sequence.read(field, frame).copy()))
+
+
+def road(grid):
+    return np.isin(grid.labels, GROUND)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    """Return the grid of scans in which nothing is wrong."""
+    street = passing.write_sequence(tmp_path_factory.mktemp("good"), ("labels", "instances"), FRAMES)
+    make(street)
+    return grid_of(street)
+
+
+@pytest.fixture
+def street(tmp_path):
+    return passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+
+
+def swapped(frame, ids):
+    """The passing car and the parked car change their numbers in every second scan."""
+    return np.where(ids == 0, 0, np.where(ids == 9, 4, 9)).astype(np.uint32) if frame % 2 else ids
+
+
+def one_number(frame, ids):
+    return np.full_like(ids, 5)
+
+
+def a_number_per_scan(frame, ids):
+    return np.where(ids > 0, ids + 100 * frame, 0).astype(np.uint32)
+
+
+def noise(frame, ids):
+    return np.random.default_rng(frame).integers(0, 20, len(ids)).astype(np.uint32)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "several"), [(swapped, True), (one_number, True), (a_number_per_scan, False), (noise, True)]
+)
+def test_wrong_numbers_of_actors_do_not_swallow_the_road(street, good, wrong, several):
+    change(street, "instances", wrong)
+    result = make(street)
+    assert any("actors are larger than any vehicle" in note for note in result.notes) == several
+    grid = grid_of(street)
+    kept = road(good) & road(grid)
+    assert kept.sum() > 0.97 * road(good).sum()
+    assert road(grid).sum() < 1.03 * road(good).sum()
+
+
+def test_a_car_that_appears_from_nowhere_is_where_it_is_seen(tmp_path, good):
+    street = passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+
+    def only_from(frame, labels):
+        return labels if frame >= FRAME else np.where(moving(frame), 0, labels).astype(np.uint32)
+
+    def moving(frame):
+        return passing.scan(frame, passing.sensor_pose(frame))[2]
+
+    change(street, "labels", only_from)
+    change(
+        street, "instances", lambda frame, ids: ids if frame >= FRAME else np.where(ids == 9, 0, ids).astype(np.uint32)
+    )
+    make(street, frames=(FRAME - 6, FRAME + 1))
+    here, before = grid_of(street), grid_of(street, frame=FRAME - 6)
+    right = slice(0, 128), slice(64, 84)  # the lane of the passing car
+    assert (here.labels[right] == VEHICLE).sum() > 0.7 * (good.labels[right] == VEHICLE).sum()
+    assert not (before.labels[right] == VEHICLE).any()
+    assert (road(good) & road(here)).sum() > 0.97 * road(good).sum()
+
+
+@pytest.mark.parametrize("fields", [(), ("labels",), ("labels", "instances"), ("labels", "flow")])
+def test_one_scan_alone_gives_what_it_saw(tmp_path, fields):
+    street = passing.write_sequence(tmp_path, fields, frames=1)
+    result = make(street, frames=None)
+    assert result.made == 1
+    assert any("one scan only" in note for note in result.notes)
+    grid = grid_of(street, frame=0)
+    assert grid.known.any() and (grid.labels > 0).any()
+
+
+def test_scans_of_two_a_second_are_merged(tmp_path, good):
+    street = passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+    change_times = street / "cartesian" / layout.TIMES
+    poses_file = street / "cartesian" / layout.POSES
+    poses = layout.decode_poses(poses_file.read_bytes(), "poses.txt")
+    poses[:, 0, 3] *= 100  # 10 m between two scans
+    poses_file.write_bytes(layout.encode_poses(poses))
+    with pytest.raises(FormatError, match="a jump of 100 m/s"):
+        make(street)
+    change_times.write_bytes(layout.encode_times(np.arange(FRAMES) * 0.5))
+    assert make(street).made == 1
+
+
+def test_times_that_fall_are_one_line(street):
+    times = np.arange(FRAMES) * 0.1
+    times[7] = 0.2
+    (street / "cartesian" / layout.TIMES).write_bytes(layout.encode_times(times))
+    with pytest.raises(
+        FormatError, match=r"times.txt: expected increasing times, found 0.6 s and 0.2 s at frames 6 and 7"
+    ):
+        make(street)
+
+
+@pytest.mark.parametrize("motion", ["boxes", "flow"])
+def test_motion_from_a_field_that_is_not_there_is_one_line(street, motion):
+    with pytest.raises(
+        MissingDataError,
+        match=f'cartesian: expected {motion} in the sequence, found instances: use `motion="evidence"`',
+    ) as error:
+        make(street, motion=motion)
+    assert "\n" not in str(error.value)
+
+
+def test_motion_from_numbers_needs_labels(tmp_path):
+    street = passing.write_sequence(tmp_path, ("instances",), 3)
+    with pytest.raises(MissingDataError, match="expected instances in the sequence, found no field that shows motion"):
+        make(street, frames=None, motion="instances")
+
+
+@pytest.mark.parametrize("motion", ["auto", "flow", "evidence", "none"])
+def test_a_tube_takes_no_motion(motion):
+    with pytest.raises(ArgumentError, match='^motion: expected none with dynamic "tube"'):
+        FromScans(dynamic="tube", motion=motion)
+
+
+@pytest.mark.parametrize(("name", "value"), [("motion", "magic"), ("complete", "all"), ("poses", "guess")])
+def test_choices_that_do_not_exist_are_named(name, value):
+    with pytest.raises(ArgumentError, match=f"^{name}: expected one of .*, found '{value}'"):
+        FromScans(**{name: value})
