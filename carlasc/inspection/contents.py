@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.errors import CarlascError
+from carlasc.inspection.evidence import check_evidence
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.storage import layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence
 
 _FASTEST_M_S = 100.0
+_FARTHEST_M = 500.0  # boxes farther from the sensor are in another frame
 
 
 def check_documents(sequence: Sequence) -> Iterator[Finding]:
@@ -86,9 +89,10 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
     if "points" in fields:
         for name, field in layout.SCAN_FIELDS.items():
             if name in fields and name != "points":
-                yield from _compare_frames(sequence, name, "points", "error" if field.per == "point" else "note")
+                incomplete: Severity | None = {"point": "error", "box": None}.get(field.per, "note")
+                yield from _compare_frames(sequence, name, "points", incomplete, incomplete or "warning")
     for grid in sorted({name.rpartition("/")[0] for name in fields if "/" in name}):
-        parts = [part for part in ("labels", "counts", "votes") if f"{grid}/{part}" in fields]
+        parts = [part for part in layout.GRID_FIELDS if f"{grid}/{part}" in fields]
         if "labels" not in parts:
             where = f"{sequence.location}/{grid}"
             yield Finding(
@@ -96,9 +100,9 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
             )
             continue
         for part in parts[1:]:
-            yield from _compare_frames(sequence, f"{grid}/{part}", f"{grid}/labels", "error")
+            yield from _compare_frames(sequence, f"{grid}/{part}", f"{grid}/labels", "error", "error")
         if "points" in fields:
-            yield from _compare_frames(sequence, f"{grid}/labels", "points", "note", orphans="warning")
+            yield from _compare_frames(sequence, f"{grid}/labels", "points", "note", "warning")
 
 
 def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Iterator[Finding]:
@@ -138,11 +142,14 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
             yield from _check_numbers(sequence, name, arrays[name], where)
         elif kind == "class":
             yield from _check_classes(sequence, arrays[name], sequence.metadata.classes, where)
+        elif kind == "boxes":
+            yield from _check_boxes(sequence, arrays[name], where)
         elif kind == "picture" and arrays[name][:2].tobytes() != b"\xff\xd8":
             yield Finding("warning", name, sequence.path, where, "a JPEG picture", "other bytes")
     for grid in sequence.grids:
         if f"{grid}/labels" in arrays:
             yield from _check_grid(sequence, grid, frame, arrays)
+        yield from check_evidence(sequence, grid, frame, arrays, _classes_of(sequence, grid))
 
 
 def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
@@ -153,6 +160,20 @@ def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: st
     elif name == "flow" and len(rows) and float(np.abs(array).max()) > _FASTEST_M_S:
         found = f"{float(np.abs(array).max()):.0f} m/s"
         yield Finding("warning", "flow", sequence.path, where, f"velocities below {_FASTEST_M_S:.0f} m/s", found)
+
+
+def _check_boxes(sequence: Sequence, table: NDArray[Any], where: str) -> Iterator[Finding]:
+    try:
+        boxes = Boxes.from_table(table, where)
+    except CarlascError as error:
+        yield Finding.from_error("boxes", sequence.path, where, error)
+        return
+    yield from _check_classes(sequence, boxes.labels, sequence.metadata.classes, where)
+    far = np.flatnonzero(np.linalg.norm(boxes.centers, axis=1) > _FARTHEST_M)
+    if len(far):
+        found = f"track {boxes.tracks[far[0]]} at {boxes.centers[far[0]].round(1).tolist()}, and {len(far) - 1} others"
+        advice = "boxes are in the frame of the sensor, not in the world's"
+        yield Finding("warning", "boxes", sequence.path, where, f"boxes within {_FARTHEST_M:.0f} m", found, advice)
 
 
 def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
@@ -200,23 +221,22 @@ def _check_classes(
 
 
 def _compare_frames(
-    sequence: Sequence, field: str, reference: str, severity: Severity, orphans: Severity | None = None
+    sequence: Sequence, field: str, reference: str, incomplete: Severity | None, orphans: Severity
 ) -> Iterator[Finding]:
     """Compare the frames of a field with those of the field that it belongs to.
 
-    Missing frames are findings of `severity`; frames that the other field lacks are of severity `orphans`, by default the same.
+    Missing frames are findings of severity `incomplete`, and no findings if it is None (a frame without boxes was not annotated).
+    Frames that the other field lacks are findings of severity `orphans`.
     """
     have, wanted = _frame_set(sequence, field), _frame_set(sequence, reference)
     missing, extra = sorted(wanted - have), sorted(have - wanted)
     where = f"{sequence.location}/{layout.field_named(field).folder}"
-    if missing:
+    if missing and incomplete is not None:
         expected = f"{field} for each of the {len(wanted)} frames of {reference}"
-        yield Finding(severity, "frame-counts", sequence.path, where, expected, f"none for {_first_of(missing)}")
+        yield Finding(incomplete, "frame-counts", sequence.path, where, expected, f"none for {_first_of(missing)}")
     if extra:
         found = f"{len(extra)} more: {_first_of(extra)}"
-        yield Finding(
-            orphans or severity, "frame-counts", sequence.path, where, f"only the frames of {reference}", found
-        )
+        yield Finding(orphans, "frame-counts", sequence.path, where, f"only the frames of {reference}", found)
 
 
 def _first_of(frames: list[int]) -> str:

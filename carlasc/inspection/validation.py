@@ -16,6 +16,7 @@ from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
+from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
 from carlasc.storage import as_source, layout
@@ -113,11 +114,15 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
         found.extend(check_shapes(sequence, frame, with_grids=described))
         yield
     evidence: dict[str, GridEvidence] = {}
+    freshness = Freshness(sequence) if described else None
     for frame in plan.read:
-        if described:
+        if freshness is not None:
             found.extend(check_values(sequence, frame))
             _measure_grids(sequence, frame, evidence)
+            freshness.compare(frame)
         yield
+    if freshness is not None:
+        found.extend(freshness.findings())
     diagnoses = {name: grid.diagnose() for name, grid in evidence.items()}
     for name, diagnosis in diagnoses.items():
         found.extend(_judge_grid(sequence, name, diagnosis))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
 
-from carlasc.core.geometry import rotation_z
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.trajectory import check_poses, check_times
@@ -205,3 +207,48 @@ def test_times_increase(folder, times, text):
 def test_times_have_a_line_per_frame(folder):
     (folder / layout.TIMES).write_bytes(layout.encode_times(np.array([0.0])))
     assert "expected 2 lines, up to frame 1, found 1 lines" in findings(check_times, folder)[0][2]
+
+
+def write_boxes(folder, frame, **changes):
+    """Write two boxes of a frame, with other values in some columns of the second one."""
+    poses = np.stack([translation((5, 0, -1)), translation((9, 3, -1))])
+    tracks, labels = np.array([1, 2], np.uint32), np.array([10, 4], np.uint32)
+    table = Boxes.from_poses(tracks, labels, poses, np.ones((2, 3))).to_table()
+    for name, value in changes.items():
+        table[name][1] = value
+    FolderSink(folder.parent).sequence("cartesian").write("boxes", frame, table)
+
+
+def test_frames_without_boxes_were_not_annotated_and_are_no_finding(folder):
+    write_boxes(folder, 1)
+    assert findings(check_frames, folder) == []
+    assert findings(check_values, folder, 1) == []
+    write_boxes(folder, 7)
+    ((severity, check, text),) = findings(check_frames, folder)
+    assert (severity, check) == ("warning", "frame-counts") and "boxes" in text and "000007" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "severity", "check", "message"),
+    [
+        ({"x": np.nan}, "error", "boxes", r"boxes/000000.bin.*finite numbers.*in box 1 \(track 2\)"),
+        ({"height": 0}, "error", "boxes", "positive lengths, widths and heights"),
+        ({"qz": 0.5}, "error", "boxes", "a quaternion of length 1"),
+        ({"track": 1}, "error", "boxes", "one box per track in a frame"),
+        ({"label": 77}, "error", "class-ids", r"class ids of carla, found 77 \(1 times\)"),
+        ({"y": 501}, "warning", "boxes", r"boxes within 500 m, found track 2 at \[9.0, 501.0, -1.0\]"),
+    ],
+)
+def test_boxes_that_are_wrong_are_found(folder, changes, severity, check, message):
+    write_boxes(folder, 0, **changes)
+    ((found, name, text),) = findings(check_values, folder, 0)
+    assert (found, name) == (severity, check)
+    assert re.search(message, text), text
+
+
+def test_a_file_of_boxes_cut_short_is_an_error(folder):
+    write_boxes(folder, 0)
+    file = folder / "boxes/000000.bin"
+    file.write_bytes(file.read_bytes()[:-1])
+    ((severity, check, text),) = findings(check_shapes, folder, 0)
+    assert (severity, check) == ("error", "file-size") and "a multiple of 89 bytes" in text

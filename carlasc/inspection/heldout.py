@@ -1,0 +1,218 @@
+"""Held-out rays, a score that needs no ground truth: scans are left out, and compared with the grids that the others give."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.geometry import invert
+from carlasc.core.grids import GridSpec
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError
+from carlasc.groundtruth import FrameFailure, FromScans, Voting
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.from_scans.others import feed_without, grid_from_others
+from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
+from carlasc.groundtruth.inputs import Plan, Steps
+from carlasc.inspection.heldout_scores import HeldOutScores
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage import layout
+from carlasc.storage.protocol import Sequence, Source
+
+EVERY = 10
+"""Every so many scans, one is left out by default."""
+_NEARLY_WHOLE = 0.8  # share of the scans of a whole window that the window of a measured frame has
+
+
+@dataclass(frozen=True)
+class HoldoutResult:
+    """What `holdout` measured.
+
+    Attributes:
+        location: what was measured.
+        spec: geometry of the grids.
+        every: one of so many scans was left out.
+        sequences: the scores of each sequence, by its path.
+        failures: frames that could not be measured.
+        elapsed_s: duration, in seconds.
+    """
+
+    location: str
+    spec: GridSpec
+    every: int
+    sequences: Mapping[str, HeldOutScores]
+    failures: tuple[FrameFailure, ...] = ()
+    elapsed_s: float = field(default=0.0, compare=False)
+
+    @property
+    def total(self) -> HeldOutScores | None:
+        """The scores of all sequences together; None if their class tables differ."""
+        scores = list(self.sequences.values())
+        if any(other.classes != scores[0].classes for other in scores):
+            return None
+        return reduce(HeldOutScores.merge, scores)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        total = self.total
+        return {
+            "location": self.location,
+            "grid": asdict(self.spec),
+            "every": self.every,
+            "total": None if total is None else total.to_dict(),
+            "sequences": {path: scores.to_dict() for path, scores in self.sequences.items()},
+            "failures": [asdict(failure) for failure in self.failures],
+            "elapsed_s": self.elapsed_s,
+        }
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One frame to measure. It pickles into a worker."""
+
+    path: str
+    feed: ScanFeed
+    actors: Actors
+    whole: Sequence
+    frame: int
+    plan: Plan
+
+
+def holdout(
+    source: str | os.PathLike[str] | Source,
+    spec: GridSpec | None = None,
+    *,
+    observe: FromScans = FromScans(),  # noqa: B008 (frozen)
+    voting: Voting = Voting(),  # noqa: B008 (frozen)
+    every: int = EVERY,
+    frames: Frames = None,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> HoldoutResult:
+    """Leave every N-th scan out, make the grids at these frames from the other scans, and follow the rays of the scans through them.
+
+    A scan that is left out neither votes nor shows how actors move, in any grid. Frames at the ends of a drive, whose window has less than
+    80 % of the scans of a whole one, are not measured, unless all windows are so. A frame that cannot be read is reported in the result.
+    Nothing is written.
+
+    Args:
+        source: anything that `carlasc.open` takes; its sequences have scans and poses, labels or not.
+        spec: geometry of the grids, Cartesian; None for the published one.
+        observe: how scans are merged.
+        voting: how votes are counted.
+        every: one of so many scans is left out.
+        frames: range of the frames that may be left out; None for all.
+        workers: number of frames that are measured in parallel; None for one per core. With an executor: the number of its workers.
+        executor: runs the work instead of processes of our own; it is not shut down.
+        progress: called with (steps done, steps in total).
+
+    Raises:
+        ArgumentError: `every` is less than 2, or the grid is cylindrical.
+        MissingDataError: there is no sequence with scans, no poses, or no frame.
+        FormatError: poses or times are not valid.
+    """
+    start, spec = time.perf_counter(), spec or GridSpec.published()
+    if every < 2:
+        raise ArgumentError("every", expected="2 or more", found=str(every))
+    if spec.coordinates != "cartesian":
+        raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
+    plan = Plan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
+    inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
+    drives = [_Drive.of(sequence, every) for sequence in inputs]
+    steps = Steps(progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
+    tasks = [task for drive in drives for task in drive.tasks(count_workers(workers), executor, steps)]
+    scores: dict[str, HeldOutScores] = {}
+    failures = []
+    with closing(run_all(_run_task, tasks, workers=workers, executor=executor)) as results:
+        for task, outcome in zip(tasks, results, strict=True):
+            if isinstance(outcome, str):
+                failures.append(FrameFailure(task.whole.location, task.frame, outcome))
+            else:
+                scores[task.path] = scores[task.path].merge(outcome) if task.path in scores else outcome
+            steps(1)
+    for sequence in inputs:
+        scores.setdefault(sequence.path, HeldOutScores.empty(sequence.metadata.classes))
+    location = source.location if isinstance(source, Source) else str(source)
+    return HoldoutResult(location, spec, every, scores, tuple(failures), time.perf_counter() - start)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """One sequence: which scans are left out, and at which of their frames the rays are followed."""
+
+    inputs: ScanSequence
+    feed: ScanFeed
+    frames: tuple[int, ...]
+
+    @classmethod
+    def of(cls, inputs: ScanSequence, every: int) -> _Drive:
+        """Choose the scans to leave out."""
+        whole = inputs.feed
+        hidden = whole.frames[every // 2 :: every].tolist() or whole.frames[-1:].tolist()
+        enough = _NEARLY_WHOLE * max(len(whole.window_of(int(frame))) for frame in whole.frames)
+        chosen = [frame for frame in hidden if frame in inputs.plan.frames]
+        if not chosen:
+            raise MissingDataError(
+                inputs.location, expected=f"frames to leave out in {inputs.plan.frames}", found=f"only {hidden}"
+            )
+        measured = [frame for frame in chosen if len(whole.window_of(frame)) >= enough] or chosen
+        return cls(inputs, feed_without(inputs, hidden), tuple(measured))
+
+    @property
+    def steps_before(self) -> int:
+        """Number of scans that the pass that finds the actors reads."""
+        return self.feed.reads
+
+    def tasks(self, workers: int, executor: Executor | None, progress: Callable[[int], None]) -> list[_Task]:
+        """Find the actors in the scans that are left, and return a task for each frame to measure."""
+        feed, inputs = self.feed, self.inputs
+        actors = Actors()
+        if feed.needs_actors:
+            actors = find_actors(feed, workers=workers, executor=executor, progress=progress)
+        first, last = feed.options.window
+        return [
+            _Task(inputs.path, feed, actors.between(f + first, f + last), inputs.feed.sequence, f, inputs.plan)
+            for f in self.frames
+        ]
+
+
+def _run_task(task: _Task) -> HeldOutScores | str:
+    """Measure one frame, in a worker; return why it failed if it did."""
+    try:
+        return _measure(task)
+    except (CarlascError, OSError) as error:
+        return str(error)
+
+
+def _measure(task: _Task) -> HeldOutScores:
+    feed = task.feed
+    window = [other for other in feed.window_of(task.frame) if other != task.frame]
+    if not window:
+        raise MissingDataError(
+            f"{task.whole.location}: frame {task.frame}",
+            expected="other scans in its window",
+            found="none",
+            advice="leave out fewer scans, or choose another stride",
+        )
+    scan = task.whole.scan(task.frame, ("labels",))
+    distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    keep = (distance >= feed.min_range_m) & (distance <= feed.max_range_m)
+    if scan.labels is not None:
+        feed.classes.check(scan.labels, f"{task.whole.location}: labels of frame {task.frame}")
+        keep &= scan.labels > 0
+    grid = grid_from_others(feed, task.actors, task.frame, task.plan)
+    here = invert(feed.pose(task.frame))
+    others = [here @ feed.pose(other) for other in window]
+    labels = None if scan.labels is None else scan.labels[keep]
+    return HeldOutScores.of(grid, feed.classes, scan.points[keep], labels, others)

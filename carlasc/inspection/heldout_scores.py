@@ -1,0 +1,249 @@
+"""How well grids predict scans that they were made without: counts of rays by class and distance, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.metrics.casting import follow_rays
+
+BANDS_M = (0.0, 10.0, 20.0, 30.0, np.inf)
+"""Bounds of the distance bands, metres."""
+VEHICLE_M = ((-2.2, -0.75, -1.2), (2.2, 0.75, 0.0))
+"""Lower and upper corner of the space that the recording vehicle certainly fills, in the frame of its sensor (x forward)."""
+
+_RETURNS, _FREE, _UNKNOWN, _PASSED, _PASSED_OBJECT, _MISSED = range(6)
+_SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is no ground
+_STEP_M, _STEPS = 0.02, 500  # histogram of the errors of the first hit; the last bin holds all larger ones
+
+
+@dataclass(frozen=True)
+class RayShares:
+    """What became of some held-out rays. Shares are of the returns inside the grid; None where nothing could be measured.
+
+    Attributes:
+        returns: number of returns.
+        free: share of returns that lie in a voxel called free.
+        unknown: share of returns that lie in an unknown voxel.
+        occupied: share of returns that lie in an occupied voxel.
+        passed: share of rays that pass through an occupied voxel before their return; the voxel of the return and its 26 neighbours
+            do not count.
+        passed_object: the same, where only voxels of classes other than ground count. Without labels, the lowest occupied voxel of each
+            column and the one above it are taken for ground.
+        missed: share of rays that meet no occupied voxel, neither before nor behind their return.
+        error_median_m: median over the other rays of |first hit - measured range|, metres; the first hit is in the middle of the ray's
+            path through its first occupied voxel.
+        error_90_m: 90 % of these errors are at most this large, metres.
+    """
+
+    returns: int
+    free: float | None
+    unknown: float | None
+    occupied: float | None
+    passed: float | None
+    passed_object: float | None
+    missed: float | None
+    error_median_m: float | None
+    error_90_m: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutScores:
+    """The held-out rays of some frames, counted; `merge` adds those of other frames.
+
+    Attributes:
+        classes: class table of the scans.
+        labelled: whether the scans have labels.
+        frames: number of frames that were left out and measured.
+        counts: (K, B, 6) int64 rays by class and band: returns, in free voxels, in unknown ones, passed, passed an object, missed.
+        errors: (K, B, E) int64 histogram of the errors of the first hit.
+        swept_voxels: number of voxels that the vehicle itself drove through in the other frames of the windows.
+        swept_known: how many of them are known.
+        swept_occupied: how many of them are occupied.
+    """
+
+    classes: ClassTable
+    labelled: bool
+    frames: int
+    counts: NDArray[np.int64]
+    errors: NDArray[np.int64]
+    swept_voxels: int = 0
+    swept_known: int = 0
+    swept_occupied: int = 0
+
+    @classmethod
+    def empty(cls, classes: ClassTable, *, labelled: bool = True) -> HeldOutScores:
+        """Return the scores of no frame."""
+        shape = (classes.num_channels, len(BANDS_M) - 1)
+        return cls(classes, labelled, 0, np.zeros((*shape, 6), np.int64), np.zeros((*shape, _STEPS + 1), np.int64))
+
+    @classmethod
+    def of(
+        cls,
+        grid: Grid,
+        classes: ClassTable,
+        points: NDArray[np.floating],
+        labels: NDArray[np.integer] | None,
+        grid_T_vehicles: Iterable[Transform] = (),
+    ) -> HeldOutScores:
+        """Measure one frame.
+
+        Args:
+            grid: the grid at the frame, made without its scan; Cartesian, in the sensor frame of the scan.
+            classes: class table of grid and labels.
+            points: (N, 3) metres, the scan, sensor frame.
+            labels: (N,) class ids; None if the scan has no labels.
+            grid_T_vehicles: (4, 4) poses of the sensor in the other frames of the window, in the frame of the grid.
+
+        Raises:
+            ArgumentError: the grid is cylindrical.
+        """
+        spec, occupied = grid.spec, grid.known & (grid.labels != 0)
+        ground = _lowest(occupied) if labels is None else np.isin(grid.labels, sorted(classes.ground))
+        solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
+        voxels = spec.flat_index(points)
+        inside = (voxels >= 0) & np.any(points != 0, axis=1)
+        points, voxels = points[inside].astype(np.float64), voxels[inside]
+        kind = np.full(len(points), classes.geometry_id) if labels is None else labels[inside].astype(np.int64)
+        first, passed = follow_rays(solid, spec, np.zeros(3), points)
+        ranges = np.linalg.norm(points, axis=1)
+        known, hit = grid.known.reshape(-1)[voxels], occupied.reshape(-1)[voxels]
+        properties = np.zeros((len(points), 6), np.bool_)
+        properties[:, _RETURNS], properties[:, _FREE], properties[:, _UNKNOWN] = True, known & ~hit, ~known
+        properties[:, _PASSED], properties[:, _PASSED_OBJECT] = passed != 0, passed & _OBJECT != 0
+        properties[:, _MISSED] = missed = np.isinf(first)
+        scores = cls.empty(classes, labelled=labels is not None)
+        band = np.searchsorted(BANDS_M, ranges, side="right") - 1
+        for column in range(6):
+            chosen = properties[:, column]
+            np.add.at(scores.counts[:, :, column], (kind[chosen], band[chosen]), 1)
+        step = np.minimum(np.abs(first - ranges)[~missed] / _STEP_M, _STEPS).astype(np.int64)
+        np.add.at(scores.errors, (kind[~missed], band[~missed], step), 1)
+        swept = swept_voxels(spec, grid_T_vehicles)
+        known_swept, hit_swept = int((swept & grid.known).sum()), int((swept & occupied).sum())
+        return replace(
+            scores, frames=1, swept_voxels=int(swept.sum()), swept_known=known_swept, swept_occupied=hit_swept
+        )
+
+    def merge(self, other: HeldOutScores) -> HeldOutScores:
+        """Return the scores of the frames of both, which have the same class table."""
+        return HeldOutScores(
+            self.classes,
+            self.labelled and other.labelled,
+            self.frames + other.frames,
+            self.counts + other.counts,
+            self.errors + other.errors,
+            self.swept_voxels + other.swept_voxels,
+            self.swept_known + other.swept_known,
+            self.swept_occupied + other.swept_occupied,
+        )
+
+    @property
+    def swept_share(self) -> float | None:
+        """Share of the voxels that the vehicle itself drove through in the other frames that are occupied; None if there are none."""
+        return self.swept_occupied / self.swept_voxels if self.swept_voxels else None
+
+    @property
+    def all(self) -> RayShares:
+        """All rays."""
+        return self._shares(self.counts.sum(axis=(0, 1)), self.errors.sum(axis=(0, 1)))
+
+    def by_class(self) -> dict[str, RayShares]:
+        """Return the rays of each class that occurs, by its name; empty if the scans have no labels."""
+        if not self.labelled:
+            return {}
+        rows = {self.classes.names.get(i, str(i)): i for i in np.flatnonzero(self.counts[:, :, 0].any(axis=1)).tolist()}
+        return {name: self._shares(self.counts[i].sum(axis=0), self.errors[i].sum(axis=0)) for name, i in rows.items()}
+
+    def by_distance(self) -> dict[str, RayShares]:
+        """Return the rays of each band of distances, by its name, such as "10-20 m"."""
+        return {
+            name: self._shares(self.counts[:, i].sum(axis=0), self.errors[:, i].sum(axis=0))
+            for i, name in enumerate(_band_names())
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all figures as plain values for JSON."""
+        return {
+            "frames": self.frames,
+            "rays": vars(self.all),
+            "by_class": {name: vars(shares) for name, shares in self.by_class().items()},
+            "by_distance": {name: vars(shares) for name, shares in self.by_distance().items()},
+            "swept": {
+                "voxels": self.swept_voxels,
+                "known": self.swept_known,
+                "occupied": self.swept_occupied,
+                "occupied_share": self.swept_share,
+            },
+        }
+
+    def _shares(self, counts: NDArray[np.int64], errors: NDArray[np.int64]) -> RayShares:
+        total = int(counts[_RETURNS])
+
+        def share(column: int) -> float | None:
+            return float(counts[column]) / total if total else None
+
+        occupied = float(total - counts[_FREE] - counts[_UNKNOWN]) / total if total else None
+        return RayShares(
+            total,
+            share(_FREE),
+            share(_UNKNOWN),
+            occupied,
+            share(_PASSED),
+            share(_PASSED_OBJECT),
+            share(_MISSED),
+            _quantile(errors, 0.5),
+            _quantile(errors, 0.9),
+        )
+
+
+def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArray[np.bool_]:
+    """Return (X, Y, Z) bool: the voxels whose centre lies in the space that the vehicle fills at any of some poses.
+
+    Args:
+        spec: geometry of the grid, Cartesian.
+        grid_T_vehicles: (4, 4) poses of the vehicle's sensor in the frame of the grid, x forward.
+    """
+    swept = np.zeros(spec.size, np.bool_)
+    lower, upper = np.array(VEHICLE_M)
+    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(3, -1).T
+    for pose in grid_T_vehicles:
+        placed = (transform_points(pose, corners) - np.array(spec.lower)) / spec.voxel_size
+        first = np.clip(np.floor(placed.min(axis=0)).astype(int), 0, spec.size)
+        stop = np.clip(np.ceil(placed.max(axis=0)).astype(int), 0, spec.size)
+        cells = np.stack(np.meshgrid(*map(np.arange, first, stop), indexing="ij"), axis=-1).reshape(-1, 3)
+        centers = np.array(spec.lower) + (cells + 0.5) * spec.voxel_size
+        body = transform_points(invert(pose), centers)
+        i, j, k = cells[((body > lower) & (body < upper)).all(axis=1)].T
+        swept[i, j, k] = True
+    return swept
+
+
+def _lowest(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (X, Y, Z) bool: the lowest occupied voxel of each column, and the one above it."""
+    lowest = occupied & (occupied.cumsum(axis=2) == 1)
+    above = np.zeros_like(lowest)
+    above[:, :, 1:] = lowest[:, :, :-1]
+    return lowest | above
+
+
+def _quantile(errors: NDArray[np.int64], share: float) -> float | None:
+    """Return a quantile of a histogram of errors, in metres, to the width of its bins; 10 m stands for all larger ones."""
+    total = int(errors.sum())
+    if not total:
+        return None
+    middle = int(np.searchsorted(errors.cumsum(), share * total)) + 0.5
+    return round(min(middle, _STEPS) * _STEP_M, 3)
+
+
+def _band_names() -> Iterator[str]:
+    for low, high in pairwise(BANDS_M):
+        yield f"{low:.0f}-{high:.0f} m" if np.isfinite(high) else f"{low:.0f} m and more"

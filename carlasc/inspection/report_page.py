@@ -1,0 +1,225 @@
+"""Reports as one page for a browser: a file that loads nothing else, with charts in SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from carlasc.groundtruth.reporting.actors import Actor
+from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
+from carlasc.inspection.reports import ReportResult
+from carlasc.storage.files import write_atomic
+from carlasc.storage.resuming import RECORD
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 62em; padding: 0 1em; color: #1c2733; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2.2em; border-bottom: 1px solid #c9d2db; } h3 { font-size: 1em; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; } td, th { padding: .15em .8em .15em 0; text-align: left; }
+th { font-weight: 600; } td.n, th.n { text-align: right; } svg { display: block; margin: .5em 0; max-width: 100%; }
+.note { color: #5b6875; } code { font-size: .9em; } details { margin: .6em 0; }
+"""
+_BAR, _ROW = "#3566a8", 18  # colour of a bar, and the height of a row in pixels
+
+
+def write_report_page(result: ReportResult, out: str | Path) -> None:
+    """Write reports as one self-contained HTML page.
+
+    Args:
+        result: as `report` returns it.
+        out: the file.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    parts = [_section(name, report) for name, report in result.reports.items()]
+    title = f"Ground truth of {escape(result.location)}"
+    page = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
+        f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>\n"
+        f"{''.join(parts)}</body></html>\n"
+    )
+    write_atomic(Path(out), page.encode())
+
+
+def describe(report: Report) -> list[tuple[str, str]]:
+    """Return what a report says, as pairs of a name and a sentence or figure."""
+    coverage, convergence, actors = report.coverage, report.convergence, report.actors
+    frames = report.frames
+    span = f" ({frames[0]} to {frames[-1]})" if frames else ""
+    rows = [
+        ("frames", f"{len(frames)}{span}"),
+        ("known", f"{coverage.known_share:.1%} of the voxels"),
+        ("occupied", f"{coverage.occupied_share:.1%} of the known voxels"),
+    ]
+    if coverage.mean_votes is not None:
+        rows.append(("votes", f"{coverage.mean_votes:.1f} for each known voxel, on average"))
+    if convergence is not None:
+        changed = f"{convergence.changed_share:.2%} of the known voxels change their label if {LEFT_OUT:.0%} of the scans are left out"
+        rows.append(("convergence", f"{changed} ({convergence.frames} frames)"))
+    if actors is not None:
+        rows.append(("actors", _count(actors)))
+    if report.inferred_share is not None:
+        rows.append(("inferred", f"{report.inferred_share:.1%} of the known voxels"))
+    if report.holdout is not None:
+        rows.append(("held-out rays", _held_out(report.holdout)))
+    settings = report.settings.get(RECORD)
+    if isinstance(settings, dict):
+        rows.append(("settings", ", ".join(f"{name} {value}" for name, value in settings.items())))
+    rows.append(("versions", ", ".join(f"{name} {value}" for name, value in report.versions.items())))
+    return rows
+
+
+def _count(actors: Sequence[Actor]) -> str:
+    if not actors:
+        return "none that moves"
+    labels = [actor.label for actor in actors]
+    kinds = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(sorted(labels)))
+    residuals = sorted(actor.residual_m for actor in actors if actor.residual_m is not None)
+    middle = f"; the median residual is {residuals[len(residuals) // 2]:.2f} m" if residuals else ""
+    return f"{len(actors)} that move ({kinds}){middle}"
+
+
+def _held_out(values: Mapping[str, Any]) -> str:
+    rays, swept = values["rays"], values["swept"]["occupied_share"]
+    if not rays["returns"]:
+        return "none"
+    text = f"{rays['returns']} returns: {rays['free']:.2%} in free voxels, {rays['unknown']:.2%} in unknown ones"
+    text += f"; {rays['passed_object']:.2%} pass an object before"
+    return text if swept is None else f"{text}; {swept:.2%} of the vehicle's own path is occupied"
+
+
+def _section(name: str, report: Report) -> str:
+    coverage = report.coverage
+    classes = sorted(((label, count) for label, count in coverage.classes.items()), key=lambda pair: -pair[1])
+    size = " x ".join(f"{float(cells):g}" for cells in report.settings.get("grid_size", ()))
+    parts = [
+        f"<h2>{escape(name)}</h2>",
+        f'<p class="note">{escape(str(report.settings.get("coordinates", "")))} grid of {escape(size)} voxels</p>',
+        _table([], [[label, text] for label, text in describe(report)]),
+        "<h3>Known voxels by class</h3>",
+        '<p class="note">The length of a bar is the square root of the share.</p>',
+        _bars([(label, count / max(coverage.known, 1)) for label, count in classes]),
+    ]
+    if coverage.votes:
+        bins = [(_bin_name(power), count / max(coverage.known, 1)) for power, count in enumerate(coverage.votes)]
+        parts += ["<h3>Known voxels by their number of votes</h3>", _bars(bins)]
+    if report.holdout is not None and report.holdout["by_distance"]:
+        parts += ["<h3>Held-out rays</h3>", _held_out_table(report.holdout)]
+    if report.actors:
+        parts += [
+            "<h3>Moving actors, and the frames in which they are seen</h3>",
+            _timeline(report.actors, report.frames),
+        ]
+        parts.append(_actor_table(report.actors))
+    digests = [[field, digest.all] for field, digest in report.digests.items()]
+    digests += [[field, digest.digest] for field, digest in report.documents.items()]
+    parts.append(f"<details><summary>Digests (BLAKE2b)</summary>{_table(['file', 'digest'], digests)}</details>")
+    return "\n".join(parts)
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[object]], *, figures: bool = False) -> str:
+    """Return a table; with `figures`, all columns but the first hold numbers."""
+
+    def line(cells: Sequence[object], tag: str) -> str:
+        parts = []
+        for column, cell in enumerate(cells):
+            kind = ' class="n"' if figures and column else ""
+            parts.append(f"<{tag}{kind}>{'' if cell is None else escape(str(cell))}</{tag}>")
+        return f"<tr>{''.join(parts)}</tr>"
+
+    return f"<table>{line(header, 'th') if header else ''}{''.join(line(row, 'td') for row in rows)}</table>"
+
+
+def _bars(rows: Sequence[tuple[str, float]]) -> str:
+    """Return horizontal bars of shares, on a square-root scale, so that small shares can be seen."""
+    lines = []
+    for row, (label, share) in enumerate(rows):
+        y, width = row * _ROW, 520 * share**0.5
+        lines.append(f'<text x="0" y="{y + 13}">{escape(label)}</text>')
+        lines.append(f'<rect x="130" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}"/>')
+        lines.append(f'<text x="{136 + width:.1f}" y="{y + 13}">{share:.2%}</text>')
+    return _svg(720, len(rows) * _ROW, lines)
+
+
+def _timeline(actors: Sequence[Actor], frames: Sequence[int]) -> str:
+    """Return one line per actor, from its first to its last sighting; it is the paler the more frames in between do not show it."""
+    first = min([*(actor.first for actor in actors), *frames[:1]])
+    last = max([*(actor.last for actor in actors), *frames[-1:]])
+    scale = 560 / max(last - first, 1)
+    lines = []
+    for row, actor in enumerate(actors):
+        y, x, width = row * _ROW, 130 + (actor.first - first) * scale, max((actor.last - actor.first) * scale, 2)
+        name = f"{actor.label} {actor.instance or ''}".strip()
+        lines.append(f'<text x="0" y="{y + 13}">{escape(name)}</text>')
+        share = actor.sightings / (actor.last - actor.first + 1)
+        bar = (
+            f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" fill-opacity="{share:.2f}"/>'
+        )
+        lines.append(bar)
+    axis = len(actors) * _ROW + 14
+    lines += [f'<text x="130" y="{axis}">{first}</text>', f'<text x="680" y="{axis}">{last}</text>']
+    return _svg(720, axis + 6, lines)
+
+
+def _svg(width: int, height: int, lines: Sequence[str]) -> str:
+    return (
+        f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-size="12">{"".join(lines)}</svg>'
+    )
+
+
+def _actor_table(actors: Sequence[Actor]) -> str:
+    header = [
+        "class",
+        "instance",
+        "first",
+        "last",
+        "sightings",
+        "points",
+        "m/s",
+        "size, m",
+        "residual, m",
+        "standing, m",
+    ]
+    rows = [
+        [
+            actor.label,
+            actor.instance or None,
+            actor.first,
+            actor.last,
+            actor.sightings,
+            actor.points,
+            f"{actor.speed_m_s:.1f}",
+            " x ".join(f"{side:.1f}" for side in actor.size_m),
+            _metres(actor.residual_m),
+            _metres(actor.residual_standing_m),
+        ]
+        for actor in actors
+    ]
+    return f"<details><summary>Table of the actors</summary>{_table(header, rows, figures=True)}</details>"
+
+
+def _held_out_table(values: Mapping[str, Any]) -> str:
+    shares = ("free", "unknown", "occupied", "passed", "passed_object", "missed")
+    header = ["rays", "returns", *(name.replace("_", " ") for name in shares), "error, m", "90%, m"]
+    rows = [
+        [
+            label,
+            rays["returns"],
+            *("" if rays[name] is None else f"{rays[name]:.2%}" for name in shares),
+            _metres(rays["error_median_m"]),
+            _metres(rays["error_90_m"]),
+        ]
+        for label, rays in {"all": values["rays"], **values["by_distance"], **values["by_class"]}.items()
+    ]
+    return _table(header, rows, figures=True)
+
+
+def _metres(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _bin_name(power: int) -> str:
+    return "1" if power == 0 else f"{2**power} to {2 ** (power + 1) - 1}"

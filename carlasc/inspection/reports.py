@@ -1,0 +1,287 @@
+"""The reports of grids: read where a run left them, or made from the files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from carlasc.core.frames import FrameRange
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError
+from carlasc.groundtruth import FrameFailure, FromScans, Voting
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
+from carlasc.groundtruth.inputs import Plan, Steps, without_caches
+from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
+from carlasc.groundtruth.reporting.report import Report
+from carlasc.inspection.heldout import EVERY
+from carlasc.inspection.heldout import holdout as leave_out
+from carlasc.running.processes import count_workers, run_all
+from carlasc.storage import as_source, layout
+from carlasc.storage.folders.folder import FolderSequence, FolderWriter
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.resuming import RECORD, read_record
+
+_MOST_LEFT_OUT = 20  # scans that are left out of a long sequence for its held-out scores
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """The reports of a data set.
+
+    Attributes:
+        location: what was looked at.
+        reports: the report of each grid, by the path of its sequence and the name of the grid: "Val/Town/cartesian/evaluation".
+        failures: frames that could not be read, for reports that were made.
+    """
+
+    location: str
+    reports: Mapping[str, Report]
+    failures: tuple[FrameFailure, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        return {
+            "location": self.location,
+            "reports": {name: report.to_dict() for name, report in self.reports.items()},
+            "failures": [asdict(failure) for failure in self.failures],
+        }
+
+
+def report(
+    source: str | os.PathLike[str] | Source,
+    *,
+    grid: str | None = None,
+    remake: bool = False,
+    holdout: bool = False,
+    save: bool = False,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ReportResult:
+    """Return the report of each grid of a data set: the one that its run left, or one that is made from the files.
+
+    A report that is made from files has the same content as that of the run, if the scans that the grids were made from lie beside them.
+
+    Args:
+        source: anything that `carlasc.open` takes.
+        grid: name of one grid; None for all.
+        remake: make the reports from the files, also where there are some.
+        holdout: add held-out scores (see `carlasc.inspection.holdout`) where there are none, for Cartesian grids that were made from scans.
+        save: write the reports beside their grids: folders only, and only grids that carlasc made.
+        workers: number of frames that are read in parallel; None for one per core. With an executor: the number of its workers.
+        executor: runs the work instead of processes of our own; it is not shut down.
+        progress: called with (steps done, steps in total), for reports that are made.
+
+    Raises:
+        MissingDataError: there is no data set, or no grid of this name.
+        FormatError: a report is damaged; `remake` makes it again.
+        ArgumentError: `save` with a source that is no folder.
+        ConflictError: `save` with a grid that carlasc did not make.
+    """
+    opened = as_source(source)
+    grids = [
+        (path, sequence, name)
+        for path, sequence in opened.sequences().items()
+        for name in sequence.grids
+        if grid in (None, name) and sequence.predicted_by(name) is None
+    ]
+    if not grids:
+        raise MissingDataError(opened.location, expected="a grid" if grid is None else f"the grid {grid}", found="none")
+    if save:
+        for _, sequence, name in grids:
+            _check_writable(sequence, name)
+    makers = [_Maker(sequence, name) for _, sequence, name in grids]
+    existing = {} if remake else {row: maker.existing() for row, maker in enumerate(makers)}
+    reports = {row: one for row, one in existing.items() if one is not None}
+    missing = [row for row in range(len(makers)) if row not in reports]
+    measured = _measure_all([makers[row] for row in missing], workers, executor, progress)
+    failures: list[FrameFailure] = []
+    for row, results in zip(missing, measured, strict=True):
+        failures += [result for result in results if isinstance(result, FrameFailure)]
+        reports[row] = makers[row].make(results)
+    found: dict[str, Report] = {}
+    for row, (path, sequence, name) in enumerate(grids):
+        one = reports[row]
+        if holdout and one.holdout is None:
+            one = replace(one, holdout=makers[row].held_out(workers, executor))
+        if save and isinstance(sequence, FolderSequence):
+            FolderWriter(sequence.folder).write_document(layout.report_file(name), one.to_json())
+        found[f"{path}/{name}" if path else name] = one
+    return ReportResult(opened.location, found, tuple(failures))
+
+
+_Measured = FrameFacts | FrameFailure
+
+
+def _measure_all(
+    makers: list[_Maker],
+    workers: int | None,
+    executor: Executor | None,
+    progress: Callable[[int, int], None] | None,
+) -> list[list[_Measured]]:
+    """Return what was measured of the frames of each report."""
+    steps = Steps(progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
+    for maker in makers:
+        maker.find_actors(count_workers(workers), executor, steps)
+    tasks = [(row, task) for row, maker in enumerate(makers) for task in maker.tasks()]
+    measured: list[list[_Measured]] = [[] for _ in makers]
+    with closing(run_all(_measure, [task for _, task in tasks], workers=workers, executor=executor)) as results:
+        for (row, _), result in zip(tasks, results, strict=True):
+            measured[row].append(result)
+            steps(1)
+    return measured
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame to measure. It pickles into a worker."""
+
+    sequence: Sequence
+    grid: str
+    number: int
+    scans: ScanFrame | None  # the scans that it was made from
+    plan: Plan | None  # to make it again without a tenth of the scans
+
+
+class _Maker:
+    """Makes the report of one grid of one sequence."""
+
+    def __init__(self, sequence: Sequence, grid: str) -> None:
+        self.sequence, self.grid = sequence, grid
+        self.frames: list[int] = sequence.frames(f"{grid}/labels").tolist()
+        self.inputs = _inputs_of(sequence, grid)
+
+    def existing(self) -> Report | None:
+        """Return the report beside the grid; None if there is none."""
+        name = layout.report_file(self.grid)
+        if name not in self.sequence.documents():
+            return None
+        return Report.from_json(self.sequence.read_document(name), f"{self.sequence.location}/{name}")
+
+    @property
+    def steps_before(self) -> int:
+        """Number of scans of the pass that finds the actors."""
+        return 0 if self.inputs is None else self.inputs.steps_before
+
+    def find_actors(self, workers: int, executor: Executor | None, progress: Callable[[int], None]) -> None:
+        """Find the actors, if the grid was made with them; the inputs are given up if a scan cannot be read."""
+        if self.inputs is None or not self.inputs.feed.needs_actors:
+            return
+        try:
+            self.inputs.actors = find_actors(self.inputs.feed, workers=workers, executor=executor, progress=progress)
+        except (CarlascError, OSError):  # measuring the frame reports the scan
+            self.inputs = None
+
+    def tasks(self) -> list[_Frame]:
+        """Return the frames to measure."""
+        light, sampled = without_caches(self.sequence), sample_frames(self.frames)
+        scans = set() if self.inputs is None else set(self.inputs.feed.frames.tolist())
+        return [
+            _Frame(
+                light,
+                self.grid,
+                number,
+                ScanFrame(self.inputs, number, number) if self.inputs is not None and number in scans else None,
+                None if self.inputs is None or number not in sampled else self.inputs.plan,
+            )
+            for number in self.frames
+        ]
+
+    def make(self, measured: list[_Measured]) -> Report:
+        """Make the report of what was measured."""
+        sequence = self.sequence
+        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(self.grid))
+        documents = {name: sequence.read_document(name) for name in names if name in sequence.documents()}
+        classes, params = sequence.classes_of(self.grid), sequence.params(self.grid)
+        facts = [result for result in measured if isinstance(result, FrameFacts)]
+        actors = None if self.inputs is None else self.inputs.summaries()
+        return Report.make(self.grid, facts, params, classes, documents, actors=actors)
+
+    def held_out(self, workers: int | None, executor: Executor | None) -> Mapping[str, Any] | None:
+        """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans beside it."""
+        spec = self.sequence.grids[self.grid]
+        if self.inputs is None or spec.coordinates != "cartesian":
+            return None
+        every = max(EVERY, len(self.inputs.feed.frames) // _MOST_LEFT_OUT)
+        result = leave_out(
+            _Single(self.sequence),
+            spec,
+            observe=self.inputs.options,
+            voting=self.inputs.plan.voting,
+            every=every,
+            workers=workers,
+            executor=executor,
+        )
+        return None if result.total is None else result.total.to_dict()
+
+
+class _Single(Source):
+    """One sequence of a source, as a source."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence, self.location = sequence, sequence.location
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        return {self.sequence.path: self.sequence}
+
+
+def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
+    """Return the scans that a grid was made from, if they lie beside it; None otherwise."""
+    record = sequence.params(grid).get(RECORD)
+    if not isinstance(record, dict) or "points" not in sequence.fields():
+        return None
+    try:
+        known = read_record(record, f"{sequence.location}/{layout.params_file(grid)}")
+        if known.get("observe") != "scans":
+            return None
+        options = _options_of(known)
+        voting = Voting(known.get("voting"), float(known.get("free_step_m", Voting().free_step_m)))
+        plan = Plan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
+        inputs = ScanSequence(sequence, plan, options)
+        return inputs if len(inputs.feed.frames) else None
+    except (CarlascError, ValueError, TypeError):  # the record of another version, or no valid poses
+        return None
+
+
+def _options_of(record: Mapping[str, Any]) -> FromScans:
+    """Return the options that the record of a run names; the others have their defaults."""
+    given = {option.name: record[option.name] for option in fields(FromScans) if option.name in record}
+    # The record names all that motion was taken from; several sources are those that "auto" chose.
+    if "+" in str(given.get("motion", "")) or given.get("dynamic") == "tube":
+        del given["motion"]
+    if "window" in given:
+        first, _, last = str(given["window"]).partition(":")
+        given["window"] = (int(first), int(last))
+    return FromScans(**given, force=True)
+
+
+def _measure(task: _Frame) -> FrameFacts | FrameFailure:
+    """Measure one frame; return why it failed if it did."""
+    sequence, number, grid = task.sequence, task.number, task.grid
+    names = (*layout.SCAN_FIELDS, *(f"{grid}/{part}" for part in layout.GRID_FIELDS))
+    try:
+        present = sequence.fields()
+        arrays = {n: sequence.read(n, number) for n in names if n in present and number in sequence.frames(n)}
+        spec, classes, changes = sequence.grids[grid], sequence.classes_of(grid), None
+        if task.scans is not None and task.plan is not None:
+            changes = Changes.between(sequence.grid(grid, number), task.scans.thinned(task.plan))
+        residuals = None if task.scans is None else task.scans.residuals()
+        return FrameFacts.of(number, arrays, grid, spec, classes, changes, residuals)
+    except (CarlascError, OSError) as error:
+        return FrameFailure(sequence.location, number, str(error))
+
+
+def _check_writable(sequence: Sequence, grid: str) -> None:
+    if not isinstance(sequence, FolderSequence):
+        raise ArgumentError("save", expected="a source that is a folder", found=sequence.location)
+    if not isinstance(sequence.params(grid).get(RECORD), dict):
+        raise ConflictError(
+            f"{sequence.location}/{grid}",
+            expected="a grid that carlasc made",
+            found="published data, which are never written to",
+            advice="leave out `save=True`",
+        )
