@@ -22,12 +22,17 @@ def main(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="key=value, replaces a setting of the file.")
     ] = None,
+    soft_labels: Annotated[
+        bool,
+        typer.Option("--soft-labels", help="Train on probabilities instead of labels; the same as soft_labels=true."),
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint of the run.")] = False,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
     """Train a network on a data set. The weights with the best mIoU on the validation split are kept."""
     with join_processes(device) as processes:
-        progress = train(data, Config.read(config, settings or ()), out, processes, resume=resume)
+        overrides = [*(settings or ()), *(["soft_labels=true"] if soft_labels else [])]
+        progress = train(data, Config.read(config, overrides), out, processes, resume=resume)
         if processes.first:
             print(f"best mIoU {100 * progress.best_miou:.2f} after epoch {progress.best_epoch}: {out / BEST}")
 

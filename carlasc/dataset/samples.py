@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
+from carlasc.dataset.grids import OF_GRID, GridFields
 from carlasc.dataset.labels import LabelMap, RemapLike
 from carlasc.dataset.scans import RecentScans
 from carlasc.dataset.selection import (
@@ -33,10 +34,12 @@ from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.metadata import Axes
 
 FIELDS = ("occupancy", "density", "labels", "known", "counts", "points", "point_labels", "flow", "poses")
+"""Fields that samples of published data may have."""
+EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
+"""Fields of grids that say how certain each voxel is, which published grids do not."""
 ALWAYS = ("valid", "sequence", "frame")
 RAGGED = ("points", "point_labels", "flow")  # one row per point of the scan
 _STACKS = frozenset({"occupancy", "density"})
-_OF_GRID = {"labels": "labels", "known": "counts", "counts": "counts"}  # field of a sample -> field of the grid
 _OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow"}  # field of a sample -> field of the scan
 
 if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
@@ -57,6 +60,11 @@ class Dataset(_MapStyle):
         labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also unknown
         known         (X, Y, Z) bool, voxels that have a vote: leave the others out of losses and metrics
         counts        (X, Y, Z) float32, number of votes per voxel
+        posterior     (K, X, Y, Z) float32, soft labels: probability of each class, 0 for free; zeros where not known. K is the
+                      largest id of `classes` plus 1
+        occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where nothing is known
+        flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
+        views         (X, Y, Z) uint16, number of scans that saw the voxel
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
@@ -66,7 +74,8 @@ class Dataset(_MapStyle):
         frame         int, number of the frame; in every sample
 
     The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are empty, and their `valid` is
-    False. Frames that lack a field that was asked for are left out. Points nearer than `min_range_m` or farther than `max_range_m`
+    False. Frames that lack a field that was asked for are left out. Only grids made with `carlasc.Voting(keep_evidence=True)` have
+    `posterior`, `occupied`, `flags` and `views`. Points nearer than `min_range_m` or farther than `max_range_m`
     of carlasc.json are in no grid. Arrays are in the sequences' own axes: right-handed data are not mirrored, and are not mixed
     with left-handed data.
 
@@ -89,6 +98,8 @@ class Dataset(_MapStyle):
         fields: Iterable[str] = ("occupancy", "labels", "known"),
         remap: RemapLike = "carlasc11",
         align: bool = True,
+        inferred: bool = True,
+        min_confidence: float = 0.0,
         transform: Callable[[Sample], Sample] | None = None,
     ) -> None:
         """Find the frames. No scan and no grid is read.
@@ -107,6 +118,9 @@ class Dataset(_MapStyle):
             remap: how `labels` and `point_labels` are mapped: a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a
                 table of new ids by old id; None keeps the ids of the data.
             align: move past scans into the frame's sensor frame by their poses; False stacks them without moving them.
+            inferred: False leaves voxels that no scan saw, but that were completed, out of `known` and `posterior`.
+            min_confidence: leaves voxels that are neither free nor occupied with at least this probability out of `known` and
+                `posterior`; 0 to 0.5 keeps all.
             transform: called with each sample.
 
         Raises:
@@ -117,6 +131,7 @@ class Dataset(_MapStyle):
         self.fields = _check_fields(fields)
         self.history = _check_history(history)
         self.align = align
+        self._grid_fields = GridFields(frozenset(self.fields), inferred, min_confidence)
         self.transform = transform
         coordinates = grid.coordinates if isinstance(grid, GridSpec) else coordinates
         if coordinates not in layout.COORDINATES:
@@ -124,7 +139,7 @@ class Dataset(_MapStyle):
 
         opened = as_source(source)
         chosen = choose_sequences(opened, split, coordinates)
-        if self._asks(_OF_GRID) or (self._asks(_STACKS) and isinstance(grid, str)):
+        if self._asks(OF_GRID) or (self._asks(_STACKS) and isinstance(grid, str)):
             grids_opened = opened if grids_source is None else as_source(grids_source)
             grids = find_grid_sequences(chosen, grids_opened, coordinates)
             self._parts = [
@@ -179,8 +194,8 @@ class Dataset(_MapStyle):
             sample["poses"] = part.current_T_past(frame, past)
         if self._asks(_STACKS):
             sample |= self._stacks(part, past, sample.get("poses"))
-        if self._asks(_OF_GRID):
-            sample |= self._grid(part, frame)
+        if part.grids is not None:
+            sample |= self._grid_fields.read(part.grids, part.grid, frame, self._label_map)
         if self._asks(_OF_SCAN):
             sample |= self._scan(part, frame)
         sample["valid"] = np.array([number is not None for number in past])
@@ -221,13 +236,11 @@ class Dataset(_MapStyle):
 
     def _part(self, scans: Sequence, grids: Sequence | None, grid: str) -> Part:
         wanted = {(scans, _OF_SCAN[field]): None for field in self.fields if field in _OF_SCAN}
-        if self._asks(_STACKS) or not self._asks(_OF_GRID):
+        if self._asks(_STACKS) or not self._asks(OF_GRID):
             wanted[scans, "points"] = None
         if grids is not None:
-            uncounted = "counts" not in self.fields and not len(grids.frames(f"{grid}/counts"))
-            parts = {_OF_GRID[field] for field in self.fields if field in _OF_GRID}
-            # If the grid has no counts, every voxel is known, in all frames that have labels.
-            wanted |= {(grids, f"{grid}/{'labels' if uncounted else part}"): None for part in sorted(parts)}
+            parts = self._grid_fields.parts(grids, grid)
+            wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
         part = Part(scans, grids, grid, common_frames(wanted), frozenset(scans.frames("points").tolist()))
         if self._needs_poses:
             part.check_poses()
@@ -242,7 +255,7 @@ class Dataset(_MapStyle):
         for part in self._parts:
             if "point_labels" in self.fields:
                 tables[part.scans.location] = part.scans.metadata.classes
-            if "labels" in self.fields and part.grids is not None:
+            if self._asks(("labels", "posterior")) and part.grids is not None:
                 tables[f"{part.grids.location}/{part.grid}"] = part.grids.classes_of(part.grid)
         where, found = next(iter(tables.items()), ("", self.sequences[0].metadata.classes))
         label_map = LabelMap(remap, found)
@@ -274,22 +287,6 @@ class Dataset(_MapStyle):
         return {"density": density} | (
             {"occupancy": (density > 0).view(np.uint8)} if "occupancy" in self.fields else {}
         )
-
-    def _grid(self, part: Part, frame: int) -> Sample:
-        if part.grids is None:
-            return {}
-        sample: Sample = {}
-        if "labels" in self.fields:
-            field = f"{part.grid}/labels"
-            sample["labels"] = self._label_map(
-                part.grids.read(field, frame), f"{part.grids.location}: {field} of frame {frame}"
-            )
-        if "known" in self.fields or "counts" in self.fields:
-            field = f"{part.grid}/counts"
-            counts = part.grids.read(field, frame) if len(part.grids.frames(field)) else None
-            sample["known"] = np.ones(part.grids.grids[part.grid].size, np.bool_) if counts is None else counts > 0
-            sample["counts"] = np.array(counts, np.float32) if "counts" in self.fields else None
-        return sample
 
     def _scan(self, part: Part, frame: int) -> Sample:
         sample: Sample = {}
@@ -326,12 +323,15 @@ def collate(samples: list[Sample]) -> dict[str, Any]:
 
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([fields] if isinstance(fields, str) else fields))
-    unknown = [name for name in names if name not in (*FIELDS, *ALWAYS)]
+    unknown = [name for name in names if name not in (*FIELDS, *EVIDENCE_FIELDS, *ALWAYS)]
     if unknown:
-        raise ArgumentError("fields", expected=f"any of {', '.join(FIELDS)}", found=", ".join(map(repr, unknown)))
+        expected = f"any of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}"
+        raise ArgumentError("fields", expected=expected, found=", ".join(map(repr, unknown)))
     chosen = tuple(name for name in names if name not in ALWAYS)
     if not chosen:
-        raise ArgumentError("fields", expected=f"at least one of {', '.join(FIELDS)}", found="none")
+        raise ArgumentError(
+            "fields", expected=f"at least one of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}", found="none"
+        )
     return chosen
 
 

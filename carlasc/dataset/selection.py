@@ -16,6 +16,8 @@ from carlasc.storage.protocol import Sequence, Source
 
 _T = TypeVar("_T")
 
+_ADVICE = "leave the sequence out with `split`, a list of names, or do not ask for the field"
+_ADVICE_EVIDENCE = "regrid with `voting=Voting(keep_evidence=True)`, or do not ask for the field"
 _RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
 
 
@@ -158,7 +160,7 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
                 sequence.location,
                 expected=f"the field {field}",
                 found="no frame that has it",
-                advice="leave the sequence out with `split`, a list of names, or do not ask for the field",
+                advice=_ADVICE_EVIDENCE if field.rpartition("/")[2] in layout.EVIDENCE_FIELDS else _ADVICE,
             )
         common = frames if common is None else np.intersect1d(common, frames, assume_unique=True)
     return np.empty(0, np.int64) if common is None else common

@@ -19,7 +19,9 @@ Sample = dict[str, Any]  # what `Dataset` gives: see there
 
 _DIRECTIONS = ("x", "y")
 _TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, which is off by 9e-8
-_FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "labels": 0, "known": 0, "counts": 0}
+_FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "posterior": 1} | dict.fromkeys(
+    ("labels", "known", "counts", "occupied", "flags", "views"), 0
+)
 
 
 class Flip:

@@ -32,6 +32,7 @@ class Config:
         flips: directions in which samples are mirrored at random: "x", "y", "xy" or "".
         class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the training split), "none", or the file
             that `carlasc stats --json` wrote.
+        soft_labels: train on the probability of each class instead of labels; the grid must be made with `keep_evidence=True`.
         free_ratio: number of free voxels in the loss per occupied one, drawn at random for each batch; 0 takes all (SSCNet: 2).
         epochs: passes over the training split.
         batch_size: samples per step, over all processes together.
@@ -55,6 +56,7 @@ class Config:
     test: str | list[str] = "test"
     flips: str = "xy"
     class_weights: str = "table"
+    soft_labels: bool = False
     free_ratio: float = 0.0
     epochs: int = 10
     batch_size: int = 16
@@ -79,6 +81,12 @@ class Config:
         if self.history > 1 and self.network != "motionsc":
             raise ArgumentError(
                 "history", expected=f"1 for {self.network}", found=str(self.history), advice="only motionsc takes more"
+            )
+        if self.soft_labels and self.remap == "semantickitti19":
+            raise ArgumentError(
+                "soft_labels",
+                expected="False with remap=semantickitti19, whose ignored classes are left out by their labels",
+                found="True",
             )
         if not set(self.flips) <= {"x", "y"}:
             raise ArgumentError("flips", expected="x, y, xy or nothing", found=repr(self.flips))

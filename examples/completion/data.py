@@ -78,8 +78,11 @@ def open_split(source: str | Path, split: str | list[str], config: Config, *, tr
     """
     kitti = config.remap == "semantickitti19"
     remap = None if kitti else config.remap
+    fields = ("occupancy", "labels", "known", *(("posterior",) if training and config.soft_labels else ()))
     try:
-        data = Dataset(source, split, history=config.history, grid=config.grid, remap=remap, align=config.align)
+        data = Dataset(
+            source, split, history=config.history, grid=config.grid, fields=fields, remap=remap, align=config.align
+        )
     except MissingDataError as error:
         raise error.within(f"split {split!r}") from error
     frames = {sequence.location: len(sequence.scan_frames()) for sequence in data.sequences}
@@ -163,6 +166,12 @@ def to_device(batch: Sample, device: torch.device) -> tuple[Tensor, Tensor]:
     occupancy = batch["occupancy"].to(device, non_blocking=True).float()
     labels = batch["labels"].to(device, non_blocking=True).long()
     return occupancy, labels.masked_fill(~batch["known"].to(device, non_blocking=True), IGNORE)
+
+
+def soft_target(batch: Sample, target: Tensor) -> Tensor:
+    """Return a batch's soft target (B, K, X, Y, Z) float32: the probability of each class, zeros where `target` is `IGNORE`."""
+    posterior = batch["posterior"].to(target.device, non_blocking=True)
+    return posterior.masked_fill((target == IGNORE).unsqueeze(1), 0)
 
 
 def class_weights(source: str | Path, data: Dataset, config: Config) -> NDArray[np.float32]:

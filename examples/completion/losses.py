@@ -1,4 +1,4 @@
-"""The loss: weighted cross-entropy over known voxels, at every scale of a network's output."""
+"""The loss: weighted cross-entropy over known voxels, at every scale of a network's output, with labels or with probabilities."""
 
 from __future__ import annotations
 
@@ -20,21 +20,35 @@ def completion_loss(outputs: Tensor | Sequence[Tensor], target: Tensor, class_we
 
     Args:
         outputs: (B, X, Y, Z, K) logits, or a list of them at 1/1, 1/2, 1/4, ... of the scale.
-        target: (B, X, Y, Z) int64 labels, `IGNORE` for voxels that are left out.
+        target: (B, X, Y, Z) int64 labels, `IGNORE` for voxels that are left out. Or (B, K, X, Y, Z) float32 probabilities of the
+            classes, zeros for voxels that are left out. Certain probabilities give exactly the loss of the labels.
         class_weights: (K,) float32.
 
     Returns:
         (S,) sums and (S,) weights.
     """
     sums, weights = [], []
+    measure, blocks = (_measure_soft, coarsen_soft) if target.is_floating_point() else (_measure, coarsen)
     for scale, logits in enumerate([outputs] if isinstance(outputs, Tensor) else outputs):
-        coarse = target if scale == 0 else coarsen(target, 2**scale, len(class_weights))
-        sums.append(
-            cross_entropy(logits.movedim(-1, 1).float(), coarse, class_weights, ignore_index=IGNORE, reduction="sum")
-        )
-        counted = coarse != IGNORE
-        weights.append((class_weights[torch.where(counted, coarse, 0)] * counted).sum())
+        coarse = target if scale == 0 else blocks(target, 2**scale, len(class_weights))
+        # each voxel's loss first, then the sum: labels and certain probabilities are then added up in the same way
+        losses, counted = measure(logits.movedim(-1, 1).float(), coarse, class_weights)
+        sums.append(losses.sum())
+        weights.append(counted.sum())
     return torch.stack(sums), torch.stack(weights)
+
+
+def _measure(logits: Tensor, target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (B, X, Y, Z) the loss and the weight of each voxel for labels."""
+    losses = cross_entropy(logits, target, class_weights, ignore_index=IGNORE, reduction="none")
+    counted = target != IGNORE
+    return losses, class_weights[torch.where(counted, target, 0)] * counted
+
+
+def _measure_soft(logits: Tensor, target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the same for probabilities."""
+    losses = cross_entropy(logits, target, class_weights, reduction="none")
+    return losses, (target * class_weights.reshape(-1, 1, 1, 1)).sum(1)
 
 
 def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
@@ -57,6 +71,32 @@ def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
     occupied, most = votes[..., 1:].max(-1)
     free = torch.where(votes[..., FREE] > 0, FREE, IGNORE)
     return torch.where(occupied > 0, most + 1, free)
+
+
+def coarsen_soft(target: Tensor, block: int, num_classes: int) -> Tensor:
+    """Return the probabilities of one class per block, by the rule of `coarsen`.
+
+    A block is occupied as probably as the voxel in it that most probably is, by the class whose probabilities add up to most. It is
+    free as probably as the known voxel in it that least probably is. If two classes are equally probable, the lower id is taken.
+
+    Args:
+        target: (B, K, X, Y, Z) float32, zeros for voxels that are left out; X, Y and Z multiples of `block`.
+        block: voxels per axis of a block.
+        num_classes: K.
+
+    Returns:
+        (B, K, X / block, Y / block, Z / block) float32, zeros for blocks in which all voxels are left out.
+    """
+    batch, _, x, y, z = target.shape
+    blocks = target.reshape(batch, num_classes, x // block, block, y // block, block, z // block, block)
+    voxels = blocks.permute(0, 1, 2, 4, 6, 3, 5, 7).flatten(5)
+    occupied, known = voxels[:, 1:].sum(1), voxels.sum(1) > 0
+    free = torch.where(known, voxels[:, FREE], 1.0).amin(-1) * known.any(-1)
+    coarse = torch.zeros_like(voxels[..., 0])
+    most = voxels[:, 1:].sum(-1).argmax(1, keepdim=True) + 1
+    coarse.scatter_(1, most, occupied.amax(-1).unsqueeze(1))
+    coarse[:, FREE] = free
+    return coarse
 
 
 def balance_free(target: Tensor, ratio: float, generator: torch.Generator) -> Tensor:

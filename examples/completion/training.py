@@ -17,7 +17,7 @@ from torch.nn.parallel import DistributedDataParallel
 from carlasc.errors import CarlascError, ConflictError
 from carlasc.metrics import ConfusionMatrix
 from completion.config import Config
-from completion.data import TrainLoader, class_weights, eval_loader, open_split, to_device
+from completion.data import TrainLoader, class_weights, eval_loader, open_split, soft_target, to_device
 from completion.inference import check_compiler
 from completion.losses import balance_free, completion_loss
 from completion.networks import build_network
@@ -212,6 +212,8 @@ def _train_step(
     if config.free_ratio:
         draw = torch.Generator(processes.device).manual_seed(_mix(config.seed, *place, processes.rank))
         target = balance_free(target, config.free_ratio, draw)
+    if config.soft_labels:
+        target = soft_target(batch, target)
     with torch.autocast(processes.device.type, torch.bfloat16, enabled=config.precision == "bf16"):
         outputs = network(occupancy)
     sums, weights = completion_loss(outputs, target, class_weights)

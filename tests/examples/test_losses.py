@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
 import torch
-from completion.losses import IGNORE, balance_free, coarsen, completion_loss
+from completion.losses import IGNORE, balance_free, coarsen, coarsen_soft, completion_loss
 from torch.nn.functional import cross_entropy
 
 K = 4
@@ -77,3 +77,65 @@ def test_balancing_keeps_every_occupied_voxel_and_twice_as_many_free_ones():
     assert torch.equal(balance_free(few, 2.0, generator), few)
     nothing = torch.zeros(1, 2, 2, 2, dtype=torch.int64)
     assert (balance_free(nothing, 2.0, generator) == IGNORE).all()
+
+
+def certain(target):
+    """Return the probabilities of voxels whose labels are certain."""
+    classes = torch.arange(K).reshape(1, K, 1, 1, 1)
+    return (target.unsqueeze(1) == classes).float()
+
+
+def random_target(shape, seed=2):
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.randint(0, K, shape, generator=generator)
+    return target.masked_fill(torch.rand(shape, generator=generator) < 0.4, IGNORE)
+
+
+def test_certain_probabilities_give_exactly_the_loss_and_the_step_of_labels():
+    torch.manual_seed(2)
+    target = random_target((2, 8, 8, 4))
+    target[0, :4, :4, :4] = IGNORE  # blocks without a known voxel
+    target[1, :4, :4, :4] = 0  # and blocks that are free
+    weights = torch.tensor([0.1, 1.0, 2.0, 0.5])
+    shapes = [(2, 8, 8, 4, K), (2, 4, 4, 2, K), (2, 2, 2, 1, K)]
+    found = []
+    for this in (target, certain(target)):
+        generator = torch.Generator().manual_seed(0)
+        outputs = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
+        sums, totals = completion_loss(outputs, this, weights)
+        (sums / totals).mean().backward()
+        found.append([sums.detach(), totals, *(output.grad for output in outputs)])
+    for hard, soft in zip(*found, strict=True):
+        assert torch.equal(hard, soft)
+    assert all((totals > 0).all() for _, totals, *_ in found)
+
+
+def test_the_loss_of_probabilities_is_the_mean_of_the_losses_of_the_labels_by_their_probability():
+    torch.manual_seed(3)
+    logits, shape = torch.randn(1, 4, 4, 2, K), (1, 4, 4, 2)
+    weights = torch.tensor([0.1, 1.0, 2.0, 0.5])
+    one, other = torch.randint(0, K, shape), torch.randint(0, K, shape)
+    sums, totals = completion_loss(logits, 0.25 * certain(one) + 0.75 * certain(other), weights)
+    parts = [completion_loss(logits, target, weights) for target in (one, other)]
+    torch.testing.assert_close(sums, 0.25 * parts[0][0] + 0.75 * parts[1][0])
+    torch.testing.assert_close(totals, 0.25 * parts[0][1] + 0.75 * parts[1][1])
+
+
+@pytest.mark.parametrize("block", [2, 4])
+def test_blocks_of_certain_voxels_have_the_label_of_the_block(block):
+    target = random_target((2, 8, 4, 4))
+    target[0, :4] = IGNORE
+    assert torch.equal(coarsen_soft(certain(target), block, K), certain(coarsen(target, block, K)))
+
+
+def test_a_block_is_occupied_as_probably_as_its_most_probable_voxel_by_the_class_with_the_largest_sum():
+    def block(*voxels):
+        target = torch.zeros(1, K, 8)
+        for place, probabilities in enumerate(voxels):
+            target[0, :, place] = torch.tensor(probabilities)
+        return coarsen_soft(target.reshape(1, K, 2, 2, 2), 2, K).flatten().tolist()
+
+    assert block((0.25, 0.75, 0, 0), (0.5, 0, 0.5, 0), (0.5, 0, 0.5, 0)) == [0.25, 0, 0.75, 0]
+    assert block((0.5, 0.5, 0, 0), (0.5, 0, 0, 0.5)) == [0.5, 0.5, 0, 0]  # a tie goes to the lowest
+    assert block((1, 0, 0, 0)) == [1, 0, 0, 0]
+    assert block() == [0, 0, 0, 0]

@@ -176,3 +176,50 @@ def test_two_processes_of_torchrun_end_with_the_weights_of_one(data, tmp_path, e
     assert two["mious"] == pytest.approx(one["mious"], rel=1e-2)
     for name, value in one["network"].items():  # Adam turns rounding into steps where a gradient is nearly zero
         assert torch.isclose(value, two["network"][name], rtol=1e-3, atol=1e-4).double().mean() > 0.98, name
+
+
+@pytest.fixture(scope="module")
+def certain(tmp_path_factory):
+    """The data of `data`, with certain labels that the grid says are certain."""
+    root = tmp_path_factory.mktemp("certain")
+    write_split(root, "Train", ["Town01_Light", "Town02_Light"], frames=3, certainty=1.0)
+    write_split(root, "Val", ["Town07_Light"], frames=3, seed=1)
+    return root
+
+
+@pytest.mark.parametrize("network, free_ratio", [("lmscnet_ss", 0.0), ("lmscnet", 0.0), ("sscnet", 2.0)])
+def test_training_on_certain_probabilities_is_training_on_labels(certain, tmp_path, network, free_ratio):
+    config = replace(QUICK, network=network, free_ratio=free_ratio, epochs=1)
+    hard = train(certain, config, tmp_path / "hard", ALONE)
+    soft = train(certain, replace(config, soft_labels=True), tmp_path / "soft", ALONE)
+    assert soft.losses == hard.losses and soft.mious == hard.mious
+    expected, found = (read_weights(tmp_path / name / LAST) for name in ("hard", "soft"))
+    for name, value in expected.items():
+        assert torch.equal(value, found[name]), name
+
+
+def test_a_run_on_soft_labels_learns(tmp_path):
+    write_split(tmp_path / "data", "Train", ["Town01_Light", "Town02_Light"], frames=3, certainty=0.9)
+    write_split(tmp_path / "data", "Val", ["Town07_Light"], frames=3, seed=1)
+    hard = train(tmp_path / "data", replace(QUICK, epochs=4), tmp_path / "hard", ALONE)
+    soft = train(tmp_path / "data", replace(QUICK, epochs=4, soft_labels=True), tmp_path / "run", ALONE)
+    assert soft.losses[-1] < soft.losses[0]
+    assert soft.losses != hard.losses
+    assert Config.read(tmp_path / "run" / "config.yaml").soft_labels
+
+
+def test_data_that_have_no_soft_labels_are_refused_with_what_to_do(data, tmp_path):
+    with pytest.raises(MissingDataError, match=r"split 'train': .*evaluation/classes.*keep_evidence=True"):
+        train(data, replace(QUICK, soft_labels=True), tmp_path, ALONE)
+    with pytest.raises(ArgumentError, match="soft_labels: expected False with remap=semantickitti19"):
+        replace(QUICK, soft_labels=True, remap="semantickitti19")
+
+
+def test_the_script_takes_soft_labels(certain, tmp_path, examples):
+    settings = {"epochs": 1, "batch_size": 2, "workers": 0, "class_weights": "none"}
+    options = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    command = [sys.executable, examples / "train.py", examples / "sscnet" / "carlasc.yaml", certain]
+    command += ["--out", tmp_path / "run", "--soft-labels", "--device", "cpu", *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert Config.read(tmp_path / "run" / "config.yaml").soft_labels
