@@ -85,10 +85,11 @@ def _names(name: str, annotation: Any, info: ParameterInfo) -> list[str]:
         return [info.metavar or name.upper()]
     given = (info.default, *(info.param_decls or ()))  # typer keeps the first name where a default would stand
     declared = [part for part in given if isinstance(part, str) and part.startswith("-")]
-    if annotation is bool and len(declared) == 1:
+    is_switch = annotation in (bool, bool | None)
+    if is_switch and len(declared) == 1:
         return declared[0].split("/")
     dashed = name.replace("_", "-")
-    return declared or ([f"--{dashed}", f"--no-{dashed}"] if annotation is bool else [f"--{dashed}"])
+    return declared or ([f"--{dashed}", f"--no-{dashed}"] if is_switch else [f"--{dashed}"])
 
 
 def _values(annotation: Any) -> str:
@@ -120,7 +121,7 @@ def _layout() -> str:
     grid = [layout.field_named(f"{layout.EVALUATION}/{part}") for part in layout.GRID_FIELDS]
     for field in (*layout.SCAN_FIELDS.values(), *grid):
         shape = "(X, Y, Z)" if field.per == "voxel" else "(N,)" if field.columns is None else f"(N, {field.columns})"
-        special = {"picture": "bytes", "votes": "npz"}
+        special = {"picture": "bytes", "votes": "npz", "boxes": "[table](#boxes)"}
         kind = special[field.kind] if field.kind in special else f"{np.dtype(field.dtype).name} {shape}"
         unit = f", {field.unit}" if field.unit in ("m", "m/s") else ""
         ours = "" if field.published else " *(ours)*"
