@@ -1,0 +1,230 @@
+"""Is ground truth from scans true where things move? `python docs/studies/movers.py [WORK]` prints rows as they finish, and writes the tables.
+
+Simulated drives in which everything moves, through a town and along a street, are recorded by one LiDAR each. Their ground truth is made in many ways and
+compared with what 40 other sensors saw at the same instant. WORK keeps drives, references and counts, and a run continues there; the counts of
+code that has changed must be removed (WORK/scores). The default is a temporary folder.
+
+    --quick       two drives, 32 channels, coarse grids, no ablations
+    --parked      the drives of seeds 1, 2 and 3 with parked cars instead, which are judged too
+    --tables      only write the tables of what WORK has
+    --town, --street SEED ...   other drives (61 to 65 and 261 to 265)
+    --workers N   processes (2)
+
+The rows with DUFOMap need the extra `study` (Python 3.12 or older).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from pathlib import Path
+from typing import Any
+
+from movers_drives import GRIDS, Recorded, Reference, Setting, record, reference
+from movers_rows import ABLATIONS, BASIC, MANY_CHANNELS, PARKED, ROWS, Row
+from movers_scores import Counts, count, figures
+from movers_tables import Table, write_tables
+
+from carlasc.core.frames import FrameRange
+from carlasc.groundtruth import Voting
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.inputs import Plan
+from carlasc.inspection import holdout
+from carlasc.storage.files import write_atomic
+
+SEEDS = {"town": [61, 62, 63, 64, 65], "street": [261, 262, 263, 264, 265]}
+WINDOW = (-30, 30)  # scans that show the sides of actors
+ABLATED = 1  # drives of each kind
+UNCHANGED = ("align, flow", "align, instances", "align, evidence")  # beside the ablations
+HELD_OUT = ("tube", "current", "align, flow", "align, exact boxes", "align, evidence")
+BY_NAME = {row.name: row for row in (*ROWS, *ABLATIONS)}
+
+
+@dataclass(frozen=True)
+class Task:
+    """Some rows of one drive.
+
+    Attributes:
+        setting: the drive and its LiDAR.
+        grids: names of the grids.
+        rows: names of the rows.
+        work: folder that keeps everything.
+        held_out: whether held-out rays are followed, instead of a comparison with the reference.
+    """
+
+    setting: Setting
+    grids: tuple[str, ...]
+    rows: tuple[str, ...]
+    work: Path
+    held_out: bool = False
+
+    def path(self, row: str, grid: str) -> Path:
+        """Return the file of a row's result."""
+        part = "held out" if self.held_out else grid
+        return self.work / "scores" / str(self.setting) / plain(part) / f"{plain(row)}.json"
+
+
+def tasks_of(arguments: argparse.Namespace, work: Path) -> list[Task]:
+    """Return what is to be done, the most important first."""
+    every, basic, ablations, many, parked = (
+        tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, MANY_CHANNELS, PARKED)
+    )
+    if arguments.parked:
+        return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
+    seeds = {"town": arguments.town, "street": arguments.street}
+    if arguments.quick:
+        return [Task(Setting(kind, own[0], 32), ("coarse",), every, work) for kind, own in seeds.items()]
+    by_kind = [[(kind, seed) for seed in own] for kind, own in seeds.items()]
+    drives = [drive for pair in zip(*by_kind, strict=True) for drive in pair]
+    some = drives[: len(by_kind) * ABLATED]
+    tasks = [Task(Setting(*drive, 32), ("coarse",), every, work) for drive in drives]
+    tasks += [Task(Setting(*drive, channels), ("coarse",), basic, work) for channels in (16, 64) for drive in drives]
+    tasks += [Task(Setting(*drive, 32), ("0.2 m",), basic, work) for drive in drives]
+    tasks += [Task(Setting(*drive, 128), ("coarse",), many, work) for drive in some]
+    tasks += [Task(Setting(*drive, 32), ("coarse",), (*UNCHANGED, *ablations), work) for drive in some]
+    tasks += [Task(Setting(*drive, 32), ("coarse",), HELD_OUT, work, held_out=True) for drive in some]
+    tasks += [Task(Setting(*drive, channels), ("0.2 m",), basic, work) for channels in (16, 64) for drive in drives]
+    return tasks
+
+
+@dataclass(frozen=True)
+class ActorStore:
+    """Keeps the actors of a drive, which several rows and grids share, in a folder."""
+
+    folder: Path
+
+    def of(self, row: Row, feed: ScanFeed) -> Actors:
+        """Return the actors of a row; they are found on first use."""
+        if not feed.needs_actors:
+            return Actors()
+        path = self.folder / f"{plain(row.finds)}.npz"
+        if not path.exists():
+            found = find_actors(feed)
+            write_atomic(path, found.to_bytes(row.finds))
+            return found
+        return Actors.from_bytes(path.read_bytes(), str(path))[0]
+
+
+def plain(name: str) -> str:
+    """Return a name for a file."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def run(task: Task) -> None:
+    """Do a task, and print a line for each row that was made; rows that were made before are left out."""
+    missing = [(BY_NAME[row], grid) for row in task.rows for grid in task.grids if not task.path(row, grid).exists()]
+    if not missing:
+        return
+    setting = task.setting
+    (drive,) = record(setting.kind, setting.seed, [setting.channels], task.work)
+    actors = ActorStore(task.work / "scores" / str(setting) / "actors")
+    for row, grid in missing:
+        start = time.perf_counter()
+        if task.held_out:
+            scores = holdout(drive.folder, GRIDS[grid], observe=row.observe, every=15, frames=(30, 61), workers=1)
+            result = scores.to_dict()["total"]
+            line = f"{setting} {grid} {row.name}: held-out rays"
+        else:
+            references = reference(setting.kind, setting.seed, task.work)
+            chosen = {frame: seen for (name, frame), seen in references.items() if name == grid}
+            counts = judge(drive, row, grid, chosen, actors)
+            result = counts.to_json()
+            line = f"{setting} {grid} {row.name}: {summary(counts)}"
+        path = task.path(row.name, grid)
+        write_atomic(path, json.dumps(result).encode())
+        print(f"{line}; {time.perf_counter() - start:.0f} s", flush=True)
+
+
+def summary(counts: Counts) -> str:
+    """Return some figures in a line."""
+    found = figures(counts)
+    shown = ("Vehicle IoU", "Pedestrian IoU", "Vehicle found", "Vehicle free", "Road IoU", "Building IoU", "seconds")
+    values = ", ".join(f"{name} {found[name]:.3f}" for name in shown)
+    return f"{values}, wrongly Vehicle {found['wrongly Vehicle']:.0f}"
+
+
+def judge(drive: Recorded, row: Row, grid: str, references: dict[int, Reference], store: ActorStore) -> Counts:
+    """Make the judged frames of a drive in one way, and count what is right."""
+    total = []
+    for frame, merged, seconds in make(drive, row, grid, references, store):
+        posterior = None if merged.evidence is None else merged.evidence.occupied
+        total.append(count(merged.grid, references[frame], drive.sides(frame, WINDOW), posterior, seconds))
+    return reduce(add, total)
+
+
+def make(
+    drive: Recorded, row: Row, grid: str, frames: Iterable[int], store: ActorStore
+) -> Iterator[tuple[int, MergedFrame, float]]:
+    """Yield the frames of a drive that are made in one way, each with the time that it took in seconds."""
+    plan = Plan(GRIDS[grid], "grid", row.observe, Voting(keep_evidence=row.observe.dynamic != "tube"), FrameRange())
+    feed = None
+    for frame in frames:
+        if feed is None or row.by_frame:
+            feed = ScanFeed(row.change(drive, frame), row.observe)
+        actors = store.of(row, feed)
+        start = time.perf_counter()
+        merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        yield frame, merged, time.perf_counter() - start
+
+
+def tables(tasks: Iterable[Task]) -> list[Table]:
+    """Return the tables of what was made so far."""
+    found: dict[tuple[str, int, tuple[str, ...]], Table] = {}
+    for task in (task for task in tasks if not task.held_out):
+        for grid in task.grids:
+            title = f"{task.setting.channels} channels, {grid}"
+            table = found.setdefault((grid, task.setting.channels, task.rows), Table(title, {}))
+            for row in task.rows:
+                path = task.path(row, grid)
+                if path.exists():
+                    counts = Counts.from_json(json.loads(path.read_text()))
+                    table.rows.setdefault(row, {})[task.setting.drive] = counts
+    return [table for table in found.values() if table.rows]
+
+
+def held_out(tasks: Iterable[Task]) -> dict[str, list[dict[str, Any]]]:
+    """Return the scores of held-out rays by row, one of each drive."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for task in (task for task in tasks if task.held_out):
+        for row in task.rows:
+            path = task.path(row, task.grids[0])
+            if path.exists():
+                found.setdefault(row, []).append(json.loads(path.read_text()))
+    return found
+
+
+def main() -> None:
+    """Do all tasks, and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", nargs="?", type=Path)
+    for option in ("quick", "parked", "tables"):
+        parser.add_argument(f"--{option}", action="store_true")
+    for kind, seeds in SEEDS.items():
+        parser.add_argument(f"--{kind}", nargs="+", type=int, default=seeds)
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = arguments.work or Path(temporary)
+        tasks = tasks_of(arguments, work)
+        if not arguments.tables:
+            start = time.perf_counter()
+            with ProcessPoolExecutor(arguments.workers) as pool:
+                for done in as_completed([pool.submit(run, task) for task in tasks]):
+                    done.result()
+            print(f"{time.perf_counter() - start:.0f} s", flush=True)
+        text = write_tables(tables(tasks), held_out(tasks), work / ("parked" if arguments.parked else "movers"))
+        print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,271 @@
+"""The drives of `movers.py`, recorded once, and what other sensors saw at the judged frames: both are kept in a folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from street import StreetDrive
+
+import carlasc
+from carlasc import Boxes, GridSpec
+from carlasc.captures import Actor, Drive, Lidar
+from carlasc.captures.town.actors import EGO_ID
+from carlasc.captures.town.drive import REFERENCE_OFFSET_M, scan_snapshot
+from carlasc.core.geometry import Transform, invert, relative_to, transform_points, translation
+from carlasc.core.tables import CARLA
+from carlasc.groundtruth import Observation, count_votes
+from carlasc.storage import FolderSink, Sequence, layout
+
+POINTS = {16: 29_000, 32: 65_000, 64: 130_000, 128: 260_000}  # rays per scan by channels
+GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
+VEHICLE = CARLA.id_of("Vehicle")
+MOVES_M_S = 1.0  # faster actors are movers; the voxels of the others are not judged
+SIGHTINGS = "sightings.npy"  # frame, actor, points, sensor and half the size (3 each, metres, frame of the box) per actor and scan
+_GROW_M = 0.4  # voxels this close to an actor's box may hold a part of it
+_FACE_SINE, _FACE_POINTS = 0.26, 12  # a side is seen from 15 degrees or more, by scans with so many points on the actor
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of drive.
+
+    Attributes:
+        make: makes the drive of a seed and a LiDAR.
+        frames: number of frames.
+        candidates: frames whose grids may be judged.
+        judged: how many of them are: those with most moving vehicles nearby.
+        sensors: number of sensors of the reference.
+        movers_only: whether the voxels of actors that stand are left out.
+    """
+
+    make: Callable[[int, Lidar], Drive]
+    frames: int
+    candidates: tuple[int, ...]
+    judged: int
+    sensors: int
+    movers_only: bool = True
+
+
+def _town(seed: int, lidar: Lidar) -> Drive:
+    return Drive(seed, "heavy", lidar)
+
+
+def _town_without_parked_cars(seed: int, lidar: Lidar) -> Drive:
+    drive = Drive(seed, "heavy", lidar)
+    drive._population._parked = []
+    return drive
+
+
+KINDS = {
+    "town": Kind(_town_without_parked_cars, 91, tuple(range(30, 61, 5)), 3, 40),
+    "street": Kind(StreetDrive, 91, (30, 45, 60), 3, 40),
+    "parked": Kind(_town, 101, tuple(int(f) for f in np.linspace(0, 100, 10)), 10, 60, movers_only=False),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A drive and the LiDAR that records it."""
+
+    kind: str
+    seed: int
+    channels: int
+
+    @property
+    def drive(self) -> str:
+        """Name of the drive."""
+        return f"{self.kind}{self.seed}"
+
+    def __str__(self) -> str:
+        return f"{self.drive}_{self.channels}"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What other sensors saw at the instant of a frame.
+
+    Attributes:
+        labels: (X, Y, Z) class of each voxel.
+        judged: (X, Y, Z) bool, the voxels that are known and whose actor, if they belong to one, moves.
+        owner: (X, Y, Z) uint16, number of the actor that a voxel may belong to; 0 is none.
+        speeds: speed of each actor in m/s.
+    """
+
+    labels: NDArray[np.uint8]
+    judged: NDArray[np.bool_]
+    owner: NDArray[np.uint16]
+    speeds: dict[int, float]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recorded drive.
+
+    Attributes:
+        setting: what it is.
+        sequence: points, labels, flow, instances and exact boxes of all frames.
+        folder: where things are kept that are made from it.
+    """
+
+    setting: Setting
+    sequence: Sequence
+    folder: Path
+
+    def sides(self, frame: int, window: tuple[int, int]) -> dict[int, int]:
+        """Return how many of its four sides the scans of a window saw of each actor."""
+        kept = np.load(self.folder / SIGHTINGS)
+        kept = kept[(kept[:, 0] >= frame + window[0]) & (kept[:, 0] <= frame + window[1])]
+        actors, points, sensors, half = kept[:, 1], kept[:, 2], kept[:, 3:6], kept[:, 6:9]
+        distance = np.linalg.norm(sensors[:, :2], axis=1)
+        seen = {int(actor): 0 for actor in np.unique(actors)}
+        for axis in (0, 1):
+            for sign in (-1.0, 1.0):
+                faces = sign * sensors[:, axis] - half[:, axis] > _FACE_SINE * distance
+                for actor in seen:
+                    seen[actor] += int(points[faces & (actors == actor)].sum() >= _FACE_POINTS)
+        return seen
+
+
+def record(kind: str, seed: int, channels: Iterable[int], work: Path) -> list[Recorded]:
+    """Record a drive with everything that tells what moves, once for each LiDAR; those that were recorded before are opened."""
+    settings = {count: Setting(kind, seed, count) for count in channels}
+    folders = {count: work / "drives" / str(setting) for count, setting in settings.items()}
+    missing = {count: folder for count, folder in folders.items() if not folder.exists()}
+    if missing:
+        unfinished = {count: folder.with_name(f"{folder.name}.{os.getpid()}") for count, folder in missing.items()}
+        for folder in unfinished.values():
+            shutil.rmtree(folder, ignore_errors=True)
+        _write(kind, seed, unfinished)
+        for count, folder in unfinished.items():
+            folder.rename(missing[count])
+    return [Recorded(settings[count], _open(folder), folder) for count, folder in folders.items()]
+
+
+def _open(folder: Path) -> Sequence:
+    (sequence,) = carlasc.open(folder).sequences().values()
+    return sequence
+
+
+def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
+    """Record a drive by LiDARs of several numbers of channels, each in its folder."""
+    frames = KINDS[kind].frames
+    lidars = {channels: Lidar(channels=channels, points=POINTS[channels]) for channels in folders}
+    drive = KINDS[kind].make(seed, Lidar())
+    poses = np.stack([drive.sensor_poses(frame, 1)[0] for frame in range(frames)])
+    writers = {channels: FolderSink(folder).sequence("cartesian") for channels, folder in folders.items()}
+    sightings: dict[int, list[NDArray[np.float64]]] = {channels: [] for channels in folders}
+    for writer in writers.values():
+        writer.write_document(layout.POSES, layout.encode_poses(relative_to(poses[0], poses)))
+        writer.write_document(layout.TIMES, layout.encode_times(np.arange(frames) * layout.FRAME_PERIOD_S))
+    for frame in range(frames):
+        snapshot = drive.snapshot(frame)
+        for channels, writer in writers.items():
+            noise = np.random.default_rng([seed, channels, frame])
+            recording = scan_snapshot(snapshot, poses[frame], lidars[channels], noise)
+            scan = recording.scan
+            writer.write("points", frame, np.column_stack([scan.points, np.zeros(len(scan), np.float32)]))
+            writer.write("labels", frame, scan.labels)
+            writer.write("instances", frame, scan.instances)
+            writer.write("flow", frame, recording.flow())
+            numbers, points = np.unique(scan.instances[scan.instances > 0], return_counts=True)
+            boxes = boxes_of([snapshot.actors[int(number)] for number in numbers], poses[frame])
+            writer.write("boxes", frame, boxes.to_table())
+            sensors = np.array([invert(pose)[:3, 3] for pose in boxes.sensor_T_box]).reshape(-1, 3)
+            at = np.full(len(numbers), frame)
+            sightings[channels].append(np.column_stack([at, numbers, points, sensors, boxes.sizes / 2]))
+    for channels, folder in folders.items():
+        np.save(folder / SIGHTINGS, np.concatenate(sightings[channels]))
+
+
+def boxes_of(actors: list[Actor], world_T_sensor: Transform) -> Boxes:
+    """Return the tight boxes of actors in the frame of a sensor; their tracks are the actors' numbers."""
+    poses, sizes = np.zeros((len(actors), 4, 4)), np.zeros((len(actors), 3))
+    for row, actor in enumerate(actors):
+        lower, upper = actor.mesh.vertices.min(axis=0), actor.mesh.vertices.max(axis=0)
+        poses[row] = invert(world_T_sensor) @ actor.world_T_actor @ translation((lower + upper) / 2)
+        sizes[row] = upper - lower
+    labels = np.array([label_of(actor) for actor in actors], np.uint32)
+    return Boxes.from_poses(np.array([actor.id for actor in actors], np.uint32), labels, poses, sizes)
+
+
+def label_of(actor: Actor) -> int:
+    """Return the class of an actor."""
+    return int(np.bincount(actor.mesh.labels).argmax())
+
+
+def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Reference]:
+    """Return the references of a drive by grid and frame; they are made once."""
+    path = work / "references" / f"{kind}{seed}.npz"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(f"{kind}{seed}.{os.getpid()}.npz")
+        np.savez_compressed(unfinished, **_see(kind, seed))
+        unfinished.rename(path)
+    kept = np.load(path)
+    found = {}
+    for frame in kept["frames"].tolist():
+        speeds = {int(actor): float(speed) for actor, speed in kept[f"{frame} speeds"]}
+        for grid in GRIDS:
+            labels, known, owner = (kept[f"{frame} {grid} {name}"] for name in ("labels", "known", "owner"))
+            if KINDS[kind].movers_only:
+                known = known & ~np.isin(owner, [actor for actor, speed in speeds.items() if speed <= MOVES_M_S])
+            found[grid, frame] = Reference(labels, known, owner, speeds)
+    return found
+
+
+def _see(name: str, seed: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a drive's references."""
+    kind = KINDS[name]
+    drive = kind.make(seed, Lidar())
+    arrays: dict[str, NDArray[Any]] = {}
+    frames = choose_frames(drive, kind)
+    arrays["frames"] = np.array(frames)
+    for frame in frames:
+        pose = drive.sensor_poses(frame, 1)[0]
+        seen = [
+            Observation(r.scan.points, r.scan.labels, invert(pose) @ r.world_T_sensor)
+            for r in drive.reference_observations(frame, kind.sensors)
+        ]
+        actors = [actor for actor in drive.snapshot(frame).actors.values() if actor.id != EGO_ID]
+        speeds = [(actor.id, np.linalg.norm(actor.velocity)) for actor in actors]
+        arrays[f"{frame} speeds"] = np.array(speeds, np.float64).reshape(-1, 2)
+        for size, spec in GRIDS.items():
+            grid = count_votes(seen, spec).to_grid()
+            arrays[f"{frame} {size} labels"], arrays[f"{frame} {size} known"] = grid.labels, grid.known
+            arrays[f"{frame} {size} owner"] = _owners(actors, invert(pose), spec)
+    return arrays
+
+
+def choose_frames(drive: Drive, kind: Kind) -> list[int]:
+    """Return the candidates with most moving vehicles in the grid's area, in their order."""
+    counts = []
+    for frame in kind.candidates:
+        here = drive.sensor_poses(frame, 1)[0]
+        moving = [a for a in drive.actors(frame) if np.linalg.norm(a.velocity) > MOVES_M_S and label_of(a) == VEHICLE]
+        places = np.array([actor.world_T_actor[:3, 3] for actor in moving if actor.id != EGO_ID]).reshape(-1, 3)
+        near = np.abs(transform_points(invert(here), places)[:, :2]) < REFERENCE_OFFSET_M
+        counts.append(int(near.all(axis=1).sum()))
+    best = np.argsort(-np.array(counts), kind="stable")[: kind.judged]
+    return sorted(kind.candidates[int(row)] for row in best)
+
+
+def _owners(actors: list[Actor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
+    """Return the actor that each voxel may belong to; the smaller one where boxes overlap."""
+    owner = np.zeros(spec.num_voxels, np.uint16)
+    centers = np.indices(spec.size).reshape(3, -1).T * spec.voxel_size + spec.lower + np.array(spec.voxel_size) / 2
+    bounds = {a.id: (a.mesh.vertices.min(axis=0) - _GROW_M, a.mesh.vertices.max(axis=0) + _GROW_M) for a in actors}
+    for actor in sorted(actors, key=lambda a: -float(np.prod(bounds[a.id][1] - bounds[a.id][0]))):
+        lower, upper = bounds[actor.id]
+        actor_T_grid = invert(actor.world_T_actor) @ invert(grid_T_world)
+        reach = np.linalg.norm(np.maximum(-lower, upper))
+        near = np.flatnonzero((np.abs(centers - invert(actor_T_grid)[:3, 3]) <= reach).all(axis=1))
+        local = transform_points(actor_T_grid, centers[near])
+        owner[near[((local > lower) & (local < upper)).all(axis=1)]] = actor.id
+    return owner.reshape(spec.size)
