@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.errors import FormatError
+
+Floating = TypeVar("Floating", bound=np.floating[Any])
 
 Transform = NDArray[np.float64]
 """(4, 4) float64, last row 0 0 0 1."""
@@ -35,6 +39,11 @@ def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDAr
         (..., 3) float64 metres, frame `dst`.
     """
     return np.asarray(points, np.float64) @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
+
+
+def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
+    """Return every N-th of the rows of an array, with the smallest N that leaves at most `most`."""
+    return points[:: max(1, -(-len(points) // most))]
 
 
 def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.cells import as_pose, cached
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
 from carlasc.motion.visibility import View, look_up
@@ -86,7 +86,7 @@ class Evidence:
 
     def thinned(self, most: int = 400) -> Evidence:
         """Return the same with at most so many `points` for each cluster; `clusters` stay complete."""
-        return replace(self, points=tuple(points[:: -(-len(points) // most)] for points in self.points))
+        return replace(self, points=tuple(thin(points, most) for points in self.points))
 
     @property
     def moved(self) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.geometry import thin
 from carlasc.motion.evidence import Evidence, Sighting, find_evidence
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.registration import nearest_points
@@ -222,7 +223,7 @@ class _Chain:
         label = int(votes.argmax()) or default_label
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
-        samples = [s.points[:: -(-len(s.points) // _SAMPLES)] for s in segments]
+        samples = [thin(s.points, _SAMPLES) for s in segments]
         positions, velocities = estimate_path(samples, seconds, rigid=rigid)
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
         if np.ptp(positions[:, :2], axis=0).max() < _MIN_WAY_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
@@ -267,7 +268,7 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
-    samples = [link.segment.points[:: -(-len(link.segment.points) // _SAMPLES)] for link in (one, other)]
+    samples = [thin(link.segment.points, _SAMPLES) for link in (one, other)]
     return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 

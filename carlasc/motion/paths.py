@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import rotation_z
+from carlasc.core.geometry import rotation_z, thin
 from carlasc.motion.registration import best_sighting, follow, nearest_points
 from carlasc.motion.smoothing import resample, smooth
 
@@ -79,7 +79,7 @@ def is_standing(
         headings: (F,) estimated headings, radians.
         seconds: (F,) times, increasing.
     """
-    thinned = [points[:: -(-len(points) // _POINTS)] for points in sightings]
+    thinned = [thin(points, _POINTS) for points in sightings]
     body = [(points - positions[i]) @ rotation_z(headings[i])[:3, :3] for i, points in enumerate(thinned)]
     still, moved = [], []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):

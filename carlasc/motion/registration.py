@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.core.geometry import Transform, invert, rotation_z, thin, transform_points
 from carlasc.motion.smoothing import smooth
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
@@ -61,7 +61,7 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
             elapsed = seconds[index] - seconds[previous]
             predicted = states[previous] + velocity * elapsed
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
-            points = sightings[index][:: -(-len(sightings[index]) // _POINTS)]
+            points = thin(sightings[index], _POINTS)
             shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
             states[index] = _register(points, model, _normals(model), predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
@@ -149,7 +149,7 @@ def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Keep one point per cell, and at most `_MODEL_POINTS`."""
     _, first = np.unique(np.floor(points / _MODEL_CELL_M).astype(np.int64), axis=0, return_index=True)
     kept = points[np.sort(first)]
-    return kept[:: -(-len(kept) // _MODEL_POINTS)]
+    return thin(kept, _MODEL_POINTS)
 
 
 def _normals(model: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform
+from carlasc.core.geometry import Transform, thin
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite
 from carlasc.errors import FormatError, MissingDataError
@@ -58,7 +58,7 @@ class ScanMotion:
 
     def thinned(self) -> ScanMotion:
         """Return the same actors with at most `_SIGHTING_POINTS` points each; `members` stay complete."""
-        segments = (replace(s, points=s.points[:: -(-len(s.points) // _SIGHTING_POINTS)]) for s in self.segments)
+        segments = (replace(s, points=thin(s.points, _SIGHTING_POINTS)) for s in self.segments)
         return replace(self, segments=tuple(segments))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, thin, transform_points
 
 _MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured
 
@@ -45,7 +45,7 @@ class Residual:
             world_T_actor: (4, 4) pose of the actor at the first sighting.
             world_T_next: (4, 4) its pose at the next one.
         """
-        one, other = _thin(one, _MOST_POINTS), _thin(other, _MOST_POINTS)
+        one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
         standing = _distances(one, other)
         moving = _distances(transform_points(invert(world_T_actor), one), transform_points(invert(world_T_next), other))
         return cls(float(moving.sum()), float(standing.sum()), len(moving))
@@ -128,11 +128,6 @@ def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArra
     """Return the distances from some points of each sighting to the nearest point of the other, metres."""
     found = []
     for asked, others in ((one, other), (other, one)):
-        squares = np.square(_thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
+        squares = np.square(thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
         found.append(np.sqrt(squares.min(axis=1)))
     return np.concatenate(found)
-
-
-def _thin(points: NDArray[np.floating], most: int) -> NDArray[np.floating]:
-    """Return every so many-th point, at most `most`."""
-    return points[:: max(1, -(-len(points) // most))]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.cells import Cells, Pose, cached, fingerprint, inlined, jit, transform
+from carlasc.groundtruth.voting.observations import NOWHERE
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
     DOUBTFUL,
@@ -273,7 +274,7 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
             free_step_m: distance between two free samples, metres.
             voter: number of the observation.
             hit_region: region in which points vote, or ANYWHERE.
-            free_region: region in which rays vote, or ANYWHERE.
+            free_region: region in which rays vote, ANYWHERE, or NOWHERE.
             tally: the votes so far, with room for N more candidates.
         """
         _ = sources
@@ -285,7 +286,8 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
             place_points(rays, view, hits)
             own = hit_labels[begin : begin + BLOCK]
             vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
-            vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
+            if free_region != NOWHERE:
+                vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
         if tally.once:
             if free_region != ANYWHERE:
                 for v in range(len(tally.passed)):
@@ -297,5 +299,5 @@ def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
     return vote
 
 
-_SOURCES = ("rule.py", "rays.py", "kernel.py")
+_SOURCES = ("observations.py", "rule.py", "rays.py", "kernel.py")
 vote = _compile_vote(fingerprint(*(Path(__file__).parent / name for name in _SOURCES)))
