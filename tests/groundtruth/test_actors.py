@@ -56,6 +56,10 @@ ACTORS = Actors.of(
 )
 
 
+def test_an_actor_that_no_field_shows_has_no_number_in_the_data():
+    assert [summary["instance"] for summary in ACTORS.summary] == [7, 7, 0]
+
+
 class TestKept:
     def test_those_that_move_are_kept_and_all_are_summed_up(self):
         assert list(ACTORS.tracks) == [0, 2]

@@ -22,6 +22,7 @@ from carlasc.motion import Extent, Track
 
 # What numpy and zipfile raise for files that are cut short, damaged or of another kind.
 _DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error)
+FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
 _NAMES = ("members", "frames", "poses", "velocities", "bounds", "table", "moving", "moving_frames")
 
 
@@ -149,7 +150,7 @@ def _summarize(track: Track) -> dict[str, Any]:
     speed = np.linalg.norm(track.velocity, axis=1)
     return {
         "label": track.label,
-        "instance": track.instance,
+        "instance": track.instance if track.instance < FIRST_MOVER else 0,  # a number that the data do not have
         "first": int(min(track.members, default=track.first)),
         "last": int(max(track.members, default=track.first)),
         "scans": len(track.members),

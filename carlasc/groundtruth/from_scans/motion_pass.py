@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import invert, transform_points
-from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.actors import FIRST_MOVER, Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed, ScanMotion
 from carlasc.motion import (
     HORIZON_S,
@@ -46,7 +46,6 @@ VERSION = 1
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece
 _BLOCK = 100  # frames whose evidence is found in one piece
-FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import CarlascError, MissingDataError
-from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.actors import FIRST_MOVER, Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
-from carlasc.groundtruth.from_scans.motion_pass import FIRST_MOVER, find_actors, key_of
+from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
 from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
 from carlasc.groundtruth.inputs import (
     FrameData,
