@@ -9,8 +9,10 @@ import pytest
 from helpers.sequences import scan
 
 import carlasc
-from carlasc.converting.frames import FrameJob, Target, make_fields
-from carlasc.converting.protocol import FrameContent
+from carlasc.converting import Cloud, Sensor
+from carlasc.converting.assembling import Rig, assemble
+from carlasc.converting.scans import make_fields
+from carlasc.converting.target import Target
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans
@@ -90,12 +92,9 @@ def test_a_scan_keeps_it_with_its_points(folder):
 
 def test_a_converter_passes_it_on(rings):
     numbers = np.arange(5, dtype=np.uint16)
-    content = FrameContent(np.ones((5, 4), np.float32), others={"rings": numbers, "flow": np.ones((5, 3), np.float32)})
-
-    class Handle:
-        location = "a"
-
-    fields, _ = make_fields(content, FrameJob(Handle(), True, None), Target(CARLA, None, True, False, None))
+    cloud = Cloud(np.ones((5, 4), np.float32), others={"rings": numbers, "flow": np.ones((5, 3), np.float32)})
+    scan = assemble([cloud], Rig((Sensor(),), np.eye(4)), None, "a")
+    fields = make_fields(scan, Target(CARLA, None, mirrored=True), "a")
     assert np.array_equal(fields["rings"], numbers)
     assert fields["flow"].tolist() == [[1, -1, 1]] * 5
 

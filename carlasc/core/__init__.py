@@ -1,5 +1,15 @@
 """Values that know nothing of files: transforms, cells and grids, scans, boxes, class tables and the remaps between them."""
 
+from carlasc.core.benchmarks import (
+    IGNORED,
+    OCC3D,
+    OCC3D_TO_OPENOCCUPANCY,
+    OPENOCCUPANCY,
+    SSCBENCH,
+    SSCBENCH_TO_RAW,
+    TO_OCC3D,
+    TO_SSCBENCH,
+)
 from carlasc.core.boxes import BOXES_DTYPE, Boxes
 from carlasc.core.classes import ClassTable, Color, Remap, class_weights
 from carlasc.core.evidence import VoxelFlag
@@ -13,11 +23,12 @@ from carlasc.core.geometry import (
     rotate_vectors,
     rotation_z,
     rotations_of,
+    slerp,
     transform_points,
     translation,
 )
 from carlasc.core.grids import Coordinates, Grid, GridSpec
-from carlasc.core.scans import Scan
+from carlasc.core.scans import Scan, runs_of_origins, sorted_by_origin
 from carlasc.core.tables import (
     CARLA,
     CARLASC11,
@@ -39,11 +50,19 @@ __all__ = [
     "BOXES_DTYPE",
     "CARLA",
     "CARLASC11",
+    "IGNORED",
+    "OCC3D",
+    "OCC3D_TO_OPENOCCUPANCY",
+    "OPENOCCUPANCY",
     "REMAPS",
     "SEMANTICKITTI",
     "SEMANTICKITTI19",
     "SEMANTICPOSS",
+    "SSCBENCH",
+    "SSCBENCH_TO_RAW",
     "TABLES",
+    "TO_OCC3D",
+    "TO_SSCBENCH",
     "TRAIN_VOXEL_COUNTS",
     "Boxes",
     "ClassTable",
@@ -67,6 +86,9 @@ __all__ = [
     "rotate_vectors",
     "rotation_z",
     "rotations_of",
+    "runs_of_origins",
+    "slerp",
+    "sorted_by_origin",
     "table_from_json",
     "table_named",
     "table_to_json",

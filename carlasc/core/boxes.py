@@ -162,6 +162,14 @@ class Boxes:
             self.annotated[keep],
         )
 
+    def joined(self, others: Boxes) -> Boxes:
+        """Return these boxes and others of the same frame.
+
+        Raises:
+            FormatError: an object has a box in both.
+        """
+        return Boxes(*(np.concatenate([own, vars(others)[name]]) for name, own in vars(self).items()))
+
     def transform(self, dst_T_sensor: Transform) -> Boxes:
         """Return the boxes in another frame, for example in the world's: `dst_T_sensor` is (4, 4) and rigid."""
         return Boxes.from_poses(self.tracks, self.labels, dst_T_sensor @ self.sensor_T_box, self.sizes, self.annotated)

@@ -18,6 +18,7 @@ from carlasc.errors import ArgumentError, FormatError
 Color = tuple[int, int, int]
 ROLES = ("moving", "movable", "deformable", "ground")
 """The roles that several classes of a table may have: names of attributes of `ClassTable`."""
+_WITHOUT_LABELS = ("geometry_only", "ground_only")  # ids for points of scans without labels
 _MAX_ID = 65535  # ids are kept in 16 bits in memory
 
 
@@ -36,6 +37,7 @@ class ClassTable:
         deformable: ids of classes of objects that change their shape while they move, such as people.
         ground: ids of classes of ground surfaces, such as roads, pavements, grass and water.
         geometry_only: id that the points of a scan without labels get; None takes the largest id.
+        ground_only: id that the ground points of a scan without labels get; None takes the lowest id of `ground`.
         num_channels: number of vote channels, which is greater than every id. It may be greater than necessary if the format requires it.
 
     Raises:
@@ -50,6 +52,7 @@ class ClassTable:
     deformable: frozenset[int] = frozenset()
     ground: frozenset[int] = frozenset()
     geometry_only: int | None = None
+    ground_only: int | None = None
     num_channels: int = 0
 
     def __post_init__(self) -> None:
@@ -69,6 +72,8 @@ class ClassTable:
                 raise ArgumentError(where, expected=f"ids of the table in {role}", found=_listed(unknown))
         if self.geometry_only is not None and self.geometry_only not in self.names:
             raise ArgumentError(where, expected="an id of the table in geometry_only", found=str(self.geometry_only))
+        if self.ground_only is not None and self.ground_only not in self.ground:
+            raise ArgumentError(where, expected="an id of ground in ground_only", found=str(self.ground_only))
         if self.num_channels and self.num_channels <= max(self.names):
             raise ArgumentError(where, expected=f"num_channels above {max(self.names)}", found=str(self.num_channels))
         object.__setattr__(self, "names", dict(self.names))
@@ -93,7 +98,8 @@ class ClassTable:
                 {int(index): str(name) for index, name in values["names"].items()},
                 {int(index): _color(color) for index, color in values["colors"].items()},
                 **{role: frozenset(map(int, values.get(role, ()))) for role in ROLES},
-                geometry_only=None if values.get("geometry_only") is None else int(values["geometry_only"]),
+                geometry_only=_id_or_none(values.get("geometry_only")),
+                ground_only=_id_or_none(values.get("ground_only")),
                 num_channels=int(values.get("num_channels", 0)),
             )
         except KeyError as error:
@@ -115,13 +121,18 @@ class ClassTable:
             "colors": {str(index): list(color) for index, color in self.colors.items()},
         }
         values |= {role: sorted(getattr(self, role)) for role in ROLES if getattr(self, role)}
-        values |= {} if self.geometry_only is None else {"geometry_only": self.geometry_only}
+        values |= {name: getattr(self, name) for name in _WITHOUT_LABELS if getattr(self, name) is not None}
         return values | {"num_channels": self.num_channels}
 
     @property
     def geometry_id(self) -> int:
         """The id that the points of a scan without labels get."""
         return max(self.names) if self.geometry_only is None else self.geometry_only
+
+    @property
+    def ground_id(self) -> int | None:
+        """The id that the ground points of a scan without labels get; None if the table has no ground classes."""
+        return min(self.ground, default=None) if self.ground_only is None else self.ground_only
 
     @property
     def dtype(self) -> np.dtype[np.unsignedinteger]:
@@ -256,6 +267,10 @@ def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None)
     weights[common] = 1.0 / np.log(counts[common] + 0.001)
     weights[(counts > 0) & ~common] = weights.max(initial=0.0) or 1.0
     return weights
+
+
+def _id_or_none(value: Any) -> int | None:
+    return None if value is None else int(value)
 
 
 def _color(values: Any) -> Color:

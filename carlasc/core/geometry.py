@@ -94,6 +94,37 @@ def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.where(leading < 0, -1.0, 1.0)[:, None] * unit
 
 
+def slerp(poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Interpolate poses in time: positions linearly, rotations by slerp. Outside of the poses, the nearest motion goes on.
+
+    Args:
+        poses: (K, 4, 4) rigid transforms.
+        seconds: (K,) their times, increasing.
+        at: (...,) times.
+
+    Returns:
+        (..., 4, 4) transforms; the only one if there is one.
+    """
+    if len(poses) < 2:
+        return np.broadcast_to(poses, (*np.shape(at), 4, 4)).copy()
+    times = np.asarray(at, np.float64).reshape(-1)
+    before = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, len(poses) - 2)
+    share = (times - seconds[before]) / np.diff(seconds)[before]
+    turns = quaternions_of(
+        np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
+    )  # the first number is not negative
+    axes = turns[:, 1:]
+    lengths = np.linalg.norm(axes, axis=1)
+    half = np.arctan2(lengths, turns[:, 0])[before] * share
+    units = np.divide(axes, lengths[:, None], out=np.zeros_like(axes), where=lengths[:, None] > 0)[before]
+    between = np.tile(np.eye(4), (len(times), 1, 1))
+    between[:, :3, :3] = poses[before, :3, :3] @ rotations_of(
+        np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * units], axis=1)
+    )
+    between[:, :3, 3] = poses[before, :3, 3] + share[:, None] * (poses[before + 1, :3, 3] - poses[before, :3, 3])
+    return between.reshape(*np.shape(at), 4, 4)
+
+
 def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Express world poses (..., 4, 4) in the frame `first`: `inv(first) @ pose`, as in poses.txt."""
     return np.linalg.inv(first) @ poses
@@ -116,7 +147,9 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
     poses = np.asarray(transforms, np.float64)
     if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
         raise FormatError(name, expected="4 x 4 transforms", found=f"shape {poses.shape}")
-    for index, pose in enumerate(poses.reshape(-1, 4, 4)):
+    if _are_rigid(poses.reshape(-1, 4, 4), tolerance):
+        return poses
+    for index, pose in enumerate(poses.reshape(-1, 4, 4)):  # one of them is not: find out which, and why
         where = name if poses.ndim == 2 else f"{name}: transform {index}"
         if not np.isfinite(pose).all():
             raise FormatError(where, expected="finite numbers", found="NaN or infinity")
@@ -134,3 +167,13 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
                 where, expected="a rotation", found="a reflection (determinant -1)", advice="the axes may be mirrored"
             )
     return poses
+
+
+def _are_rigid(poses: NDArray[np.float64], tolerance: float) -> bool:
+    """Return whether all of (F, 4, 4) transforms are finite, rigid and proper."""
+    if not np.isfinite(poses).all():
+        return False
+    rotations = poses[:, :3, :3]
+    deviation = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0)
+    last = np.abs(poses[:, 3] - (0, 0, 0, 1)).max(initial=0.0)
+    return bool(max(deviation, last) <= tolerance and (np.linalg.det(rotations) >= 0).all())

@@ -71,6 +71,32 @@ class Scan:
         )
 
 
+def sorted_by_origin(origins: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the order, (N,), in which points with equal (N, 3) origins are next to each other; the order of equal ones is kept."""
+    starts = _starts(origins)
+    group = np.unique(origins[starts], axis=0, return_inverse=True)[1].reshape(-1)
+    return np.argsort(np.repeat(group, np.diff([*starts, len(origins)])), kind="stable")
+
+
+def runs_of_origins(origins: NDArray[np.floating] | None, count: int) -> list[tuple[slice, NDArray[np.floating]]]:
+    """Return the runs of points with equal (N, 3) origins, and the (3,) origin of each.
+
+    Args:
+        origins: metres; None if the rays of all points begin at (0, 0, 0).
+        count: number of points.
+    """
+    if origins is None or not count:
+        return [(slice(0, count), np.zeros(3, np.float32))]
+    starts = _starts(origins).tolist()
+    return [(slice(a, b), origins[a]) for a, b in zip(starts, [*starts[1:], count], strict=True)]
+
+
+def _starts(origins: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return where each run of equal rows begins."""
+    changes = (origins[1:] != origins[:-1]).any(axis=1)
+    return np.concatenate([np.zeros(min(len(origins), 1), np.int64), np.flatnonzero(changes) + 1])
+
+
 def check_finite(points: NDArray[np.floating], name: str) -> None:
     """Raise a FormatError that names the first point that is NaN or infinite; `name` is the file."""
     if not np.isfinite(points).all():

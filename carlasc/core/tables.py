@@ -45,6 +45,7 @@ CARLA = ClassTable(
     deformable=frozenset({4}),
     ground=frozenset({6, 7, 8, 14, 15, 16, 21, 22}),
     geometry_only=3,  # Other
+    ground_only=14,  # Ground
     num_channels=25,  # as every published params.json says, although 23 classes exist
 )
 CARLASC11 = ClassTable(
@@ -60,6 +61,7 @@ CARLASC11 = ClassTable(
     deformable=frozenset({4}),
     ground=frozenset({6, 7, 8}),
     geometry_only=3,  # Other
+    ground_only=7,  # Ground
 )
 
 _KITTI: tuple[tuple[int, str, Color, int], ...] = (  # raw id, name, colour, class of the benchmark (0: ignored)
@@ -107,6 +109,7 @@ SEMANTICKITTI = ClassTable(
     deformable=frozenset({30, 254}),
     ground=frozenset({40, 44, 48, 49, 60, 72}),
     geometry_only=99,  # other-object
+    ground_only=49,  # other-ground
 )
 _KITTI19 = {0: "unlabeled"} | {k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)}
 SEMANTICKITTI19 = ClassTable(
@@ -116,6 +119,7 @@ SEMANTICKITTI19 = ClassTable(
     movable=frozenset(range(1, 9)),
     deformable=frozenset({6}),
     ground=frozenset({9, 10, 11, 12, 17}),
+    ground_only=12,  # other-ground
 )
 
 

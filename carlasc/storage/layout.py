@@ -177,6 +177,21 @@ SCAN_FIELDS: dict[str, Field] = {
             meaning="actor of each point, 0 none, consistent over a sequence", published=False,
         ),
         Field(
+            name="seconds", folder="seconds", suffix=".bin", per="point", kind="value",
+            dtype="<f4", names=("seconds",), unit="s",
+            meaning="time of each point after the time of the frame", published=False,
+        ),
+        Field(
+            name="sensor", folder="sensor", suffix=".bin", per="point", kind="id",
+            dtype="u1", names=("sensor",), unit="sensor",
+            meaning="which of the sensors in carlasc.json took the point, from 0", published=False,
+        ),
+        Field(
+            name="origins", folder="origins", suffix=".bin", per="point", kind="vector",
+            dtype="<f4", names=("x", "y", "z"), unit="m",
+            meaning="where the ray of each point began, sensor frame; absent: at the origin", published=False,
+        ),
+        Field(
             name="boxes", folder="boxes", suffix=".bin", per="box", kind="boxes",
             dtype="", names=BOXES_DTYPE.names or (), unit="m",
             meaning="tracked boxes: track, class, pose, size, whether annotated in this frame", published=False,

@@ -40,6 +40,11 @@ class Metadata:
     source: str | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def has_rays(self) -> bool:
+        """Whether points were seen from the sensor. Clouds whose sensor nobody knows say otherwise: nothing tells their free space."""
+        return self.extra.get("rays") is not False
+
     @classmethod
     def from_json(cls, data: bytes, where: str) -> Metadata:
         """Read carlasc.json, of this version or an older one; `where` is the file named in errors.

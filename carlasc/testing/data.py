@@ -119,6 +119,10 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
         some = scan(rng, 50 + frame)
         scans.write("points", frame, some["points"])
         scans.write("labels", frame, some["labels"])
+        places = rng.normal(size=(3, 3)).astype(np.float32)
+        scans.write("seconds", frame, rng.normal(scale=0.05, size=50 + frame).astype(np.float32))
+        scans.write("sensor", frame, rng.integers(0, 3, 50 + frame).astype(np.uint8))
+        scans.write("origins", frame, places[rng.integers(0, 3, 50 + frame)])
     grids = sink.sequence(GRIDS)
     grids.write_document("evaluation/params.json", params(SIZE, "cylindrical"))
     for frame in (3, 4):

@@ -137,7 +137,7 @@ def test_empty_folders_and_folders_without_params_are_no_fields(tmp_path: Path) 
     (root / "predictions").mkdir()
     (root / "depth").mkdir()
     (root / "depth" / "000000.label").write_bytes(bytes(4))
-    assert FolderSource(root).sequences()[""].fields() == {"points", "labels"}
+    assert FolderSource(root).sequences()[""].fields() == {"points", "labels", "seconds", "sensor", "origins"}
 
 
 def test_frames_are_sorted_whatever_the_order_of_the_files(tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""The classes of other benchmarks, and maps to them: Occ3D-nuScenes, OpenOccupancy and SSCBench. Scores and exports use the same maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19
+
+IGNORED = -1
+"""Target of the classes that a benchmark leaves out: voxels of such a class do not count."""
+
+
+def _table(name: str, names: str, free: int) -> ClassTable:
+    words = names.split()
+    grey = {i: (110 + 13 * i % 120, 90 + 29 * i % 130, 80 + 47 * i % 140) for i in range(len(words))}
+    return ClassTable(name, dict(enumerate(words)), grey | {free: (255, 255, 255)})
+
+
+SSCBENCH = _table(
+    "sscbench",
+    "empty car bicycle motorcycle truck other-vehicle person road parking sidewalk other-ground building fence vegetation terrain pole"
+    " traffic-sign other-structure other-object",
+    0,
+)
+_NUSCENES = (
+    "barrier bicycle bus car construction-vehicle motorcycle pedestrian traffic-cone trailer truck driveable-surface other-flat sidewalk"
+    " terrain manmade vegetation"
+)
+OCC3D = _table("occ3d", f"others {_NUSCENES} free", 17)
+OPENOCCUPANCY = _table("openoccupancy", f"empty {_NUSCENES}", 0)
+
+# CARLA class -> (Occ3D, SSCBench), as CarlaOcc publishes the map; the 23 old tags have one Vehicle, a car.
+_CARLA = {
+    0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (11, 7), 8: (13, 9), 9: (16, 13), 10: (4, 1),
+    11: (15, 17), 12: (0, 16), 13: (17, 0), 14: (14, 10), 15: (15, 17), 16: (12, 10), 17: (1, 12), 18: (0, 16), 19: (0, 18), 20: (0, 18),
+    21: (12, 10), 22: (14, 14),
+}  # fmt: skip
+# The paper's 11 classes do not tell these apart: Barrier is fence, wall and guard rail; Pole holds signs and lights; Ground is terrain too.
+_CARLASC11 = {
+    0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (14, 14), 8: (13, 9), 9: (16, 13), 10: (4, 1),
+}  # fmt: skip
+# SSCBench's column is the set's own table. Occ3D's follows CarlaOcc: riders are people, signs are others. Its outliers are noise.
+_SEMANTICKITTI = {
+    0: (17, 0), 1: (IGNORED, IGNORED), 10: (4, 1), 11: (2, 2), 13: (3, 5), 15: (6, 3), 16: (9, 5), 18: (10, 4), 20: (0, 5), 30: (7, 6),
+    31: (7, IGNORED), 32: (7, IGNORED), 40: (11, 7), 44: (11, 8), 48: (13, 9), 49: (12, 10), 50: (15, 11), 51: (1, 12), 52: (15, 17),
+    60: (11, 7), 70: (16, 13), 71: (16, IGNORED), 72: (14, 14), 80: (15, 15), 81: (0, 16), 99: (0, 18), 252: (4, 1), 253: (7, IGNORED),
+    254: (7, 6), 255: (7, IGNORED), 256: (9, 5), 257: (3, 5), 258: (10, 4), 259: (0, 5),
+}  # fmt: skip
+_SEMANTICKITTI19 = {i: _SEMANTICKITTI[SEMANTICKITTI.id_of(name)] for i, name in SEMANTICKITTI19.names.items()}
+_MAPS = {"carla": _CARLA, "carlasc11": _CARLASC11, "semantickitti": _SEMANTICKITTI, "semantickitti19": _SEMANTICKITTI19}
+
+Maps = Mapping[str, Mapping[int, int]]
+"""Name of a class table -> id -> id of a benchmark's class, or IGNORED."""
+
+TO_OCC3D: Maps = MappingProxyType(
+    {name: {i: occ3d for i, (occ3d, _) in table.items()} for name, table in _MAPS.items()}
+    | {"occ3d": {i: i for i in OCC3D.names}}
+)
+TO_SSCBENCH: Maps = MappingProxyType(
+    {name: {i: sscbench for i, (_, sscbench) in table.items()} for name, table in _MAPS.items()}
+    | {"sscbench": {i: i for i in SSCBENCH.names}}
+)
+OCC3D_TO_OPENOCCUPANCY: Mapping[int, int] = MappingProxyType({0: IGNORED, 17: 0} | {i: i for i in range(1, 17)})
+"""Class of Occ3D -> class of OpenOccupancy, where "others" are noise."""
+
+SSCBENCH_TO_RAW: Mapping[int, int] = MappingProxyType(
+    dict(enumerate((0, 10, 11, 15, 18, 20, 30, 40, 44, 48, 49, 50, 51, 70, 72, 80, 81, 52, 99)))
+)
+"""Class of SSCBench -> raw id of SemanticKITTI in its files."""
