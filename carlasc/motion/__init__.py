@@ -6,7 +6,7 @@
 from carlasc.motion.bodies import Extent, seen_from, usual_shell
 from carlasc.motion.boxes import segment_by_boxes, tracks_from_boxes
 from carlasc.motion.evidence import HORIZON_S, Evidence, Sighting, find_evidence
-from carlasc.motion.ground import ground_points
+from carlasc.motion.ground import ground_height, ground_points
 from carlasc.motion.linking import Chain, Linker
 from carlasc.motion.movers import Movers, find_movers, follow_movers
 from carlasc.motion.segments import (
@@ -36,6 +36,7 @@ __all__ = [
     "find_evidence",
     "find_movers",
     "follow_movers",
+    "ground_height",
     "ground_points",
     "is_fast",
     "link_segments",

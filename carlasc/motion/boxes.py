@@ -72,8 +72,10 @@ def tracks_from_boxes(
         for row, track in enumerate(boxes[frame].tracks.tolist()):
             found.setdefault(track, []).append((frame, row))
     world = {frame: boxes[frame].transform(poses[frame]) for frame in boxes}
+    known = np.array(sorted(times), np.int64)
+    seconds = np.array([times[frame] for frame in known.tolist()])
     return [
-        _make_track(track, part, times)
+        _make_track(track, part, known, seconds)
         for track in sorted(found)
         for part in _split_at_jumps(_sightings([(frame, world[frame], row) for frame, row in found[track]], times))
     ]
@@ -111,12 +113,17 @@ def segment_by_boxes(
         usable &= ~np.isin(scan.labels, sorted(ground))
     candidates = np.flatnonzero(usable)
     points = transform_points(world_T_sensor, scan.points[candidates])
+    labels = None if scan.labels is None else scan.labels[candidates]
+    order = np.argsort(points[:, 0], kind="stable")
+    along = points[order, 0]
     for index in np.argsort([-np.prod(track.size) for track in tracks], kind="stable").tolist():
         track = tracks[index]
         pose = track.pose(frame)
         if pose is not None:
-            labels = None if scan.labels is None else scan.labels[candidates]
-            owners[candidates[_inside(track, pose, points, labels, floor_m)]] = index
+            reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)))
+            near = order[slice(*np.searchsorted(along, [pose[0, 3] - reach, pose[0, 3] + reach]))]
+            members = near[_inside(track, pose, points[near], None if labels is None else labels[near], floor_m)]
+            owners[candidates[members]] = index
     segments = []
     for index, track in enumerate(tracks):
         members = np.flatnonzero(owners == index)
@@ -136,7 +143,7 @@ def _inside(
 ) -> NDArray[np.int64]:
     """Return the indices of the points (M, 3), world, that are in a track's box at a pose, and not on the ground below it."""
     reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)))
-    near = np.flatnonzero((np.abs(points - pose[:3, 3]) <= reach).all(axis=1))
+    near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
     body = transform_points(invert(pose), points[near])
     inside = ((body >= track.lower) & (body <= track.upper)).all(axis=1)
     above = body[:, 2] > track.lower[2] + BODY_MARGIN_M + floor_m
@@ -166,11 +173,13 @@ def _split_at_jumps(sightings: _Sightings) -> list[_Sightings]:
     return [sightings.part(rows) for rows in np.split(np.arange(len(sightings.frames)), jumps)]
 
 
-def _make_track(instance: int, sightings: _Sightings, times: Mapping[int, float]) -> Track:
+def _make_track(
+    instance: int, sightings: _Sightings, known: NDArray[np.int64], known_seconds: NDArray[np.float64]
+) -> Track:
+    """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
     seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
     headings, tilt = _headings_and_tilt(sightings.poses[:, :3, :3])
-    frames = np.array(sorted(times), np.int64)
-    at = np.array([times[frame] for frame in frames.tolist()])
+    frames, at = known, known_seconds
     path, speed = smooth(centers, seconds, sightings.weights, _SMOOTH_S)
     stands = _stands(path, centers, seconds)
     if stands:
@@ -182,10 +191,15 @@ def _make_track(instance: int, sightings: _Sightings, times: Mapping[int, float]
         inside = (at > seconds[0] - _EXTRAPOLATE_S) & (at < seconds[-1] + _EXTRAPOLATE_S)
         frames = frames[inside]
     every = np.arange(frames[0], frames[-1] + 1)
-    at = np.interp(every, sorted(times), [times[frame] for frame in sorted(times)])
-    path, speed = resample(at, seconds, path, speed)
-    poses = np.stack([rotation_z(angle) @ tilt for angle in np.interp(at, seconds, turns)])
-    poses[:, :3, 3] = path
+    at = np.interp(every, known, known_seconds)
+    if stands:  # one pose for all frames, in the memory of one
+        pose = rotation_z(turns[0]) @ tilt
+        pose[:3, 3] = path[0]
+        poses, speed = np.broadcast_to(pose, (len(every), 4, 4)), np.broadcast_to(speed[0], (len(every), 3))
+    else:
+        path, speed = resample(at, seconds, path, speed)
+        poses = np.stack([rotation_z(angle) @ tilt for angle in np.interp(at, seconds, turns)])
+        poses[:, :3, 3] = path
     half = np.median(sightings.sizes, axis=0) / 2
     return Track(
         label=int(np.bincount(sightings.labels).argmax()),

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.cells import as_pose, cached
-from carlasc.core.geometry import Transform, invert, thin, transform_points
+from carlasc.core.geometry import Transform, invert, thin, transform_points, translation
+from carlasc.core.scans import runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
 from carlasc.motion.visibility import View, look_up
@@ -30,6 +31,7 @@ _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, s
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and the others are as it is
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points is one object, which moved with all its points
+_SAME_PLACE_M = 0.2  # rays that began within this distance of each other are looked up together
 _PERIOD_S = 0.1  # between scans whose times do not rise
 
 
@@ -45,6 +47,7 @@ class Sighting:
         ground: (N,) bool, which points are ground; None to find out from their positions.
         labels: (N,) class ids; None if the scan has none.
         explained: (N,) bool, points of actors that are known already; None if there are none. They are never evidence.
+        origins: (N, 3) where the ray of each point began, metres; None: at the sensor. Points with one origin are next to each other.
     """
 
     frame: int
@@ -54,6 +57,7 @@ class Sighting:
     ground: NDArray[np.bool_] | None = None
     labels: NDArray[np.unsignedinteger] | None = None
     explained: NDArray[np.bool_] | None = None
+    origins: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -103,7 +107,16 @@ class _Kept:
 
     scan: Sighting
     seconds: float
-    view: View
+    views: tuple[tuple[Transform, View], ...]
+
+    @classmethod
+    def of(cls, scan: Sighting, seconds: float) -> _Kept:
+        """Sort the points of a scan by the places from which they were seen: (place_T_world, view) for each."""
+        views = []
+        for part, origin in _places(scan):
+            place_T_world = invert(scan.world_T_sensor @ translation(origin))
+            views.append((place_T_world, View.of(scan.points[part] - origin if origin.any() else scan.points[part])))
+        return cls(scan, seconds, tuple(views))
 
 
 def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -> Iterator[Evidence]:
@@ -123,7 +136,7 @@ def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -
     for scan in scans:
         seconds = scan.seconds if scan.seconds > last else (last + _PERIOD_S if np.isfinite(last) else 0.0)
         last = seconds
-        window.append(_Kept(scan, seconds, View.of(scan.points)))
+        window.append(_Kept.of(scan, seconds))
         while window[-1].seconds - window[current].seconds > HORIZON_S:
             yield _evidence(window, current, movable)
             current += 1
@@ -155,6 +168,17 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> E
     return Evidence(scan.frame, own.seconds, len(scan.points), tuple(clusters), tuple(points), tuple(classes))
 
 
+def _places(scan: Sighting) -> list[tuple[slice, NDArray[np.float32]]]:
+    """Return the places from which the points of a scan were seen. Neighbouring places of one sensor that moves count as their middle."""
+    joined: list[tuple[slice, list[NDArray[np.float32]]]] = []
+    for part, origin in runs_of_origins(scan.origins, len(scan.points)):
+        if joined and np.linalg.norm(origin - joined[-1][1][0]) < _SAME_PLACE_M:
+            joined[-1] = (slice(joined[-1][0].start, part.stop), [*joined[-1][1], origin])
+        else:
+            joined.append((part, [origin]))
+    return [(part, np.mean(origins, axis=0, dtype=np.float32)) for part, origins in joined]
+
+
 def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
     """Return the positions of the scans to look up, before and after the current one, nearest first."""
     seconds = np.array([kept.seconds for kept in window]) - window[current].seconds
@@ -175,9 +199,9 @@ def _judge(
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
     for side, others in enumerate((before, after)):
         for bit, other in enumerate(others):
-            pose = as_pose(invert(other.scan.world_T_sensor) @ scan.world_T_sensor)
-            view = other.view
-            look_up(points, pose, view.start, view.slope, view.distance, bit, free[side], hit[side])
+            for place_T_world, view in other.views:
+                pose = as_pose(place_T_world @ scan.world_T_sensor)
+                look_up(points, pose, view.start, view.slope, view.distance, bit, free[side], hit[side])
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)
     # Bits above the highest hit are those of the scans farther away than all that saw the place occupied.

@@ -1,7 +1,8 @@
 """Ground without labels: the points of a scan that lie on the surface that the vehicle stands on.
 
-The area around the sensor is divided into sectors and rings. In each sector the ground is followed outwards over the lowest points: the next ring
-belongs to it if the step up or down is one that a road or a kerb can have. Elsewhere the ground is interpolated.
+The area around the sensor is divided into sectors and rings. A plane through the lowest points nearby gives the height of the ground below the
+sensor, and its slope, or the tilt of the sensor. In each sector the ground is then followed outwards over the lowest points: the next ring
+belongs to it if the step up or down from this slope is one that a road or a kerb can have. Elsewhere the ground is interpolated.
 """
 
 from __future__ import annotations
@@ -14,83 +15,148 @@ from numpy.typing import NDArray
 from carlasc.core.cells import cached, fast_azimuth, fingerprint
 
 _SECTORS, _RINGS, _RING_M = 120, 160, 0.5
-_STEP_M, _SLOPE, _FAR_M = (
-    0.12,
-    0.08,
-    3.0,
-)  # greatest step between rings, and its growth with their distance up to a limit
-_SEED_M = (2.0, 12.0)  # rings whose lowest points tell the height of the ground below the sensor
-_ABOVE_M = 0.12  # points at most this far above the ground belong to it
+_BLIND_M = 1.0  # nearer points are on the vehicle
+# Greatest step between rings, and its growth with their distance up to a limit.
+_STEP_M, _SLOPE, _FAR_M = 0.12, 0.08, 3.0
+_TREND_M = 8.0  # the slope of the ground so far is that over this distance
+_KERB_M = 0.2  # highest step within a cell
+_ABOVE_M, _BELOW_M = 0.12, 0.5  # points at most this far above or below the ground belong to it
+
+_PLANE_RINGS = slice(4, 30)  # the plane is that of the lowest points at 2 to 15 m
+_TRIALS, _STEEPEST = 300, 0.25  # planes that are tried, and the greatest slope of one
+_ON_PLANE_M = 0.1  # points of a plane are this near to it
+_NEAR_M = 6.0  # those farther from the sensor count less
+_MIN_CELLS, _MIN_SHARE = 20, 0.2  # a plane has so many cells, and this share of those with points
 
 
-def ground_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return which points of a scan lie on the ground.
 
+    Points more than half a metre below the ground, which are returns of mirror images, are not among them. If no plane is found below the
+    sensor, as in a scan of few points, no point is.
+
     Args:
-        points: (N, 3) float32, metres, in the frame of a sensor that is mounted upright.
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first; finite.
 
     Returns:
         (N,) bool.
     """
-    return _ground(np.ascontiguousarray(points[:, :3], np.float32))
+    own = np.ascontiguousarray(points[:, :3], np.float32)
+    sector, ring, lowest = _lowest(own)
+    plane = _plane(own, lowest)
+    if plane is None:
+        return np.zeros(len(own), np.bool_)
+    return _ground(own, sector, ring, lowest, plane)
+
+
+def ground_height(points: NDArray[np.floating]) -> float:
+    """Return z of the ground below the sensor: minus the height of the sensor, in the sensor's own frame.
+
+    It is that of the plane which most of the lowest points at 2 to 15 m have in common, so a tilted sensor, a slope, and points below the
+    ground do not change it. On a curved road it is off by the curve within some 10 m.
+
+    Args:
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first; finite.
+
+    Returns:
+        Metres; NaN if no plane is found.
+    """
+    own = np.ascontiguousarray(points[:, :3], np.float32)
+    plane = _plane(own, _lowest(own)[2])
+    return float("nan") if plane is None else float(plane[2])
 
 
 @cached
-def _ground(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    """Return (N,) the sector and the ring of each point, and (S, R) the lowest point of each cell, -1 where there is none."""
     _ = _CODE
-    lowest = np.full((_SECTORS, _RINGS), np.inf)
+    lowest = np.full((_SECTORS, _RINGS), -1, np.int64)
     sector, ring = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
     for i in range(len(points)):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        x, y = float(points[i, 0]), float(points[i, 1])
         flat = math.sqrt(x * x + y * y)
         s = int((fast_azimuth(x, y) + math.pi) * (_SECTORS / (2 * math.pi))) % _SECTORS if flat > 0 else 0
         r = min(int(flat / _RING_M), _RINGS - 1)
         sector[i], ring[i] = s, r
-        if flat > 1.0 and z < lowest[s, r]:
-            lowest[s, r] = z
-    heights = np.empty((_SECTORS, _RINGS))
-    seed = _seed(lowest)
+        if flat > _BLIND_M and (lowest[s, r] < 0 or points[i, 2] < points[lowest[s, r], 2]):
+            lowest[s, r] = i
+    return sector, ring, lowest
+
+
+def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Return (slope along x, slope along y, z at the sensor) of the plane that most of the lowest points nearby have in common."""
+    near = lowest[:, _PLANE_RINGS]
+    chosen = points[near[near >= 0]].astype(np.float64)
+    if len(chosen) < _MIN_CELLS:
+        return None
+    rows = np.column_stack([chosen[:, :2], np.ones(len(chosen))])
+    samples = np.random.default_rng(0).integers(0, len(chosen), (_TRIALS, 3))
+    samples = samples[np.abs(np.linalg.det(rows[samples])) > 1.0]  # twice the area of the triangle, in square metres
+    planes = np.linalg.solve(rows[samples], chosen[samples, 2][..., None])[..., 0]
+    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < _STEEPEST]
+    if not len(planes):
+        return None
+    weight = 1.0 / np.maximum(np.hypot(chosen[:, 0], chosen[:, 1]) / _NEAR_M, 1.0)
+    on_plane = np.abs(planes @ rows.T - chosen[:, 2]) < _ON_PLANE_M
+    on = on_plane[int((on_plane @ weight).argmax())]
+    if on.sum() < max(_MIN_CELLS, _MIN_SHARE * len(chosen)):
+        return None
+    found: NDArray[np.float64] = np.linalg.lstsq(rows[on] * weight[on, None], chosen[on, 2] * weight[on], rcond=None)[0]
+    return found
+
+
+@cached
+def _ground(
+    points: NDArray[np.float32],
+    sector: NDArray[np.int32],
+    ring: NDArray[np.int32],
+    lowest: NDArray[np.int64],
+    plane: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    _ = _CODE
+    heights = np.empty((_SECTORS, _RINGS))  # above the plane
+    least = np.empty(_RINGS)
     for s in range(_SECTORS):
-        _follow(lowest[s], seed, heights[s])
+        for r in range(_RINGS):
+            least[r] = np.inf if lowest[s, r] < 0 else _above(points[lowest[s, r]], plane)
+        _follow(least, heights[s])
     ground = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         s, r = sector[i], ring[i]
         # A neighbour corrects a sector that went astray below or beside an object.
         a, b, c = heights[s - 1, r], heights[s, r], heights[(s + 1) % _SECTORS, r]
         middle = max(min(a, b), min(max(a, b), c))
-        ground[i] = points[i, 2] < middle + _ABOVE_M
+        # The cell of a kerb holds points of the road, whose height it has, and of the pavement, which the next ring is on.
+        step = min(max(heights[s, r - 1] if r else b, b, heights[s, min(r + 1, _RINGS - 1)]) - b, _KERB_M)
+        ground[i] = -_BELOW_M < _above(points[i], plane) - middle < _ABOVE_M + step
     return ground
 
 
 @cached
-def _seed(lowest: NDArray[np.float64]) -> float:
-    """Return the height of the ground below the sensor: the median of each sector's lowest point nearby."""
-    found = np.empty(_SECTORS)
-    count = 0
-    for s in range(_SECTORS):
-        least = np.inf
-        for r in range(int(_SEED_M[0] / _RING_M), int(_SEED_M[1] / _RING_M)):
-            least = min(least, lowest[s, r])
-        if least < np.inf:
-            found[count] = least
-            count += 1
-    return float(np.median(found[:count])) if count else -np.inf
+def _above(point: NDArray[np.float32], plane: NDArray[np.float64]) -> float:
+    """Return how far a point is above a plane, in metres along z."""
+    return float(point[2] - (plane[0] * point[0] + plane[1] * point[1] + plane[2]))
 
 
 @cached
-def _follow(lowest: NDArray[np.float64], seed: float, heights: NDArray[np.float64]) -> None:
-    """Fill the (R,) heights of the ground in the rings of one sector, from (R,) lowest points."""
-    last, at = -1, seed
+def _follow(lowest: NDArray[np.float64], heights: NDArray[np.float64]) -> None:
+    """Fill the (R,) heights of the ground in the rings of one sector, from (R,) lowest points, both above the plane below the sensor."""
+    last, at, slope = -1, 0.0, 0.0
     for r in range(_RINGS):
         if lowest[r] == np.inf:
             continue
         distance = (r - last) * _RING_M
-        step = abs(lowest[r] - at)
-        if step > _STEP_M + _SLOPE * min(distance, _FAR_M) + (_ABOVE_M if last < 0 else 0.0):
+        reached = min(distance, _FAR_M)
+        step = lowest[r] - at
+        limit = _STEP_M + _SLOPE * reached + (_ABOVE_M if last < 0 else 0.0)
+        # a road that rises goes on rising
+        if abs(step) > limit and abs(step - slope * distance) > limit:
             continue
         for k in range(last + 1, r + 1):
-            heights[k] = at + (lowest[r] - at) * ((k - last) / (r - last))
+            heights[k] = at + step * ((k - last) / (r - last))
         last, at = r, lowest[r]
+        before = r - int(_TREND_M / _RING_M)
+        slope = (at - heights[before]) / _TREND_M if before >= 0 else 0.0
     for k in range(last + 1, _RINGS):
         heights[k] = at
 

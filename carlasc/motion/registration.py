@@ -25,6 +25,7 @@ _SIDE_M = 0.14  # standard deviation, across a side, of points of this side alon
 _LINE_M = 0.06  # points with a smaller standard deviation across form a line, which has no plane
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
+_DEVIATIONS = 2.0  # the first reach is at least so many standard deviations of the prediction
 _POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and the number of points with independent errors
 _PREDICTED = np.array(
     [0.2, 0.2, 0.01, 0.02]
@@ -94,8 +95,9 @@ def _register(
         shifts: directions in which the ends of what is seen moved since then, and how far: see `_shift_of_ends`.
     """
     state = predicted.copy()
+    first_reach = max(_FIRST_REACH_M, _DEVIATIONS * float(error[:2].max()))
     for iteration in range(_ITERATIONS):
-        reach = _FIRST_REACH_M * (_LAST_REACH_M / _FIRST_REACH_M) ** (iteration / (_ITERATIONS - 1))
+        reach = first_reach * (_LAST_REACH_M / first_reach) ** (iteration / (_ITERATIONS - 1))
         pose = _pose(state)
         nearest, squared = nearest_points(transform_points(invert(pose), points), model)
         pairs = np.flatnonzero(squared < reach**2)

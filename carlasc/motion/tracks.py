@@ -59,6 +59,14 @@ class Track:
         row = frame - self.first
         return self.velocity[row] if 0 <= row < len(self.velocity) else None
 
+    def between(self, first: int, last: int) -> Track:
+        """Return the track at the frames from `first` to `last` only: small enough to be sent to a worker."""
+        start = max(self.first, first)
+        rows = slice(start - self.first, max(last + 1 - self.first, start - self.first))
+        members = {frame: own for frame, own in self.members.items() if first <= frame <= last}
+        poses, velocity = self.world_T_actor[rows], self.velocity[rows]
+        return replace(self, members=members, first=start, world_T_actor=poses, velocity=velocity)
+
     @property
     def size(self) -> NDArray[np.float64]:
         """(3,) metres: length, width, height of the body."""

@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
+from carlasc.converting import Sensor
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.errors import ArgumentError
 from carlasc.motion.odometry import estimate_poses
+from carlasc.testing.drives import SimulatedDrive, Thing
 
 pytest.importorskip("kiss_icp")
 
@@ -50,3 +52,78 @@ def test_no_scans_have_no_poses():
 
 def test_a_scan_alone_is_where_it_is_however_few_its_points():
     assert np.array_equal(estimate_poses([np.zeros((5, 3))]), np.eye(4)[None])
+
+
+class Bend(SimulatedDrive):
+    """A drive in a circle with a radius of 12 m, from its first scan on at full speed."""
+
+    def world_T_vehicle(self, seconds):
+        way = self.speed * np.asarray(seconds)
+        cos, sin = np.cos(way / 12.0), np.sin(way / 12.0)
+        poses = np.tile(np.eye(4), (*way.shape, 1, 1))
+        poses[..., 0, 0], poses[..., 0, 1], poses[..., 1, 0], poses[..., 1, 1] = cos, -sin, sin, cos
+        poses[..., 0, 3], poses[..., 1, 3] = 12.0 * sin, 12.0 * (1 - cos)
+        return poses
+
+
+def houses_about(x, y, seed=1):
+    rng = np.random.default_rng(seed)
+    for angle in np.linspace(0, 2 * np.pi, 26, endpoint=False):
+        middle = rng.uniform(20, 32) * np.array([np.cos(angle), np.sin(angle)]) + (x, y)
+        yield Thing("building", (*middle, 4.0), (*rng.uniform(2, 6, 2), 8.0), rng.uniform(0, 3))
+
+
+@pytest.fixture(scope="module")
+def bend():
+    """Return the drive, its scans, and first_T_sensor at the times of its frames."""
+    things = tuple(houses_about(0.0, 12.0))
+    drive = Bend(frames=20, rolling=True, speed=8.0, channels=32, columns=540, things=things)
+    world_T_sensor = drive.world_T_vehicle(drive.times) @ drive.sensors[0].vehicle_T_sensor
+    return drive, [drive.scan(frame) for frame in range(20)], invert(world_T_sensor[0]) @ world_T_sensor
+
+
+def step_errors(estimated, true):
+    steps = [invert(poses[:-1]) @ poses[1:] for poses in (estimated, true)]
+    return np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1)
+
+
+def test_a_drive_may_start_at_any_speed(bend):
+    _, scans, true = bend
+    estimated = estimate_poses([scan.deskewed[:, :3] for scan in scans], max_range_m=50.0)
+    assert step_errors(estimated, true).max() < 0.06  # of 0.8 m; registered forwards only, 0.4 m
+
+
+@pytest.mark.parametrize("height_m", [1.0, 2.5])
+def test_the_sensor_may_be_at_any_height(height_m):
+    sensors = (Sensor("lidar", translation((0.0, 0.0, height_m))),)
+    drive = SimulatedDrive(frames=20, speed=10.0, channels=32, columns=540, sensors=sensors)
+    true = invert(drive.world_T_vehicle(0.0)) @ drive.world_T_vehicle(drive.times)
+    estimated = estimate_poses([drive.scan(frame).points[:, :3] for frame in range(20)], max_range_m=50.0)
+    assert np.linalg.norm((estimated - true)[-1, :2, 3]) < 0.15
+    assert step_errors(estimated, true).max() < 0.06
+
+
+def test_poses_of_rolling_scans_are_those_at_the_times_of_the_frames(bend):
+    drive, scans, true = bend
+    points, seconds = [scan.points[:, :3] for scan in scans], [scan.seconds for scan in scans]
+    estimated = estimate_poses(points, seconds=seconds, times=drive.times, max_range_m=50.0)
+    raw = estimate_poses(points, max_range_m=50.0)
+    assert np.linalg.norm((estimated - true)[-1, :2, 3]) < 0.1
+    assert np.linalg.norm((raw - true)[-1, :2, 3]) > 0.2
+    assert step_errors(estimated, true).max() < 0.06
+
+
+def test_frames_may_be_at_any_rate(bend):
+    drive, scans, true = bend
+    every_other = [(scan.points[:, :3], scan.seconds) for scan in scans[::2]]
+    points, seconds = zip(*every_other, strict=True)
+    estimated = estimate_poses(points, seconds=seconds, times=drive.times[::2], max_range_m=50.0)
+    assert np.linalg.norm((estimated - true[::2])[-1, :2, 3]) < 0.1
+
+
+def test_seconds_must_be_those_of_the_points():
+    scans = [np.zeros((200, 3))] * 2
+    with pytest.raises(ArgumentError, match="expected 200 of scan 1, one per point, found 199"):
+        estimate_poses(scans, seconds=[np.zeros(200), np.zeros(199)])
+    with pytest.raises(ArgumentError, match="expected 200 of scan 1, one per point, found 0"):
+        estimate_poses(scans, seconds=[np.zeros(200)])
