@@ -205,8 +205,9 @@ def _measure(task: _Task) -> HeldOutScores:
             found="none",
             advice="leave out fewer scans, or choose another stride",
         )
-    scan = task.whole.scan(task.frame, ("labels",))
-    distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    scan = task.whole.scan(task.frame, ("labels", "origins"))
+    origins = scan.others.get("origins")
+    distance = np.linalg.norm((scan.points if origins is None else scan.points - origins).astype(np.float64), axis=1)
     keep = (distance >= feed.min_range_m) & (distance <= feed.max_range_m)
     if scan.labels is not None:
         feed.classes.check(scan.labels, f"{task.whole.location}: labels of frame {task.frame}")
@@ -215,4 +216,5 @@ def _measure(task: _Task) -> HeldOutScores:
     here = invert(feed.pose(task.frame))
     others = [here @ feed.pose(other) for other in window]
     labels = None if scan.labels is None else scan.labels[keep]
-    return HeldOutScores.of(grid, feed.classes, scan.points[keep], labels, others)
+    origins = None if origins is None else origins[keep]
+    return HeldOutScores.of(grid, feed.classes, scan.points[keep], labels, others, origins)

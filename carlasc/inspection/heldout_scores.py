@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import runs_of_origins, sorted_by_origin
 from carlasc.metrics.casting import follow_rays
 
 BANDS_M = (0.0, 10.0, 20.0, 30.0, np.inf)
@@ -93,6 +94,7 @@ class HeldOutScores:
         points: NDArray[np.floating],
         labels: NDArray[np.integer] | None,
         grid_T_vehicles: Iterable[Transform] = (),
+        origins: NDArray[np.floating] | None = None,
     ) -> HeldOutScores:
         """Measure one frame.
 
@@ -102,6 +104,7 @@ class HeldOutScores:
             points: (N, 3) metres, the scan, sensor frame.
             labels: (N,) class ids; None if the scan has no labels.
             grid_T_vehicles: (4, 4) poses of the sensor in the other frames of the window, in the frame of the grid.
+            origins: (N, 3) metres, where the ray of each point began, sensor frame; None: at the sensor.
 
         Raises:
             ArgumentError: the grid is cylindrical.
@@ -111,10 +114,13 @@ class HeldOutScores:
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
         voxels = spec.flat_index(points)
         inside = (voxels >= 0) & np.any(points != 0, axis=1)
-        points, voxels = points[inside].astype(np.float64), voxels[inside]
+        points, voxels = np.asarray(points[inside], np.float64), voxels[inside]
+        begun: NDArray[np.float64] = (
+            np.zeros_like(points) if origins is None else np.asarray(origins[inside], np.float64)
+        )
         kind = np.full(len(points), classes.geometry_id) if labels is None else labels[inside].astype(np.int64)
-        first, passed = follow_rays(solid, spec, np.zeros(3), points)
-        ranges = np.linalg.norm(points, axis=1)
+        first, passed = _follow(solid, spec, begun, points)
+        ranges = np.linalg.norm(points - begun, axis=1)
         known, hit = grid.known.reshape(-1)[voxels], occupied.reshape(-1)[voxels]
         properties = np.zeros((len(points), 6), np.bool_)
         properties[:, _RETURNS], properties[:, _FREE], properties[:, _UNKNOWN] = True, known & ~hit, ~known
@@ -247,3 +253,15 @@ def _quantile(errors: NDArray[np.int64], share: float) -> float | None:
 def _band_names() -> Iterator[str]:
     for low, high in pairwise(BANDS_M):
         yield f"{low:.0f}-{high:.0f} m" if np.isfinite(high) else f"{low:.0f} m and more"
+
+
+def _follow(
+    solid: NDArray[np.uint8], spec: GridSpec, origins: NDArray[np.floating], points: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return what `follow_rays` returns, for (N, 3) rays that begin at (N, 3) origins, of which there are few different ones."""
+    order = sorted_by_origin(origins)
+    first, passed = np.empty(len(points)), np.empty(len(points), np.uint8)
+    for part, origin in runs_of_origins(origins[order], len(points)):
+        rows = order[part]
+        first[rows], passed[rows] = follow_rays(solid, spec, origin.astype(np.float64), points[rows])
+    return first, passed

@@ -92,7 +92,9 @@ class TestKept:
         near = ACTORS.between(5, 8)
         assert list(near.tracks) == [0]
         assert sorted(near.tracks[0].members) == [5, 6, 7, 8]
-        assert np.array_equal(near.tracks[0].world_T_actor, ACTORS.tracks[0].world_T_actor)
+        for frame in range(5, 9):
+            assert np.array_equal(near.tracks[0].pose(frame), ACTORS.tracks[0].pose(frame))
+        assert near.tracks[0].pose(4) is near.tracks[0].pose(9) is None
         assert sorted(near.moving) == [8]
         assert not ACTORS.between(30, 40).tracks and not ACTORS.between(30, 40).moving
 

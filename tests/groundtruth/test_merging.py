@@ -208,7 +208,7 @@ def around(turn, points):
     """A scan of points that are turned around the sensor by an angle, and the box that stays 4 m away in this direction."""
     turned = transform_points(rotation_z(turn), np.array(points, float)).astype(np.float32)
     scan = PreparedScan.of(0, turned, np.ones(len(turned), np.uint16), np.eye(4))
-    return scan.rays_through(rotation_z(-turn), np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])).tolist()
+    return scan.rays[0].through(rotation_z(-turn), np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])).tolist()
 
 
 @pytest.mark.parametrize("turn", np.linspace(-np.pi, np.pi, 9))
@@ -229,11 +229,11 @@ def test_rays_through_a_box_end_in_it_or_behind_it(turn):
 def test_a_box_around_below_or_beside_the_sensor_is_seen_whole():
     points = np.array([(5, 0, -2), (-5, 0, -2), (0, 5, -2), (0, -5, -2)], np.float32)
     scan = PreparedScan.of(0, points, np.ones(4, np.uint16), np.eye(4))
-    below = scan.rays_through(np.eye(4), np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0]))
+    below = scan.rays[0].through(np.eye(4), np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0]))
     assert sorted(below.tolist()) == [0, 1, 2, 3]
-    beside = scan.rays_through(np.eye(4), np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0]))
+    beside = scan.rays[0].through(np.eye(4), np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0]))
     assert beside.tolist() == [2]
-    corner = scan.rays_through(np.eye(4), np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0]))
+    corner = scan.rays[0].through(np.eye(4), np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0]))
     assert corner.tolist() == [1]
 
 

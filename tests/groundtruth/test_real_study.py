@@ -157,7 +157,7 @@ def test_the_archive_is_read(real, tmp_path):
         archive.extractall(tmp_path, filter="data")
     (training,) = tmp_path.rglob("training")
     scans = read_scans(training.parent)
-    boxes = read_boxes(training.parent, list(scans))
+    boxes = read_boxes(training.parent)
     assert sorted(scans) == list(range(20, 105))
     assert {track for found in boxes.values() for track in found.tracks.tolist()} == {1, 2, 4}
     for frame in (20, 60, 104):

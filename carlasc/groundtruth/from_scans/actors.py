@@ -10,7 +10,7 @@ import io
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 from zipfile import BadZipFile
 
@@ -51,11 +51,8 @@ class Actors:
 
     def between(self, first: int, last: int) -> Actors:
         """Return what concerns the frames from `first` to `last`: small enough to be sent to a worker with every frame."""
-        tracks = {}
-        for number, track in self.tracks.items():
-            members = {frame: own for frame, own in track.members.items() if first <= frame <= last}
-            if members or (track.first <= last and track.first + len(track.world_T_actor) > first):
-                tracks[number] = replace(track, members=members)
+        near = {number: track.between(first, last) for number, track in self.tracks.items()}
+        tracks = {number: track for number, track in near.items() if track.members or len(track.world_T_actor)}
         return Actors(tracks, {frame: own for frame, own in self.moving.items() if first <= frame <= last})
 
     def to_bytes(self, key: str) -> bytes:

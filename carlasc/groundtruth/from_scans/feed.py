@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, thin
 from carlasc.core.grids import GridSpec
-from carlasc.core.scans import Scan, check_finite
+from carlasc.core.scans import Scan, check_finite, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
@@ -39,6 +39,7 @@ from carlasc.storage.protocol import Sequence
 
 _SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground
+_USED = ("labels", "flow", "instances", "origins")  # fields of a scan that are read for merging
 _PARTS = 30  # with `window_m`, scans are at least this fraction of it apart
 
 
@@ -133,7 +134,9 @@ class ScanFeed:
             if name in fields and (name == "boxes" or "labels" in fields)
         ]
         if asked == "auto":
-            return (*usable[:1], *(() if "flow" in usable else ("evidence",)))
+            # Boxes show what annotators saw, often in the view of a camera only; flow that comes from them knows no more.
+            whole = "flow" in usable and "boxes" not in usable
+            return (*usable[:1], *(() if whole else ("evidence",)))
         if asked not in usable:
             raise MissingDataError(
                 self.sequence.location,
@@ -236,7 +239,13 @@ class ScanFeed:
         if "flow" in self.motion and scan.flow is not None:
             moving |= is_fast(scan.flow, self.options.min_speed_m_s)
         return PreparedScan.of(
-            frame, scan.points, _labels(scan), self.pose(frame), seconds=self.time(frame), moving=np.flatnonzero(moving)
+            frame,
+            scan.points,
+            _labels(scan),
+            self.pose(frame),
+            seconds=self.time(frame),
+            moving=np.flatnonzero(moving),
+            origins=scan.others.get("origins"),
         )
 
     def sighting(self, frame: int, boxes: Sequence_[Track]) -> Sighting:
@@ -252,7 +261,8 @@ class ScanFeed:
             explained[segment.members] = True
         ground = np.isin(_labels(scan), sorted(self.classes.ground))
         labels = _labels(scan) if self.has_labels else None
-        return Sighting(frame, scan.points, pose, self.time(frame), ground, labels, explained)
+        origins = scan.others.get("origins")
+        return Sighting(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)
 
     def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
         """Return the actors of a scan, as the sequence's own fields show them.
@@ -275,8 +285,8 @@ class ScanFeed:
         return ScanMotion(frame, tuple(found), standing)
 
     def _voting_points(self, frame: int) -> Scan:
-        """Read a scan without the points that do not vote: unlabelled, too near or too far."""
-        scan = self.sequence.scan(frame)
+        """Read a scan without the points that do not vote: unlabelled, too near or too far. Points with one origin are together."""
+        scan = self.sequence.scan(frame, _USED)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
             scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
@@ -284,8 +294,14 @@ class ScanFeed:
             scan = replace(scan, labels=self._with_ground(scan.points, _labels(scan)))
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
-        distance = np.sqrt(np.square(scan.points).sum(axis=1))
-        return scan.select((labels > 0) & (distance >= self.min_range_m) & (distance <= self.max_range_m))
+        origins = scan.others.get("origins")
+        distance = np.sqrt(np.square(scan.points if origins is None else scan.points - origins).sum(axis=1))
+        voting = (labels > 0) & (distance >= self.min_range_m) & (distance <= self.max_range_m)
+        if origins is None:
+            return scan.select(voting)
+        check_finite(origins, f"{self.sequence.location}: origins of frame {frame}")
+        order = sorted_by_origin(origins)
+        return scan.select(order[voting[order]])
 
     def _with_ground(self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:
         """Return labels in which geometry without a class that lies on the ground has a ground class, so that it votes as ground does."""

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.core.grids import GridSpec
+from carlasc.core.scans import runs_of_origins
 from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.regions import STATIC, Regions
 from carlasc.groundtruth.options import Dynamic
@@ -48,58 +49,38 @@ class Instant:
 
 
 @dataclass(frozen=True)
-class PreparedScan:
-    """A scan that is ready for merging: decoded once, and used for every frame whose window contains it.
+class Rays:
+    """Those rays of a scan that began at one place.
 
     Attributes:
-        frame: frame number.
-        points: (N, 3) float32, metres, sensor frame.
-        labels: (N,) uint16; 0 casts no vote.
-        world_T_sensor: (4, 4).
-        reach_m: distance of the farthest point, metres.
-        seconds: time of the scan.
-        moving: (M,) indices of the points that move by their flow or their class, on a track or not.
-        order: (N,) int32, indices of the points by increasing azimuth.
-        azimuth: (N,) float32, radians, in this order.
+        part: the points of the scan to which they go.
+        sensor_T_place: (4, 4), from the place where they began, in the axes of the sensor, to the sensor's frame.
+        points: (M, 3) float32, the same points seen from there, metres.
+        order: (M,) int32, indices of `points` by increasing azimuth.
+        azimuth: (M,) float32, radians, in this order.
     """
 
-    frame: int
+    part: slice
+    sensor_T_place: Transform
     points: NDArray[np.float32]
-    labels: NDArray[np.uint16]
-    world_T_sensor: Transform
-    reach_m: float
-    seconds: float
-    moving: NDArray[np.int64]
     order: NDArray[np.int32]
     azimuth: NDArray[np.float32]
 
     @classmethod
-    def of(
-        cls,
-        frame: int,
-        points: NDArray[np.float32],
-        labels: NDArray[np.unsignedinteger],
-        world_T_sensor: Transform,
-        *,
-        seconds: float = 0.0,
-        moving: NDArray[np.int64] | None = None,
-    ) -> PreparedScan:
-        """Prepare the voting points of a scan."""
-        azimuth = np.arctan2(points[:, 1], points[:, 0])
+    def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> Rays:
+        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan."""
+        own = points[part] - origin.astype(np.float32) if origin.any() else points[part]
+        azimuth = np.arctan2(own[:, 1], own[:, 0])
         order = np.argsort(azimuth, kind="stable").astype(np.int32)
-        reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
-        moving = np.empty(0, np.int64) if moving is None else moving
-        return cls(
-            frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, order, azimuth[order]
-        )
+        return cls(part, translation(origin), own, order, azimuth[order])
 
-    def rays_through(
+    def through(
         self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.int32]:
-        """Return the indices of the points whose rays, from the sensor to the point, intersect a box.
+        """Return the indices of the points whose rays, from where they began to the point, intersect a box.
 
         Args:
-            box_T_sensor: (4, 4), from the sensor's frame to the frame in which the box is axis-aligned.
+            box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is axis-aligned.
             lower: (3,) lower corner.
             upper: (3,) upper corner.
         """
@@ -136,6 +117,69 @@ class PreparedScan:
         return np.concatenate(parts)
 
 
+@dataclass(frozen=True)
+class PreparedScan:
+    """A scan that is ready for merging: decoded once, and used for every frame whose window contains it.
+
+    Attributes:
+        frame: frame number.
+        points: (N, 3) float32, metres, sensor frame.
+        labels: (N,) uint16; 0 casts no vote.
+        world_T_sensor: (4, 4).
+        reach_m: distance of the farthest point, metres.
+        seconds: time of the scan.
+        moving: (M,) indices of the points that move by their flow or their class, on a track or not.
+        rays: the rays to the points, by where they began: at one place, unless there are several sensors, or the vehicle moved.
+    """
+
+    frame: int
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint16]
+    world_T_sensor: Transform
+    reach_m: float
+    seconds: float
+    moving: NDArray[np.int64]
+    rays: tuple[Rays, ...]
+
+    @classmethod
+    def of(
+        cls,
+        frame: int,
+        points: NDArray[np.float32],
+        labels: NDArray[np.unsignedinteger],
+        world_T_sensor: Transform,
+        *,
+        seconds: float = 0.0,
+        moving: NDArray[np.int64] | None = None,
+        origins: NDArray[np.float32] | None = None,
+    ) -> PreparedScan:
+        """Prepare the voting points of a scan. Those with the same origin, (N, 3), must be next to each other; None: all are at the sensor."""
+        reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
+        moving = np.empty(0, np.int64) if moving is None else moving
+        rays = tuple(Rays.of(points, part, origin) for part, origin in runs_of_origins(origins, len(points)))
+        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, rays)
+
+    def observations(
+        self, grid_T_world: Transform, hits: NDArray[np.bool_] | None = None, *, free_region: int | None = None
+    ) -> Iterator[Observation]:
+        """Yield the votes of the scan: one observation for each place where rays began.
+
+        Args:
+            grid_T_world: (4, 4).
+            hits: (N,) bool, points that vote for their class; None: all.
+            free_region: region of the grid in which rays vote; None for the whole grid.
+        """
+        for rays in self.rays:
+            pose = grid_T_world @ self.world_T_sensor
+            yield Observation(
+                rays.points,
+                self.labels[rays.part],
+                pose if len(self.rays) == 1 and not rays.sensor_T_place[:3, 3].any() else pose @ rays.sensor_T_place,
+                None if hits is None else hits[rays.part],
+                free_region=free_region,
+            )
+
+
 class Merger:
     """Merges the scans of a window into the observations of one frame.
 
@@ -151,7 +195,7 @@ class Merger:
     ) -> None:
         self.scans, self.actors, self.classes, self.dynamic = scans, actors, classes, dynamic
         self._static: dict[int, NDArray[np.bool_]] = {}
-        self._carried: dict[tuple[int, int], Observation | None] = {}
+        self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
 
     def forget_before(self, frame: int) -> None:
         """Remove what is kept of scans before a frame."""
@@ -182,14 +226,13 @@ class Merger:
             scan, own = self.scans[other], other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
             hits = None if everything else self.static(other)
-            yield Observation(
-                scan.points, scan.labels, grid_T_world @ scan.world_T_sensor, hits, free_region=None if own else STATIC
-            )
+            yield from scan.observations(grid_T_world, hits, free_region=None if own else STATIC)
         for region, number in regions.actors.items():
+            pose = self.actors.tracks[number].pose(now.frame)
+            if pose is None:
+                continue
             for other in window:
-                carried = None if other == now.frame else self._carry(number, other, now)
-                pose = self.actors.tracks[number].pose(now.frame)
-                if carried is not None and pose is not None:
+                for carried in self._carry(number, other, now) if other != now.frame else ():
                     yield replace(
                         carried,
                         grid_T_sensor=grid_T_world @ pose @ carried.grid_T_sensor,
@@ -209,8 +252,7 @@ class Merger:
             if not track.rigid or pose is None:
                 continue
             for other in window:
-                carried = self._carry(number, other, now)
-                if carried is not None:
+                for carried in self._carry(number, other, now):
                     yield replace(
                         carried,
                         points=carried.points * np.array([1, -1, 1], np.float32),
@@ -233,7 +275,7 @@ class Merger:
         for other in window:
             scan = self.scans[other]
             if abs(scan.seconds - now.seconds) <= _RECENT_S:
-                yield Observation(scan.points, scan.labels, now.grid_T_world @ scan.world_T_sensor)
+                yield from scan.observations(now.grid_T_world)
 
     def shells(self, now: Instant, regions: Regions) -> Iterator[Observation]:
         """Yield the surface of each vehicle as it usually is, for what no scan saw of it. No ray votes for free space."""
@@ -257,25 +299,28 @@ class Merger:
             self._static[frame] = static
         return self._static[frame]
 
-    def _carry(self, number: int, other: int, now: Instant) -> Observation | None:
-        """Return a scan's rays through an actor's body, in the actor's frame; None if there are none, or it had another shape then."""
+    def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
+        """Return a scan's rays through an actor's body, in the actor's frame; none if it had another shape then."""
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scans[other].seconds - now.seconds) > _DEFORMABLE_S:
-            return None
+            return ()
         key = (number, other)
         if key not in self._carried:
             self._carried[key] = self._cut(track, other)
         return self._carried[key]
 
-    def _cut(self, track: Track, frame: int) -> Observation | None:
+    def _cut(self, track: Track, frame: int) -> tuple[Observation, ...]:
         pose = track.pose(frame)
         if pose is None:
-            return None
+            return ()
         scan = self.scans[frame]
-        actor_T_sensor = invert(pose) @ scan.world_T_sensor
-        rays = scan.rays_through(actor_T_sensor, track.lower, track.upper)
-        if not len(rays):
-            return None
         own = np.zeros(len(scan.points), np.bool_)
         own[track.members.get(frame, [])] = True
-        return Observation(scan.points[rays], scan.labels[rays], actor_T_sensor, own[rays])
+        found = []
+        for rays in scan.rays:
+            actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
+            crossing = rays.through(actor_T_place, track.lower, track.upper)
+            if len(crossing):
+                labels, hits = scan.labels[rays.part][crossing], own[rays.part][crossing]
+                found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
+        return tuple(found)

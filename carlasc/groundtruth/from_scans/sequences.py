@@ -21,6 +21,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
 from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
+from carlasc.groundtruth.heights import find_ground, share_below
 from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
@@ -40,6 +41,8 @@ from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 TRACKS = "tracks.npz"
 """The document that keeps the actors of a sequence beside its grids. It may be deleted: the next run makes it again."""
 _TENTH = 10
+_LOOKED_AT = 3  # scans that are looked at for ground below the grid
+_BELOW = 0.2  # share of ground points below the grid that is worth a note: on hills, some are
 
 
 @dataclass(frozen=True)
@@ -188,21 +191,34 @@ class ScanSequence(StoredSequence):
             notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
         elif not self.feed.motion and dynamic != "tube":
             notes.append(f"{where}: nothing shows what moves: everything was treated as static")
-        if "evidence" in self.feed.motion and (self.actors.tracks or self.actors.moving):
-            found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
-            left_out = sum(len(points) for points in self.actors.moving.values())
-            notes.append(
-                f"{where}: free space shows {found} actors that move although nothing else says so; {left_out} more points that moved"
-                " were left out of other frames"
-            )
+        found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
+        left_out = sum(len(points) for points in self.actors.moving.values())
+        if "evidence" in self.feed.motion and (found or left_out):
+            shown = [f"{found} actors that move"] if found else []
+            shown += [f"{left_out} {'more ' if found else ''}points that moved"] if left_out else []
+            out = ": these points were left out of other frames" if left_out else ""
+            notes.append(f"{where}: free space shows {' and '.join(shown)}, although nothing else says so{out}")
         wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
         if wrong:
             notes.append(
                 f"{where}: {wrong} actors are larger than any vehicle, so their numbers or boxes are wrong: their points were treated as static"
             )
+        below = self._share_below()
+        if below > _BELOW:
+            notes.append(
+                f"{where}: {below:.0%} of the points on the ground are below the grid, which begins at {self.plan.spec.lower[2]:g} m"
+            )
         if len(self.feed.frames) == 1:
             notes.append(f"{where}: there is one scan only: nothing is merged, and what it did not see is unknown")
         return notes
+
+    def _share_below(self) -> float:
+        """Return the share of the ground points of some scans that are below the grid."""
+        frames = self.feed.frames
+        chosen = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int))]
+        scans = (self.feed.sequence.read("points", int(frame)) for frame in chosen)
+        ground = find_ground(scans, float(abs(self.plan.spec.upper[0])))
+        return 0.0 if ground is None else share_below(ground, self.plan.spec)
 
 
 def _read_actors(writer: SequenceWriter, key: str) -> Actors | None:

@@ -36,9 +36,16 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
 
     Raises:
         MissingDataError: it has no poses.
-        FormatError: a pose is not rigid, or jumps without `options.force`, or a time does not increase; names the frame.
+        FormatError: nobody knows where points were seen from, a pose is not rigid, or jumps without `options.force`, or a time does not increase; names the frame.
     """
     where = f"{sequence.location}/{layout.POSES}"
+    if not sequence.metadata.has_rays:
+        raise FormatError(
+            sequence.location,
+            expected="scans of a sensor whose place is known",
+            found='"rays": false in carlasc.json',
+            advice="free space cannot be told from unknown space: take the grids that came with the data",
+        )
     if options.poses == "file" and layout.POSES not in sequence.documents():
         raise MissingDataError(
             where,

@@ -1,0 +1,74 @@
+"""The height of the sensor above the ground, and grids that reach down to the ground below a sensor that is higher than CarlaSC's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+from carlasc.motion import ground_height, ground_points
+
+_BELOW = 0.05  # share of ground points that may be below a grid
+_LOW = 0.05  # quantile of the heights of ground points that a grid must reach down to
+_OF_EACH = 1000  # heights that stand for those of one drive
+_SLACK_M = 0.6  # a grid that begins so far below the ground wastes voxels
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground around a sensor.
+
+    Attributes:
+        heights_m: z of ground points around the sensor, sensor frame; at least one.
+        below_m: height of the sensor above the ground under it.
+    """
+
+    heights_m: NDArray[np.float32]
+    below_m: float
+
+
+def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float) -> Ground | None:
+    """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the sensor; None if there is none."""
+    heights: list[NDArray[np.float32]] = []
+    near: list[float] = []
+    for points in scans:
+        usable = points[np.isfinite(points[:, :3]).all(axis=1), :3]
+        ground = usable[ground_points(usable)]
+        distance = np.hypot(ground[:, 0], ground[:, 1])
+        heights.append(ground[distance < reach_m, 2])
+        below = ground_height(usable)
+        near += [below] if np.isfinite(below) else []
+    if not near or not sum(map(len, heights)):
+        return None
+    return Ground(np.concatenate(heights), -float(np.median(near)))
+
+
+def joined(grounds: Sequence[Ground]) -> Ground:
+    """Return the ground in the scans of several drives, at least one. Each counts equally, however many points it has."""
+    if len(grounds) == 1:
+        return grounds[0]
+    shares = np.linspace(0, 1, _OF_EACH)
+    heights = [np.quantile(ground.heights_m, shares).astype(np.float32) for ground in grounds]
+    return Ground(np.concatenate(heights), float(np.median([ground.below_m for ground in grounds])))
+
+
+def share_below(ground: Ground, spec: GridSpec) -> float:
+    """Return the share of ground points that are below a grid."""
+    return float((ground.heights_m < spec.lower[2]).mean())
+
+
+def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
+    """Return a grid moved up or down by whole voxels so that the ground is in its lowest layers; the same grid if it is there already."""
+    size = float(spec.voxel_size[2])
+    low = float(np.quantile(ground.heights_m, _LOW))
+    if share_below(ground, spec) <= _BELOW and low - spec.lower[2] < max(_SLACK_M, 2 * size):
+        return spec
+    layers = int(np.floor((low - spec.lower[2]) / size))
+    if not layers:
+        return spec
+    (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
+    low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))  # as params.json keeps bounds
+    return replace(spec, lower=(x0, y0, low), upper=(x1, y1, high))
