@@ -1,8 +1,9 @@
 """The agreement of poses with scans: how well scans overlap under the poses, and which known mistake explains a poor overlap.
 
 The structure of a scan, moved by the poses, must fall on the structure of an earlier scan. The share of its points that do is measured for
-the poses as they are, and for the poses with each known mistake undone. Poses are reported as wrong if undoing a mistake clearly raises this
-share on most of the pairs of scans on which it makes a difference at all: on a straight road, for instance, a mirrored y axis makes none.
+the poses as they are, and for the poses with each known mistake undone. The mistake that, undone, gives the highest mean over all pairs of
+scans is reported, if it raises the share by more than chance could, and on most of the pairs on which it makes a difference at all: on a
+straight road, for instance, a mirrored y axis makes none.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.inspection.matching import match
+from carlasc.inspection.misfit import Misfit, explain_misfit
 from carlasc.inspection.structure import MAX_RANGE_M
 
 Poses: TypeAlias = NDArray[np.float64]
@@ -32,9 +35,18 @@ _GOOD = 0.75  # no offset is searched for poses with this share of overlap
 _STRIDE_M = 2.0  # the scans of a pair are this far apart, or
 _STRIDE_RAD = np.deg2rad(10.0)  # turned by this angle: enough to see a mistake, little enough for the scans to overlap
 _REACH = 10  # the scans of a pair are at most this number of frames apart
-_GAIN = 0.05  # a correction must raise the share of overlap by this
-_WINS = 0.75  # on this share of the pairs
-_TIE = 0.01  # of two corrections whose shares differ by less, the first is taken
+_GAIN = 0.02  # a correction must raise the mean share of overlap by this,
+_CERTAIN = 4.0  # and by this number of standard errors
+_WINS = 0.75  # on this share of the pairs on which it makes a difference,
+_JUDGED_M = 0.05  # which is a distance of the two motions greater than this
+_COMMON_AXES = 5  # the choices of axes that are listed first
+_SAME_M = 0.002  # motions that are nearer than this are the same
+_EXPLAINED = 0.2  # and the mean share must be at least this then
+# Vehicles that keep pace with the recording one look like scans that are all in one frame: in a street full of them, and without labels, the
+# share grows by a factor of 1.4, and by at least 1.8 where the scans are in one frame.
+_STANDING = 1.6
+_RARE = 0.02  # a rare mistake must raise the mean by this more than a common one
+_CLEAR_OFFSET = 0.1  # an offset must raise the share by this
 
 
 @dataclass(frozen=True)
@@ -45,11 +57,15 @@ class Correction:
         name: description of poses with this mistake.
         advice: how to correct the file.
         undo: maps (F, 4, 4) poses with the mistake to the poses without it.
+        rare: whether it is one of the many choices of axes that nobody makes often.
+        factor: undoing it must raise the share of overlap by this factor, over that with another mistake undone too.
     """
 
     name: str
     advice: str
     undo: Callable[[Poses], Poses]
+    rare: bool = False
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +78,9 @@ class PoseDiagnosis:
         correction: the mistake that, undone, raises the share clearly; None if there is none.
         corrected_share: the share with the mistake undone, over the pairs on which this makes a difference.
         share_there: the share of the poses as they are, over the same pairs.
-        offset_m: (x, y, z) median distance between where the poses put a scan and where it fits, if no known mistake explains it; else None.
+        misfit: a lever arm or a delay that explains the differences between the poses and the motions that the scans show; None if there
+            is a known mistake, or neither explains them.
+        offset_m: (x, y, z) median distance between where the poses put a scan and where it fits, if nothing else explains it; else None.
     """
 
     share: float
@@ -70,6 +88,7 @@ class PoseDiagnosis:
     correction: Correction | None = None
     corrected_share: float = 0.0
     share_there: float = 0.0
+    misfit: Misfit | None = None
     offset_m: tuple[float, float, float] | None = None
 
 
@@ -85,24 +104,38 @@ def diagnose_poses(
     """
     corrections = known_corrections()
     corrected = [poses, *(correction.undo(poses) for correction in corrections)]
-    pairs, shares, differs = [], [], []
+    pairs, scans, shares, judged = [], [], [], []
     for earlier, later in choose_pairs(poses, max_pairs):
         target, moved = structure(earlier), _thin(structure(later), _MAX_POINTS)
         if min(len(target), len(moved)) < _MIN_POINTS:
             continue
         occupied = _occupancy(target)
         motions = [relative(candidate, earlier, later) for candidate in corrected]
+        distances = [_distance(motion, motions[0]) for motion in motions]
+        own = _share(occupied, transform_points(motions[0], moved))
         pairs.append((earlier, later))
-        shares.append([_share(occupied, transform_points(motion, moved)) for motion in motions])
-        differs.append([_distance(motion, motions[0]) > _DIFFERENT_M for motion in motions])
+        scans.append((target, moved))
+        judged.append([distance > _JUDGED_M for distance in distances])
+        shares.append(
+            [
+                _share(occupied, transform_points(motion, moved)) if distance > _SAME_M else own
+                for motion, distance in zip(motions, distances, strict=True)
+            ]
+        )
     if not pairs:
         return PoseDiagnosis(float("nan"), 0)
     own = float(np.mean([row[0] for row in shares]))
-    best = _best_correction(np.array(shares), np.array(differs))
+    best = _best_correction(np.array(shares), np.array(judged), corrections)
     if best is not None:
         index, share_there, corrected_share = best
         return PoseDiagnosis(own, len(pairs), corrections[index - 1], corrected_share, share_there)
-    return PoseDiagnosis(own, len(pairs), offset_m=_common_offset(structure, poses, pairs) if own < _GOOD else None)
+    motions = [relative(poses, earlier, later) for earlier, later in pairs]
+    matches = [match(target, moved, motion) for (target, moved), motion in zip(scans, motions, strict=True)]
+    misfit = explain_misfit(poses, pairs, matches)
+    search = misfit is None and own < _GOOD
+    return PoseDiagnosis(
+        own, len(pairs), misfit=misfit, offset_m=_common_offset(structure, poses, pairs) if search else None
+    )
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
@@ -118,8 +151,11 @@ def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
 
 
 def known_corrections() -> tuple[Correction, ...]:
-    """Return the mistakes that are searched for, more common ones first: of two equally good ones the first is reported."""
-    axes = [Correction(name, advice, _in_axes(matrix)) for name, advice, matrix in _axes_mistakes()]
+    """Return the mistakes that are searched for, more common ones first: of equally good ones the first is reported."""
+    mistakes = enumerate(_axes_mistakes())
+    axes = [
+        Correction(name, advice, _in_axes(matrix), rank >= _COMMON_AXES) for rank, (name, advice, matrix) in mistakes
+    ]
     others = [
         Correction(
             "transposed rotations",
@@ -135,6 +171,7 @@ def known_corrections() -> tuple[Correction, ...]:
             "poses of a moving sensor beside scans that are all in one frame",
             "move each scan to the frame of its own sensor, or take the poses of this sequence",
             lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
+            factor=_STANDING,
         ),
     ]
     return (*axes[:1], *others[:2], *axes[1:], *others[2:])
@@ -145,26 +182,31 @@ def relative(poses: Poses, earlier: int, later: int) -> Transform:
     return invert(poses[earlier]) @ poses[later]
 
 
-def _best_correction(shares: NDArray[np.float64], differs: NDArray[np.bool_]) -> tuple[int, float, float] | None:
-    """Choose the correction with the best overlap.
+def _best_correction(
+    shares: NDArray[np.float64], judged: NDArray[np.bool_], corrections: tuple[Correction, ...]
+) -> tuple[int, float, float] | None:
+    """Choose the correction with the best overlap over all pairs.
 
     Args:
         shares: (P, 1 + C) share of overlap of each pair, in column 0 for the poses as they are, then for each correction.
-        differs: (P, 1 + C) whether the motion of the pair differs from that of column 0; a correction is judged by these pairs only.
+        judged: (P, 1 + C) whether the motion of the pair differs from that of column 0.
+        corrections: those of the other columns.
 
     Returns:
-        The column of the best correction, and the mean shares without and with it on those pairs; None if none is clearly better.
+        The column of the best correction, and the mean shares without and with it on the pairs on which it makes a difference; None if
+        none is clearly better than the poses as they are.
     """
-    own, best, best_total = shares[:, 0], None, -1.0
-    for column in range(1, shares.shape[1]):
-        judged = differs[:, column]
-        gain = (shares[:, column] - own)[judged]
-        if not judged.any() or gain.mean() < _GAIN or (gain > 0).mean() < _WINS:
-            continue
-        total = float(np.where(judged, shares[:, column], own).mean())
-        if total > best_total + _TIE:
-            best, best_total = (column, float(own[judged].mean()), float(shares[judged, column].mean())), total
-    return best
+    gains, mean = shares - shares[:, :1], shares.mean(axis=0)
+    gain, error = gains.mean(axis=0), gains.std(axis=0) / np.sqrt(len(gains))
+    factors = np.array([1.0, *(correction.factor for correction in corrections)])
+    rare = np.array([False, *(correction.rare for correction in corrections)])
+    wins = ((gains > 0) & judged).sum(axis=0) >= _WINS * judged.sum(axis=0)
+    clear = wins & (gain >= _GAIN) & (gain >= _CERTAIN * error) & (mean >= np.maximum(_EXPLAINED, mean[0] * factors))
+    if not clear.any():
+        return None
+    best = int(np.where(clear, mean / factors - _RARE * rare, -np.inf).argmax())
+    own, corrected = shares[judged[:, best], 0], shares[judged[:, best], best]
+    return best, float(own.mean()), float(corrected.mean())
 
 
 def _common_offset(
@@ -175,15 +217,21 @@ def _common_offset(
     offsets, chosen = [], pairs[:: max(1, len(pairs) // _OFFSET_PAIRS)]
     for earlier, later in chosen:
         occupied = _occupancy(structure(earlier))
-        moved = transform_points(relative(poses, earlier, later), _thin(structure(later), _OFFSET_POINTS))
+        motion = relative(poses, earlier, later)
+        moved = transform_points(motion, _thin(structure(later), _OFFSET_POINTS))
         shares = np.array([_share(occupied, moved + step) for step in steps])
-        if shares.max() > shares[len(steps) // 2] + 2 * _GAIN:
-            offsets.append(-steps[shares.argmax()])
-    offsets = [offset for offset in offsets if np.abs(offset).max() > 1.5 * _VOXEL_M]
+        if shares.max() > shares[len(steps) // 2] + _CLEAR_OFFSET:
+            offsets.append((-steps[shares.argmax()], motion[:3, 3]))
+    # where the scan fits as if it had not moved, it is vehicles that keep pace that fit
+    offsets = [
+        offset
+        for offset, way in offsets
+        if np.abs(offset).max() > 1.5 * _VOXEL_M and np.abs(offset - way).max() > 1.5 * _VOXEL_M
+    ]
     if len(offsets) < max(1, _OFFSET_SHARE * len(chosen)):
         return None
     x, y, z = np.median(offsets, axis=0).tolist()
-    return (x, y, z)
+    return (x, y, z) if max(abs(x), abs(y), abs(z)) > _VOXEL_M else None
 
 
 def _partner(poses: Poses, first: int) -> int:

@@ -43,11 +43,18 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
             np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)  # packed stores keep labels in uint8
         ]
     else:
-        keep[keep] = _upright(points[keep])
+        keep[keep] = _is_upright(points[keep])
     flow = _per_point(sequence, "flow", frame, len(points))
     if flow is not None:
         keep &= np.abs(flow).max(axis=1, initial=0.0) < 0.1
     return points[keep].astype(np.float64)
+
+
+def upright(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the structure (M, 3) of a scan without labels from its points (N, 3), metres, in the frame of the sensor."""
+    distance = np.linalg.norm(points, axis=1)
+    near = points[(distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)]
+    return near[_is_upright(near)].astype(np.float64)
 
 
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[np.generic] | None:
@@ -68,7 +75,7 @@ def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
     return static
 
 
-def _upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def _is_upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (N,) which points are on upright objects, from the range of heights in columns of 0.4 m."""
     columns = np.floor((points[:, :2] + MAX_RANGE_M) / _COLUMN_M).astype(np.int64)
     width = int(2 * MAX_RANGE_M / _COLUMN_M) + 1

@@ -101,16 +101,28 @@ def _rigid_error(pose: NDArray[np.float64], where: str) -> FormatError | None:
     return None
 
 
+def _periods(sequence: Sequence, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the seconds between frames, by their times if these increase."""
+    try:
+        times = np.array([sequence.read_time(frame) for frame in frames.tolist()])
+    except CarlascError:
+        times = np.zeros(1)
+    periods = np.diff(times)
+    return (
+        periods if len(periods) == len(frames) - 1 and (periods > 0).all() else np.diff(frames) * layout.FRAME_PERIOD_S
+    )
+
+
 def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> Iterator[Finding]:
     """Check the first pose, and that the sensor moves and turns between frames as a vehicle can."""
     poses = np.stack([sequence.read_pose(frame) for frame in frames.tolist()])
     if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > 1e-3:
         advice = "the poses are relative to another frame, which is allowed: only relative poses are used"
         yield Finding("note", "poses", sequence.path, where, "the identity as the first pose", "another pose", advice)
-    if len(frames) < 2:
+    if len(frames) < 2 or not sequence.metadata.has_rays:  # frames of a cloud without a sensor are places, not instants
         return
     steps = invert(poses[:-1]) @ poses[1:]
-    period_s = np.diff(frames) * layout.FRAME_PERIOD_S
+    period_s = _periods(sequence, frames)
     speed = np.linalg.norm(steps[:, :3, 3], axis=1) / period_s
     cosine = (np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     turn = np.arccos(np.clip(cosine, -1, 1)) / period_s

@@ -11,14 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import check_rigid
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
+from carlasc.inspection.bounds import GroundBelow
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
 from carlasc.inspection.freshness import Freshness
+from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
+from carlasc.motion.ground import ground_points
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
@@ -26,6 +30,7 @@ from carlasc.storage.protocol import Sequence, Source
 _SAMPLES = 40  # frames per sequence whose contents are read by default
 _POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error
 _DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
+_COARSE_M = 0.75  # in coarser voxels several classes meet, and most of each is free: a small share is no mistake
 _NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning
 
 Progress = Callable[[int, int], None]
@@ -114,18 +119,20 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
         found.extend(check_shapes(sequence, frame, with_grids=described))
         yield
     evidence: dict[str, GridEvidence] = {}
+    below: dict[str, GroundBelow] = {}
     freshness = Freshness(sequence) if described else None
     for frame in plan.read:
         if freshness is not None:
             found.extend(check_values(sequence, frame))
-            _measure_grids(sequence, frame, evidence)
+            _measure_grids(sequence, frame, evidence, below)
             freshness.compare(frame)
         yield
     if freshness is not None:
         found.extend(freshness.findings())
     diagnoses = {name: grid.diagnose() for name, grid in evidence.items()}
     for name, diagnosis in diagnoses.items():
-        found.extend(_judge_grid(sequence, name, diagnosis))
+        found.extend(_judge_grid(sequence, name, evidence[name].spec, diagnosis))
+        found.extend(below[name].findings(sequence, name))
     poses = _diagnose_poses(sequence)
     if poses is not None:
         found.extend(_judge_poses(sequence, poses))
@@ -143,7 +150,9 @@ def _is_described(sequence: Sequence) -> bool:
         return False
 
 
-def _measure_grids(sequence: Sequence, frame: int, evidence: dict[str, GridEvidence]) -> None:
+def _measure_grids(
+    sequence: Sequence, frame: int, evidence: dict[str, GridEvidence], below: dict[str, GroundBelow]
+) -> None:
     """Compare the points of a frame with its grids. Files that cannot be read are skipped: other checks report them."""
     if "points" not in sequence.fields():
         return
@@ -151,6 +160,7 @@ def _measure_grids(sequence: Sequence, frame: int, evidence: dict[str, GridEvide
         points, labels = _points(sequence, frame)
     except CarlascError:
         return
+    ground = _ground(sequence, points, labels)
     for name in sequence.grids:
         if sequence.predicted_by(name) is not None:  # a network makes mistakes, and may have other classes
             continue
@@ -159,6 +169,7 @@ def _measure_grids(sequence: Sequence, frame: int, evidence: dict[str, GridEvide
         except CarlascError:
             continue
         evidence.setdefault(name, GridEvidence(grid.spec)).add(points, labels, grid)
+        below.setdefault(name, GroundBelow(grid.spec)).add(ground)
 
 
 def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
@@ -171,9 +182,17 @@ def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArra
     return scan.points[keep], labels
 
 
+def _ground(
+    sequence: Sequence, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger] | None
+) -> NDArray[np.float32]:
+    """Return the points on the ground: by their labels, or by their heights if they have none."""
+    classes = sorted(sequence.metadata.classes.ground)
+    return points[ground_points(points) if labels is None or not classes else np.isin(labels, classes)]
+
+
 def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
     """Measure the overlap of scans under their poses; None if there are no scans, or no valid poses."""
-    if "points" not in sequence.fields() or layout.POSES not in sequence.documents():
+    if "points" not in sequence.fields() or layout.POSES not in sequence.documents() or not sequence.metadata.has_rays:
         return None
     frames = sequence.frames("points").tolist()
     try:
@@ -190,7 +209,7 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
     return diagnose_poses(structure, poses)
 
 
-def _judge_grid(sequence: Sequence, grid: str, diagnosis: GridDiagnosis) -> Iterator[Finding]:
+def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDiagnosis) -> Iterator[Finding]:
     where = f"{sequence.location}/{grid}"
     expected = "points in voxels of their class"
     share = f"{diagnosis.share:.1%} of the points in known voxels, over {diagnosis.frames} frames"
@@ -201,7 +220,7 @@ def _judge_grid(sequence: Sequence, grid: str, diagnosis: GridDiagnosis) -> Iter
         found = f"{share}; the likely cause is {diagnosis.mistake}: with it undone, {diagnosis.corrected_share:.1%}"
         advice = "correct what writes the points or the grid, or make the grid again with `carlasc regrid`"
         yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
-    elif diagnosis.share < _DOUBTFUL_SHARE:
+    elif diagnosis.share < _DOUBTFUL_SHARE and _largest_edge(spec) <= _COARSE_M:
         if other_classes:
             found = f"{share}, but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is labels of another class table, or in another order"
         else:
@@ -211,12 +230,23 @@ def _judge_grid(sequence: Sequence, grid: str, diagnosis: GridDiagnosis) -> Iter
         yield Finding(severity, "scan-in-voxels", sequence.path, where, expected, found, advice)
 
 
+def _largest_edge(spec: GridSpec) -> float:
+    """Return the length of a voxel's longest edge in metres; of a cylindrical one, at half the radius of the grid."""
+    edges = spec.voxel_size.copy()
+    if spec.coordinates == "cylindrical":
+        edges[1] *= (spec.lower[0] + spec.upper[0]) / 2
+    return float(edges.max())
+
+
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
     where = f"{sequence.location}/{layout.POSES}"
     expected = "scans that overlap under the poses"
     if diagnosis.correction is not None:
         found = f"{diagnosis.share_there:.1%} of a scan's structure on that of an earlier scan; the likely cause is {diagnosis.correction.name}: with it undone, {diagnosis.corrected_share:.1%}"
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, diagnosis.correction.advice)
+    elif diagnosis.misfit is not None:
+        found, advice = describe_misfit(diagnosis.misfit)
+        yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)
     elif diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
         found = f"{diagnosis.share:.1%} of a scan's structure on that of an earlier scan; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from where the poses put them"

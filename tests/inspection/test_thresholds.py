@@ -11,29 +11,30 @@ from carlasc.core.grids import GridSpec
 from carlasc.inspection.validation import validate
 from carlasc.storage import FolderSink, layout
 
-SPEC = GridSpec("cartesian", (20, 20, 6), (-10.0, -10.0, -3.0), (10.0, 10.0, 3.0))
+SPEC = GridSpec("cartesian", (40, 40, 12), (-10.0, -10.0, -3.0), (10.0, 10.0, 3.0))
+COARSE = GridSpec("cartesian", (20, 20, 6), (-10.0, -10.0, -3.0), (10.0, 10.0, 3.0))
 OTHER = 9  # a class that is nowhere in the grid
 
 
-def write_scans(folder, right, frames=4, metadata=None, far=None):
+def write_scans(folder, right, frames=4, metadata=None, far=None, spec=SPEC):
     """Write scans and grids: a share of the points is in voxels of their class; points farther than `far` never are."""
     rng, writer = np.random.default_rng(0), FolderSink(folder).sequence("cartesian")
-    writer.write_document(layout.params_file("evaluation"), json.dumps(SPEC.to_params()).encode())
+    writer.write_document(layout.params_file("evaluation"), json.dumps(spec.to_params()).encode())
     writer.write_document(layout.POSES, layout.encode_poses(np.tile(np.eye(4), (frames, 1, 1))))
     writer.write_document(layout.TIMES, layout.encode_times(0.1 * np.arange(frames)))
     if metadata:
         writer.write_document(layout.METADATA, json.dumps(metadata).encode())
     for frame in range(frames):
-        labels = rng.integers(1, OTHER, SPEC.size)
-        cells = rng.integers(0, SPEC.size, (2000, 3))
-        points = SPEC.centers()[tuple(cells.T)]
+        labels = rng.integers(1, OTHER, spec.size)
+        cells = rng.integers(0, spec.size, (2000, 3))
+        points = spec.centers()[tuple(cells.T)]
         wrong = np.arange(2000) >= round(2000 * right)
         if far is not None:
             wrong |= np.linalg.norm(points, axis=1) > far
         writer.write("points", frame, np.concatenate([points, np.ones((2000, 1))], axis=1).astype(np.float32))
         writer.write("labels", frame, np.where(wrong, OTHER, labels[tuple(cells.T)]).astype(np.uint32))
         writer.write("evaluation/labels", frame, labels.astype(np.uint32))
-        writer.write("evaluation/counts", frame, np.ones(SPEC.size, np.float32))
+        writer.write("evaluation/counts", frame, np.ones(spec.size, np.float32))
     return folder
 
 
@@ -49,6 +50,12 @@ def test_the_share_of_points_in_voxels_of_their_class_decides(tmp_path, right, e
     assert severities(result, "scan-in-voxels") == expected
     assert result.sequences[0].voxel_share["evaluation"] == pytest.approx(right)
     assert expected == [] or "labels of another class table" in str(result.findings[0])
+
+
+def test_in_coarse_voxels_a_small_share_is_no_mistake(tmp_path):
+    result = validate(write_scans(tmp_path, 0.3, spec=COARSE))
+    assert severities(result, "scan-in-voxels") == []
+    assert result.sequences[0].voxel_share["evaluation"] == pytest.approx(0.3)
 
 
 def test_points_outside_the_ranges_of_the_sensor_are_not_compared(tmp_path):
