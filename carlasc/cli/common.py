@@ -199,3 +199,19 @@ def _plain(value: Any) -> Any:
     if isinstance(value, set | frozenset):
         return sorted(value)
     raise TypeError(f"no JSON for {type(value).__name__}")
+
+
+def parse_options(given: list[str] | None) -> dict[str, str]:
+    """Return the values of options given as NAME=VALUE, by name. A dash in a name is an underscore, as in other options.
+
+    Raises:
+        ArgumentError: one has no =, or is given twice.
+    """
+    options: dict[str, str] = {}
+    for entry in given or []:
+        text, equals, value = entry.partition("=")
+        name = text.strip().replace("-", "_")
+        if not equals or not name or name in options:
+            raise ArgumentError("--option", expected="NAME=VALUE, each name once", found=repr(entry))
+        options[name] = value
+    return options

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import Json, Workers, print_json, progress_bar, report_failures
+from carlasc.cli.common import Json, Workers, parse_options, print_json, progress_bar, report_failures
 from carlasc.cli.grid_options import (
     BoundsOption,
     Coordinates,
@@ -61,9 +61,9 @@ class PoseSource(StrEnum):
 
 
 class Flow(StrEnum):
-    """Where flow comes from."""
+    """Whether flow is written."""
 
-    instances = "instances"
+    auto = "auto"
     none = "none"
 
 
@@ -77,13 +77,14 @@ def _print_list(wanted: bool) -> None:
 
 
 def convert(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The data set: kitti, poss, ... (see --list).")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The data set: kitti, argoverse2, ... (see --list).")],
     source: Annotated[
         Path, typer.Argument(metavar="SOURCE", help="Folder of the data set, or of one of its sequences.")
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
     sequences: Annotated[
-        str | None, typer.Option(help="Numbers of sequences, separated by commas: 00,08. Default: all.")
+        str | None,
+        typer.Option(help="Names of sequences or the last parts of them, separated by commas: 00,08. Default: all."),
     ] = None,
     split: Annotated[Split, typer.Option(help="Only sequences of this split.")] = Split.all,
     classes: Annotated[
@@ -112,8 +113,11 @@ def convert(
         ),
     ] = PoseSource.auto,
     flow: Annotated[
-        Flow, typer.Option(help="instances: the velocity of moving actors, estimated from their points. none: no flow.")
-    ] = Flow.instances,
+        Flow,
+        typer.Option(
+            help="auto: the velocity of each actor, from its tracked boxes or else from its points. none: no flow."
+        ),
+    ] = Flow.auto,
     allow_unknown: Annotated[
         bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")
     ] = False,
@@ -131,6 +135,12 @@ def convert(
     window_m: WindowMOption = None,
     stride: StrideOption = None,
     dynamic: DynamicOption = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE", help="An option of this data set, see its page. May be given several times."
+        ),
+    ] = None,
     workers: Workers = None,
     json: Json = False,
     _list: Annotated[
@@ -165,12 +175,14 @@ def convert(
             spec=spec,
             observe=observe,
             voting=None if rule is None else Voting(rule.value),
+            follow_ground=bounds is None,
             poses=poses.value,
             flow=flow.value,
             allow_unknown=allow_unknown,
             force=force,
             workers=workers,
             progress=progress,
+            options=parse_options(option),
         )
     if json:
         print_json(result)

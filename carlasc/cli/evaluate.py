@@ -39,7 +39,8 @@ def evaluate(
         str | None,
         typer.Option(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, occ3d-lidar, occ3d-lidar-sparseocc,"
-            " occ3d-camera, openoccupancy; own scores the data's own classes. If not given: carlasc, or own for classes that it has no map for."
+            " occ3d-camera, openoccupancy; own scores the data's own classes. If not given: the benchmark whose files TRUTH holds; otherwise carlasc, or own for"
+            " classes that it has no map for."
         ),
     ] = None,
     all_conventions: Annotated[

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from carlasc.cli.common import Json, Workers, print_json, progress_bar, report_failures
+from carlasc.cli.common import Json, Workers, parse_options, print_json, progress_bar, report_failures
+
+
+def _print_list(wanted: bool) -> None:
+    if wanted:
+        from carlasc.converting import exporter_names, load_exporter, option_names
+
+        for name in exporter_names():
+            exporter = load_exporter(name)
+            options = ", ".join(option_names(exporter))
+            typer.echo(f"{name}: {exporter.title}" + (f" (options: {options})" if options else ""))
+        raise typer.Exit
 
 
 def export(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The other data set: kitti.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The other data set: kitti, occ3d, ... (see --list).")],
     source: Annotated[
         str, typer.Argument(metavar="SOURCE", help="Folder, zip, store or URL of one or more sequences.")
     ],
@@ -22,19 +33,26 @@ def export(
     grid: Annotated[
         str | None,
         typer.Option(
-            help="Grid that goes to voxels/. Default: the original files if they were kept, else the finest grid."
+            help="Grid that is exported. Default: the one with exactly the voxels of the other data set, else the one of the smallest voxels."
         ),
     ] = None,
     predictions: Annotated[
         bool,
-        typer.Option(
-            "--predictions",
-            help="SOURCE holds the output of a network: write predictions/ for SemanticKITTI's evaluator.",
-        ),
+        typer.Option("--predictions", help="SOURCE holds the output of a network: grids without counts."),
     ] = False,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE", help="Another option of the exporter (see --list); may be given several times."
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write frames again that exist.")] = False,
     workers: Workers = None,
     json: Json = False,
+    _list: Annotated[
+        bool,
+        typer.Option("--list", help="List the exporters that are installed.", callback=_print_list, is_eager=True),
+    ] = False,
 ) -> None:
     """Write sequences as another data set's files, so that its tools can read them.
 
@@ -42,6 +60,9 @@ def export(
     """
     from carlasc.converting import export as export_sequences
 
+    options: dict[str, Any] = {**parse_options(option)}
+    options |= {} if grid is None else {"grid": grid}
+    options |= {"predictions": True} if predictions else {}
     with progress_bar(f"export {name}") as progress:
         result = export_sequences(
             name,
@@ -51,14 +72,15 @@ def export(
             overwrite=overwrite,
             workers=workers,
             progress=progress,
-            grid=grid,
-            predictions=predictions,
+            **options,
         )
     if json:
         print_json(result)
     else:
-        for path, folder in result.sequences.items():
-            typer.echo(f"{path or '.'} -> {result.out / folder}")
+        for note in result.notes:
+            typer.echo(f"note: {note}")
+        for path, place in result.sequences.items():
+            typer.echo(f"{path or '.'} -> {result.out / place}")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
         typer.echo(f"{result.made} frames written{skipped} in {result.elapsed_s:.1f} s")
     report_failures(

@@ -1,42 +1,67 @@
 """Other data sets into the CarlaSC layout, and back."""
 
 from carlasc.converting.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
+from carlasc.converting.exporter import Exported, Exporter, Files, FrameExporter, SequenceExporter, SequenceFile
 from carlasc.converting.exporting import ExportResult, export
-from carlasc.converting.frames import VOXEL_FILES
+from carlasc.converting.options import option_names
 from carlasc.converting.protocol import (
+    Cloud,
     Converter,
-    Exporter,
-    FrameContent,
     FrameHandle,
     Recording,
+    Sensor,
     Split,
+    Trajectory,
     VoxelContent,
 )
-from carlasc.converting.registry import converter_names, load_converter
+from carlasc.converting.registry import (
+    converter_names,
+    exporter_names,
+    load_converter,
+    load_exporter,
+    remaps_to_carla,
+)
+from carlasc.converting.resampling import TargetFrame, is_same, resample_to, resampling_notes
 from carlasc.converting.results import ConvertResult, Failure
 from carlasc.converting.run import convert
+from carlasc.converting.scans import VOXEL_FILES
 from carlasc.storage.metadata import Axes
 
 __all__ = [
     "VOXEL_FILES",
     "Axes",
+    "Cloud",
     "ConvertResult",
     "Converter",
     "ExportResult",
+    "Exported",
     "Exporter",
     "Failure",
-    "FrameContent",
+    "Files",
+    "FrameExporter",
     "FrameHandle",
     "Recording",
+    "Sensor",
+    "SequenceExporter",
+    "SequenceFile",
     "Split",
+    "TargetFrame",
+    "Trajectory",
     "VoxelContent",
     "convert",
     "converter_names",
     "export",
+    "exporter_names",
+    "is_same",
     "load_converter",
+    "load_exporter",
     "mirror_boxes",
     "mirror_grid",
     "mirror_points",
     "mirror_poses",
     "mirror_spec",
+    "option_names",
+    "remaps_to_carla",
+    "resample_to",
+    "resampling_notes",
 ]

@@ -1,169 +1,158 @@
-"""The motion of a recording's actors: they are found by their numbers, frame by frame, and each one's path is then estimated.
+"""The motion of a recording's numbered actors: their points are collected while scans are read, and each one's path is then estimated.
 
-Only frame numbers and velocities are kept. The task that estimates a path reads the actor's points again, so memory does not
-grow with the recording.
+A path is estimated as soon as its actor was not seen for a while, and only its velocities are kept. So memory does not grow with the recording, except
+for the result.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.frames import Velocity
-from carlasc.converting.protocol import FrameHandle, Recording
-from carlasc.converting.results import Steps
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import invert, transform_points
-from carlasc.errors import CarlascError
-from carlasc.motion.paths import estimate_path
+from carlasc.core.geometry import Transform, invert, rotate_vectors, thin, transform_points
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.running.processes import run_all
 
-_BLOCK = 16  # frames that a worker searches in one task
+Velocity = tuple[float, float, float]
+"""(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
+
 _MAX_GAP = 10  # frames for which an actor may be hidden; after a longer gap a new path begins
 _MAX_SIGHTINGS = 400  # of one path
 _MAX_POINTS = 1000  # of one sighting
-_MIN_PATH_M = 1.0  # where no class says what moves: the visible part of a standing actor may shift by as much
+_BATCH = 32  # paths that are estimated together
 
 
 @dataclass(frozen=True)
-class _FrameBlock:
-    """Frames in which actors of some classes are looked for."""
-
-    handles: tuple[FrameHandle, ...]
-    labels: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class _Track:
-    """The frames in which one actor is seen.
+class ActorSighting:
+    """The points of one actor in one scan.
 
     Attributes:
         actor: its number.
         label: its most frequent class.
-        handles: T frames.
-        poses: (T, 4, 4) first_T_sensor of these frames.
-        times_s: (T,) seconds.
-        classes: table of the labels.
+        points: (M, 3) float32, at most some hundreds, metres, right-handed sensor frame.
     """
 
     actor: int
     label: int
-    handles: tuple[FrameHandle, ...]
-    poses: NDArray[np.float64]
-    times_s: NDArray[np.float64]
+    points: NDArray[np.float32]
+
+
+def find_actors(
+    points: NDArray[np.float32],
+    labels: NDArray[np.unsignedinteger] | None,
+    instances: NDArray[np.uint32] | None,
+    classes: ClassTable,
+) -> tuple[ActorSighting, ...]:
+    """Return the numbered actors of a scan that may move, of its (N, 4) points, (N,) class ids and (N,) numbers.
+
+    If the class table has classes of moving actors, these are the actors of these classes. If it has none, they are those of all movable
+    classes.
+    """
+    if labels is None or instances is None:
+        return ()
+    wanted = np.flatnonzero((instances > 0) & np.isin(labels, sorted(classes.moving or classes.movable)))
+    wanted = wanted[np.isfinite(points[wanted, :3]).all(axis=1)]
+    order = wanted[np.argsort(instances[wanted], kind="stable")]
+    groups = np.split(order, np.flatnonzero(np.diff(instances[order])) + 1) if len(order) else []
+    return tuple(
+        ActorSighting(
+            int(instances[own[0]]), int(np.bincount(labels[own]).argmax()), thin(points[own, :3], _MAX_POINTS)
+        )
+        for own in groups
+    )
+
+
+@dataclass
+class _Chain:
+    """The sightings of one actor without a long gap."""
+
+    actor: int
+    label_counts: dict[int, int] = field(default_factory=dict)
+    frames: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    poses: list[Transform] = field(default_factory=list)
+    points: list[NDArray[np.float32]] = field(default_factory=list)
+
+    @property
+    def label(self) -> int:
+        """The class of most sightings, the lowest of several."""
+        return max(sorted(self.label_counts), key=self.label_counts.__getitem__)
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Estimates the velocities of an actor, in a worker."""
+
     classes: ClassTable
 
+    def __call__(self, chain: _Chain) -> list[Velocity]:
+        """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
+        poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
+        sightings = [transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)]
+        positions, velocities = estimate_path(sightings, seconds, rigid=chain.label not in self.classes.deformable)
+        if not self.classes.moving and is_standing(sightings, positions, headings_of(velocities), seconds):
+            velocities = np.zeros_like(velocities)
+        sensor_T_world = invert(poses)
+        own = [
+            rotate_vectors(transform, velocity) for transform, velocity in zip(sensor_T_world, velocities, strict=True)
+        ]
+        return [(x, y, z) for x, y, z in np.stack(own).tolist()]
 
-def estimate_actor_velocities(
-    recording: Recording,
-    poses: NDArray[np.float64],
-    times: NDArray[np.float64],
-    classes: ClassTable,
-    *,
-    workers: int,
-    executor: Executor | None,
-    steps: Steps,
-) -> dict[int, dict[int, Velocity]]:
-    """Estimate the velocity of each moving actor in each frame.
 
-    If the class table has classes of moving actors, only actors of these classes get a velocity. If it has none, the paths of all
-    numbered actors of movable classes are estimated, and those whose path is short get zero.
+class ActorMotion:
+    """Collects the sightings of actors, frame by frame, and estimates their velocities.
+
+    If the class table has no classes of moving actors, actors that stay where they are get zero.
 
     Args:
-        recording: has labels and instances.
-        poses: (F, 4, 4) first_T_sensor by frame number.
-        times: (F,) seconds by frame number.
-        classes: table of the recording's labels.
-        workers: number of frames, or actors, that are worked on at the same time.
+        classes: table of the labels.
+        workers: number of actors that are worked on at the same time.
         executor: runs the work instead of processes of our own.
-        steps: is called after each frame and each actor.
-
-    Returns:
-        The velocity by frame number and actor.
     """
-    handles = {handle.number: handle for handle in recording.frames}
-    steps.expect(len(handles))
-    sightings: dict[int, dict[int, int]] = {}  # actor -> frame -> class
-    labels = tuple(sorted(classes.moving or classes.movable))
-    blocks = [_FrameBlock(tuple(recording.frames[i : i + _BLOCK]), labels) for i in range(0, len(handles), _BLOCK)]
-    with closing(run_all(_find_actors, blocks, workers=workers, executor=executor)) as found:
-        for block, actors in zip(blocks, found, strict=True):
-            for frame, actor, label in actors:
-                sightings.setdefault(actor, {})[frame] = label
-            steps(len(block.handles))
-    tracks = [
-        _Track(
-            actor,
-            int(np.bincount([by_frame[frame] for frame in frames]).argmax()),
-            tuple(handles[frame] for frame in frames),
-            poses[frames],
-            times[frames],
-            classes,
-        )
-        for actor, by_frame in sightings.items()
-        for frames in _split_at_gaps(sorted(by_frame))
-    ]
-    velocities: dict[int, dict[int, Velocity]] = {}
-    steps.expect(len(tracks))
-    with closing(run_all(_estimate_velocities, tracks, workers=workers, executor=executor)) as estimates:
-        for track, estimate in zip(tracks, estimates, strict=True):
-            for handle, velocity in zip(track.handles, estimate, strict=True):
-                velocities.setdefault(handle.number, {})[track.actor] = velocity
-            steps()
-    return velocities
 
+    def __init__(self, classes: ClassTable, workers: int = 1, executor: Executor | None = None) -> None:
+        self._estimate, self._workers, self._executor = _Estimate(classes), workers, executor
+        self._chains: dict[int, _Chain] = {}
+        self._ended: list[_Chain] = []
+        self._velocities: dict[int, dict[int, Velocity]] = {}
 
-def _find_actors(block: _FrameBlock) -> list[tuple[int, int, int]]:
-    """Return (frame, actor, class) of the actors in some frames. Frames that cannot be read are skipped: their conversion reports them."""
-    found = []
-    for handle in block.handles:
-        try:
-            labels, instances = handle.read_labels()
-        except (CarlascError, OSError):
-            continue
-        if labels is None or instances is None:
-            continue
-        numbered = np.flatnonzero(instances)
-        numbered = numbered[np.isin(labels[numbered], block.labels)]
-        for actor in np.unique(instances[numbered]).tolist():
-            own = labels[numbered[instances[numbered] == actor]]
-            found.append((handle.number, actor, int(np.bincount(own).argmax())))
-    return found
+    def add(self, frame: int, seconds: float, first_T_sensor: Transform, actors: Iterable[ActorSighting]) -> None:
+        """Add the actors of the next frame, seen by a sensor with the (4, 4) pose `first_T_sensor`."""
+        for sighting in actors:
+            chain = self._chains.get(sighting.actor)
+            if chain is None or frame - chain.frames[-1] > _MAX_GAP or len(chain.frames) >= _MAX_SIGHTINGS:
+                self._end(chain)
+                chain = self._chains[sighting.actor] = _Chain(sighting.actor)
+            chain.label_counts[sighting.label] = chain.label_counts.get(sighting.label, 0) + 1
+            chain.frames.append(frame)
+            chain.seconds.append(seconds)
+            chain.poses.append(first_T_sensor)
+            chain.points.append(sighting.points)
+        for actor in [actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP]:
+            self._end(self._chains.pop(actor))
+        if len(self._ended) >= _BATCH:
+            self._run()
 
+    def finish(self) -> Mapping[int, Mapping[int, Velocity]]:
+        """Return the velocity by frame number and actor."""
+        for actor in list(self._chains):
+            self._end(self._chains.pop(actor))
+        self._run()
+        return self._velocities
 
-def _estimate_velocities(track: _Track) -> list[Velocity]:
-    """Return the actor's velocity in each of its frames, in the sensor frame of that frame."""
-    sightings = [_read_points(track, index) for index in range(len(track.handles))]
-    rigid = track.label not in track.classes.deformable
-    velocities = estimate_path(sightings, track.times_s, rigid=rigid)[1]
-    if not track.classes.moving:
-        displacement = np.trapezoid(velocities, track.times_s, axis=0)
-        if np.linalg.norm(displacement) < _MIN_PATH_M:
-            velocities = np.zeros_like(velocities)
-    sensor_R_world = invert(track.poses)[:, :3, :3]
-    return [(x, y, z) for x, y, z in np.einsum("fij,fj->fi", sensor_R_world, velocities).tolist()]
+    def _end(self, chain: _Chain | None) -> None:
+        if chain is not None:
+            self._ended.append(chain)
 
-
-def _read_points(track: _Track, index: int) -> NDArray[np.float64]:
-    """Return (N, 3) points of the actor in one frame, world frame; none if the frame cannot be read."""
-    try:
-        content = track.handles[index].read()
-    except (CarlascError, OSError):
-        return np.empty((0, 3))
-    own = np.flatnonzero(content.instances == track.actor)
-    points = content.points[own[:: max(1, len(own) // _MAX_POINTS)], :3]
-    return transform_points(track.poses[index], points[np.isfinite(points).all(axis=1)])
-
-
-def _split_at_gaps(frames: list[int]) -> list[list[int]]:
-    """Split an actor's frames at long gaps, and long parts into pieces of at most `_MAX_SIGHTINGS`."""
-    breaks = np.flatnonzero(np.diff(frames) > _MAX_GAP) + 1
-    parts: list[list[int]] = []
-    for part in np.split(np.array(frames), breaks):
-        pieces = -(-len(part) // _MAX_SIGHTINGS)
-        parts += [piece.tolist() for piece in np.array_split(part, pieces)]
-    return parts
+    def _run(self) -> None:
+        chains, self._ended = self._ended, []
+        with closing(run_all(self._estimate, chains, workers=self._workers, executor=self._executor)) as estimates:
+            for chain, velocities in zip(chains, estimates, strict=True):
+                for frame, velocity in zip(chain.frames, velocities, strict=True):
+                    self._velocities.setdefault(frame, {})[chain.actor] = velocity

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+from numpy.typing import NDArray
+
 from carlasc import storage
+from carlasc.converting.exporter import Exported, Exporter, FrameExporter, SequenceExporter
+from carlasc.converting.options import make_exporter
 from carlasc.converting.places import check_outside
-from carlasc.converting.protocol import Exporter
-from carlasc.converting.registry import load_converter
+from carlasc.converting.records import ExportRecord
+from carlasc.converting.registry import load_exporter
 from carlasc.converting.results import Failure, Progress, Steps
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, StorageError
-from carlasc.running.processes import count_workers, run_all
+from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageError
+from carlasc.running.processes import count_workers, one_pool, run_all
 from carlasc.storage.files import remove_stale, write_atomic
 
 
@@ -27,10 +32,11 @@ class ExportResult:
 
     Attributes:
         out: root of the data set that was written.
-        sequences: the folder of each sequence in it, by the sequence's path in the source.
+        sequences: the folder of each sequence in it, or its file where a format has one, by the sequence's path in the source.
         made: number of frames that were written.
         skipped: number of frames that existed already.
         failures: frames that could not be written.
+        notes: remarks about the result, one line each.
         elapsed_s: duration in seconds.
     """
 
@@ -39,15 +45,8 @@ class ExportResult:
     made: int
     skipped: int
     failures: tuple[Failure, ...]
+    notes: tuple[str, ...]
     elapsed_s: float
-
-
-@dataclass(frozen=True)
-class _Job:
-    sequence: storage.Sequence
-    frame: int
-    exporter: Exporter
-    folder: Path
 
 
 def export(
@@ -64,81 +63,166 @@ def export(
 ) -> ExportResult:
     """Write sequences of the layout as another data set's files, so that its tools can read them.
 
-    A second run skips the frames that exist. A frame that cannot be written is reported in the result, and the others are written.
+    A second run skips the frames that exist; where a format has one file per sequence, it skips the sequences that are complete. A frame
+    that cannot be written is reported in the result, and the others are written.
 
     Args:
-        name: the other data set: "kitti".
+        name: the other data set: one of `exporter_names()`.
         source: anything that `carlasc.open` takes, or a Source.
         out: folder to write to.
         sequences: names of the sequences to export; None exports all.
         overwrite: write frames again that exist.
-        workers: number of frames that are written at the same time; None uses all cores.
+        workers: number of frames that are made at the same time; None uses all cores.
         executor: runs the work instead of processes of our own; it is not shut down.
         progress: called with the number of finished frames and the number of all frames.
-        **options: of the exporter. "kitti" takes `grid` (the grid that goes to voxels/; None takes the finest) and `predictions`
-            (whether grids are the output of a network, which goes to predictions/).
+        **options: of the exporter: the arguments of its constructor, such as `grid`. Text is read as the type of the option.
 
     Returns:
         What was written, what was skipped, and what failed.
 
     Raises:
-        ArgumentError: no data set has that name, it can only be read, or it has no such option.
-        MissingDataError: a sequence does not exist.
-        ConflictError: `out` lies inside `source`.
+        ArgumentError: no exporter has that name, or it has no such option.
+        MissingDataError: a sequence does not exist, or lacks what the export needs.
+        ConflictError: `out` lies inside `source`, or holds an export of other sequences or with other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
     start, workers = time.perf_counter(), count_workers(workers)
-    exporter = load_converter(name).exporter(**options)
-    if exporter is None:
-        raise ArgumentError("name", expected="a data set that can be written", found=f"{name!r}, which is only read")
+    exporter = make_exporter(load_exporter(name), options)
     opened, root = storage.as_source(source), Path(out)
     check_outside(root, opened.location)
-    chosen = _choose(opened, sequences)
-    folders = exporter.folders([sequence.name for sequence in chosen.values()])
-    jobs, total = [], 0
-    for sequence in chosen.values():
-        folder = root / folders[sequence.name]
-        remove_stale(folder)
-        for document, data in exporter.documents(sequence).items():
-            write_atomic(folder / document, data)
-        frames = sequence.scan_frames().tolist()
-        total += len(frames)
-        for frame in frames:
-            files = exporter.frame_files(sequence, frame)
-            if overwrite or not all((folder / file).is_file() for file in files):
-                jobs.append(_Job(sequence, frame, exporter, folder))
-    steps, failures = Steps(progress, total), []
-    steps(total - len(jobs))
-    with closing(run_all(_export_frame, jobs, workers=workers, executor=executor)) as results:
-        for job, problem in zip(jobs, results, strict=True):
-            if problem is not None:
-                failures.append(Failure(job.sequence.location, job.frame, problem))
-            steps()
+    every = _by_name(opened)
+    folders = exporter.folders(list(every))  # of all sequences: a folder's name does not depend on which are exported
+    chosen, notes = [], []
+    for sequence in _choose(every, sequences, opened.location):
+        notes += exporter.check(sequence)
+        chosen.append(Exported(sequence, folders[sequence.name], tuple(exporter.frames(sequence))))
+        if not chosen[-1].frames:
+            notes.append(f"{sequence.location} has no frame to export")
+    record = ExportRecord(root, name, exporter.product)
+    places = {_place(exporter, exported): exported.sequence for exported in chosen}
+    if not overwrite:
+        record.check(places, exporter.settings)
+    record.write(places, exporter.settings)
+    remove_stale(root)
+    steps = Steps(progress, sum(len(exported.frames) for exported in chosen))
+    with one_pool(workers, executor) as pool:
+        run = partial(run_all, workers=workers, executor=pool)
+        done = _Done([], 0, [])
+        for exported in chosen:
+            folder = root / exported.folder
+            remove_stale(folder)
+            for document, data in exporter.documents(exported.sequence).items():
+                write_atomic(folder / document, data)
+            done += _export_sequence(exporter, exported, folder, overwrite, run, steps)
+    for file, data in exporter.index(root, done.exported).items():
+        write_atomic(root / file, data)
+    written = sum(len(exported.frames) for exported in done.exported)
     return ExportResult(
         root,
-        {path: folders[sequence.name] for path, sequence in chosen.items()},
-        len(jobs) - len(failures),
-        total - len(jobs),
-        tuple(failures),
+        {exported.sequence.path: _place(exporter, exported) for exported in chosen},
+        written - done.skipped,
+        done.skipped,
+        tuple(done.failures),
+        tuple(dict.fromkeys(notes)),
         time.perf_counter() - start,
     )
 
 
-def _choose(source: storage.Source, wanted: Collection[str] | None) -> dict[str, storage.Sequence]:
-    """Return the wanted sequences by path, one per name: the Cartesian one where a sequence has both coordinates."""
-    found: dict[str, tuple[str, storage.Sequence]] = {}
-    for path, sequence in source.sequences().items():
-        if sequence.name not in found or sequence.coordinates == "cartesian":
-            found[sequence.name] = (path, sequence)
+@dataclass(frozen=True)
+class _Done:
+    """What exists after some sequences were exported."""
+
+    exported: list[Exported]
+    skipped: int
+    failures: list[Failure]
+
+    def __add__(self, other: _Done) -> _Done:
+        return _Done(self.exported + other.exported, self.skipped + other.skipped, self.failures + other.failures)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A frame to make."""
+
+    exporter: FrameExporter | SequenceExporter
+    sequence: storage.Sequence
+    frame: int
+    folder: Path
+
+
+_Run = Callable[[Callable[[_Job], Any], Sequence[_Job]], Generator[Any, None, None]]
+
+
+def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
+    """Return the sequences of a source by name: the Cartesian one where a sequence has both coordinates.
+
+    Raises:
+        FormatError: two splits have a sequence of the same name, which would be written to the same place.
+    """
+    found: dict[str, storage.Sequence] = {}
+    for sequence in source.sequences().values():
+        other = found.get(sequence.name)
+        if other is not None and other.split != sequence.split:
+            raise FormatError(
+                source.location,
+                expected="sequences of different names",
+                found=f"{other.path} and {sequence.path}",
+                advice="export one split at a time, each to a folder of its own",
+            )
+        if other is None or sequence.coordinates == "cartesian":
+            found[sequence.name] = sequence
+    return found
+
+
+def _choose(
+    found: Mapping[str, storage.Sequence], wanted: Collection[str] | None, location: str
+) -> list[storage.Sequence]:
     if wanted is not None and (unknown := [name for name in wanted if name not in found]):
         raise MissingDataError(
-            source.location, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(found)}"
+            location, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(found)}"
         )
-    return {path: sequence for name, (path, sequence) in found.items() if wanted is None or name in wanted}
+    return [sequence for name, sequence in found.items() if wanted is None or name in wanted]
 
 
-def _export_frame(job: _Job) -> str | None:
+def _place(exporter: Exporter, exported: Exported) -> str:
+    """Return what belongs to one sequence only: its folder, or its file where several sequences share a folder."""
+    if isinstance(exporter, SequenceExporter):
+        return PurePosixPath(exported.folder, exporter.file(exported.sequence)).as_posix()
+    return exported.folder
+
+
+def _export_sequence(
+    exporter: Exporter, exported: Exported, folder: Path, overwrite: bool, run: _Run, steps: Steps
+) -> _Done:
+    if isinstance(exporter, FrameExporter):
+        return _export_frames(exporter, exported, folder, overwrite, run, steps)
+    assert isinstance(exporter, SequenceExporter)
+    return _export_file(exporter, exported, folder, overwrite, run, steps)
+
+
+def _export_frames(
+    exporter: FrameExporter, exported: Exported, folder: Path, overwrite: bool, run: _Run, steps: Steps
+) -> _Done:
+    """Write the frames of a sequence that do not exist yet, each in files of its own."""
+    sequence = exported.sequence
+    jobs = [
+        _Job(exporter, sequence, frame, folder)
+        for frame in exported.frames
+        if overwrite or not all((folder / file).is_file() for file in exporter.frame_files(sequence, frame))
+    ]
+    steps(len(exported.frames) - len(jobs))
+    failures = []
+    with closing(run(_write_frame, jobs)) as results:
+        for job, problem in zip(jobs, results, strict=True):
+            if problem is not None:
+                failures.append(Failure(sequence.location, job.frame, problem))
+            steps()
+    return _done(exported, len(exported.frames) - len(jobs), failures)
+
+
+def _write_frame(job: _Job) -> str | None:
     """Write one frame's files; return the error message if it cannot be done."""
+    assert isinstance(job.exporter, FrameExporter)
     try:
         for file, data in job.exporter.make_frame(job.sequence, job.frame).items():
             write_atomic(job.folder / file, data)
@@ -147,3 +231,55 @@ def _export_frame(job: _Job) -> str | None:
     except (CarlascError, OSError) as error:
         return str(error)
     return None
+
+
+def _export_file(
+    exporter: SequenceExporter, exported: Exported, folder: Path, overwrite: bool, run: _Run, steps: Steps
+) -> _Done:
+    """Write the file of a sequence, unless it exists with all frames. A file that lacks frames is made anew."""
+    sequence, path = exported.sequence, folder / exporter.file(exported.sequence)
+    if path.is_file() and not overwrite and set(exported.frames) <= set(exporter.frames_in(path, sequence)):
+        steps(len(exported.frames))
+        return _done(exported, len(exported.frames), [])
+    part = path.with_name(f"{path.name}.part")
+    jobs = [_Job(exporter, sequence, frame, folder) for frame in exported.frames]
+    failures = []
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.unlink(missing_ok=True)  # of a run that was killed
+        with closing(run(_make_frame, jobs)) as results, exporter.open(part, sequence) as file:
+            for frame, made in zip(exported.frames, results, strict=True):
+                problem = made if isinstance(made, str) else _add(file.add, frame, made)
+                if problem is not None:
+                    failures.append(Failure(sequence.location, frame, problem))
+                steps()
+        if len(failures) < len(exported.frames):
+            part.replace(path)
+    except OSError as error:
+        raise StorageError(path, problem=f"cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return _done(exported, 0, failures)
+
+
+def _make_frame(job: _Job) -> Mapping[str, NDArray[Any]] | str:
+    """Return the arrays of a frame, or the error message if it cannot be done."""
+    assert isinstance(job.exporter, SequenceExporter)
+    try:
+        return job.exporter.make_frame(job.sequence, job.frame)
+    except (CarlascError, OSError) as error:
+        return str(error)
+
+
+def _add(add: Callable[[int, Any], None], frame: int, content: Mapping[str, NDArray[Any]]) -> str | None:
+    try:
+        add(frame, content)
+    except CarlascError as error:
+        return str(error)
+    return None
+
+
+def _done(exported: Exported, skipped: int, failures: list[Failure]) -> _Done:
+    failed = {failure.frame for failure in failures}
+    frames = tuple(frame for frame in exported.frames if frame not in failed)
+    return _Done([replace(exported, frames=frames)], skipped, failures)

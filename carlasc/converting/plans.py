@@ -11,20 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.converting.axes import mirror_poses
-from carlasc.converting.frames import Target, scan_fields
-from carlasc.converting.protocol import Converter, Recording
-from carlasc.converting.results import Steps
+from carlasc.converting.assembling import Motion, Rig
+from carlasc.converting.axes import mirror_poses, mirror_spec
+from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
+from carlasc.converting.target import Target
 from carlasc.converting.trajectory import (
+    FILE,
     KISS_ICP,
     PoseSource,
+    at_frames,
     check_poses,
-    estimate_poses,
-    read_poses,
-    times_from_first,
+    read_times,
+    read_trajectory,
+    scan_poses,
 )
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ConflictError, MissingDataError
+from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.metadata import Metadata
@@ -32,6 +36,7 @@ from carlasc.storage.protocol import SequenceWriter, Sink
 from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
 
 SplitName = Literal["train", "val", "test", "all"]
+_AROUND_S = 1.0  # of the trajectory that a frame needs: longer than a sweep
 
 
 @dataclass
@@ -41,44 +46,99 @@ class RecordingPlan:
     Attributes:
         recording: what is read.
         writer: where it is written.
-        poses: (F, 4, 4) first_T_sensor by frame number, right-handed; None until they are estimated.
-        times: (F,) seconds since the first frame, by frame number.
-        fields: names of the fields that are written for each scan.
-        missing: places in `recording.frames` of the frames whose scan is not written yet.
+        times: (F,) seconds by frame number, by the recording's clock.
+        trajectory: poses of the vehicle by the same clock; None until they are estimated.
+        poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
+        pose_source: where poses come from.
+        boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in the frame of the scan; None
+            where the data set has no boxes.
+        flow: whether flow is written.
+        note: what looks odd about the poses; None if nothing does.
+        missing: numbers of the frames whose scan is not written yet.
+        unfinished: numbers of the frames that lack what the motion of actors says, or whose scan is missing.
     """
 
     recording: Recording
     writer: SequenceWriter
-    poses: NDArray[np.float64] | None
     times: NDArray[np.float64]
-    fields: tuple[str, ...]
-    missing: list[int] = field(default_factory=list)
+    trajectory: Trajectory | None
+    poses: NDArray[np.float64] | None
+    pose_source: str
+    boxes: dict[int, Boxes] | None
+    flow: bool
+    note: str | None = None
+    missing: set[int] = field(default_factory=set)
+    unfinished: set[int] = field(default_factory=set)
+
+    def take_estimate(self, first_T_scan: NDArray[np.float64]) -> None:
+        """Take estimated poses, (F, 4, 4) by frame number."""
+        self.poses = first_T_scan
+        self.trajectory = at_frames(first_T_scan @ invert(self.recording.vehicle_T_scan), self.times)
+
+    @property
+    def rig(self) -> Rig:
+        """The sensors."""
+        return Rig(tuple(self.recording.sensors), self.recording.vehicle_T_scan)
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Names of the fields that the motion of actors gives."""
+        flow = ("flow",) if self.flow else ()
+        return flow if self.boxes is None else ("labels", "instances", "boxes", *flow)
+
+    def motion(self, handle: FrameHandle) -> Motion | None:
+        """Return the motion of the vehicle around a frame; None if it is not known when the frame is read.
+
+        Poses that are estimated on the way are not: they come from the scans. It makes no difference that an earlier run found them.
+        """
+        estimated = self.pose_source == KISS_ICP and not self.rig.needs_motion
+        if estimated or self.trajectory is None or self.trajectory.seconds is None:
+            return None
+        now = float(self.times[handle.number])
+        first, last = np.searchsorted(self.trajectory.seconds, [now - _AROUND_S, now + _AROUND_S])
+        near = slice(max(int(first) - 1, 0), int(last) + 1)
+        if len(self.trajectory.world_T_vehicle[near]) < 2:
+            near = slice(max(int(first) - 2, 0), int(last) + 2)
+        return Motion(Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now)
 
 
 def choose_recordings(
     recordings: list[Recording], source: Path, wanted: Collection[str] | None, split: SplitName
 ) -> list[Recording]:
-    """Return the recordings with the wanted numbers and of the wanted split.
+    """Return the recordings that were asked for, by the whole name or its last part, and of the wanted split.
 
     Raises:
-        MissingDataError: a number does not exist, or no recording is left; lists those that exist.
+        MissingDataError: a name does not exist, or no recording is left; lists those that exist.
+        ConflictError: two recordings have one name.
     """
-    by_number = {recording.name.rpartition("_")[2]: recording for recording in recordings}
-    if wanted is not None and (unknown := [number for number in wanted if number not in by_number]):
+    by_name: dict[str, Recording] = {}
+    for recording in recordings:
+        if recording.name in by_name:
+            raise ConflictError(
+                recording.location,
+                expected="recordings with different names",
+                found=f"{recording.name}, which {by_name[recording.name].location} has too",
+                advice="convert them to different folders",
+            )
+        by_name[recording.name] = recording
+    short = {name.rpartition("_")[2]: name for name in by_name}
+    short = short if len(short) == len(by_name) else {name: name for name in by_name}
+    if wanted is not None and (unknown := [name for name in wanted if name not in short and name not in by_name]):
         raise MissingDataError(
-            source, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(by_number) or 'none'}"
+            source, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(short) or 'none'}"
         )
+    asked = None if wanted is None else {short.get(name, name) for name in wanted}
     chosen = [
         recording
-        for number, recording in by_number.items()
-        if (wanted is None or number in wanted) and split in ("all", recording.split.lower())
+        for name, recording in by_name.items()
+        if (asked is None or name in asked) and split in ("all", recording.split.lower())
     ]
     chosen = [recording for recording in chosen if recording.frames or recording.problems()]
     if not chosen:
-        found = ", ".join(f"{number} ({r.split}, {len(r.frames)} scans)" for number, r in by_number.items())
+        found = ", ".join(f"{name} ({by_name[n].split}, {len(by_name[n].frames)} scans)" for name, n in short.items())
         raise MissingDataError(source, expected=f"sequences with scans in the split {split}", found=found or "none")
     if empty := [recording for recording in chosen if not recording.frames]:
-        raise MissingDataError(f"{empty[0].location}/velodyne", expected="scans", found="none", advice="copy them")
+        raise MissingDataError(empty[0].location, expected="scans", found="none", advice="copy them")
     return chosen
 
 
@@ -91,73 +151,152 @@ def plan_recording(
     flow: bool,
     force: bool,
 ) -> RecordingPlan:
-    """Read a recording's poses and times, check them, and find out which frames are missing. Nothing is written."""
+    """Read a recording's poses, times and boxes, check them, and find out which frames are missing. Nothing is written."""
     writer = sink.sequence(f"{recording.split}/{recording.name}/cartesian")
-    poses = read_poses(recording, pose_source, force=force)
-    if poses is not None and not force and writer.read_document(layout.POSES) is None:
-        check_poses(recording, converter, poses)
-    fields = scan_fields(labelled=recording.has_labels, flow=flow and recording.has_labels)
-    missing = [
-        index
-        for index, handle in enumerate(recording.frames)
-        if not all(writer.has(name, handle.number) for name in fields)
-    ]
-    return RecordingPlan(recording, writer, poses, times_from_first(recording), fields, missing)
+    times = read_times(recording)
+    trajectory = read_trajectory(recording, times, pose_source, force=force)
+    poses = None if trajectory is None else scan_poses(trajectory, recording, times)
+    note = None
+    if recording.rays and poses is not None and not force and writer.read_document(layout.POSES) is None:
+        note = check_poses(recording, converter, poses)
+    boxes = _read_boxes(recording)
+    flow = flow and (boxes is not None or (recording.has_labels and recording.has_instances))
+    source = KISS_ICP if trajectory is None else FILE
+    plan = RecordingPlan(recording, writer, times, trajectory, poses, source, boxes, flow, note)
+    for handle in recording.frames:
+        if not writer.has("points", handle.number):
+            plan.missing.add(handle.number)
+        if not writer.has("points", handle.number) or not _finished(plan, handle.number):
+            plan.unfinished.add(handle.number)
+    return plan
+
+
+def _finished(plan: RecordingPlan, number: int) -> bool:
+    """Return whether a frame whose scan is written has all that the motion of actors says."""
+    if plan.boxes is None and not plan.writer.has("instances", number):
+        return True  # the frame has no numbers in the data set
+    return all(plan.writer.has(name, number) for name in plan.added)
+
+
+def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
+    """Return the boxes of the frames of a recording in the frame of the scan; None if the data set has none."""
+    boxes = recording.boxes()
+    if boxes is None:
+        return None
+    last = recording.frames[-1].number
+    scan_T_vehicle = invert(recording.vehicle_T_scan)
+    moved = not np.array_equal(scan_T_vehicle, np.eye(4))
+    found = {}
+    for number, own in boxes.items():
+        if number <= last:  # also of frames without a scan: they tell how an object moves
+            try:
+                found[number] = own.transform(scan_T_vehicle) if moved else own
+            except FormatError as error:
+                raise error.within(f"{recording.location}: frame {number}") from error
+    return found
 
 
 def check_voxel_grid(plan: RecordingPlan, target: Target) -> None:
     """Check that the data set's own voxels may be written where the plan says.
 
     Raises:
+        MissingDataError: the recording has no voxels.
         ConflictError: another grid of that name exists there.
     """
-    if target.voxels is not None:
+    if target.voxels:
+        if plan.recording.voxels is None:
+            raise MissingDataError(
+                plan.recording.location,
+                expected="voxel grids",
+                found="none",
+                advice="copy them too, or take another value of `grids`",
+            )
         frames = [handle.number for handle in plan.recording.frames]
-        params = _voxel_params(target.voxels, target)
-        check_grid(plan.writer, layout.grid_folder(target.voxels), params, frames, overwrite=False)
+        params = voxel_params(plan.recording.voxels, target)
+        check_grid(plan.writer, layout.grid_folder(plan.recording.voxels), params, frames, overwrite=False)
 
 
-def write_documents(
-    plan: RecordingPlan, target: Target, converter: type[Converter], metadata: Metadata, steps: Steps
-) -> None:
-    """Write poses, times, carlasc.json and the voxel grid's params.json. Poses that are missing are estimated first.
+def begin(plan: RecordingPlan, target: Target, metadata: Metadata) -> None:
+    """Write carlasc.json, times and the voxel grid's params.json, and take over the poses that an earlier run estimated.
 
-    Estimated poses of an earlier run are kept, because a second estimate might differ in its last digits.
+    A second estimate might differ in its last digits.
 
     Raises:
         ConflictError: other poses, times or metadata exist there.
     """
     writer = plan.writer
-    origin = "file" if plan.poses is not None else KISS_ICP
-    metadata = replace(metadata, extra={"poses": origin})
+    extra: dict[str, object] = {**metadata.extra, "poses": plan.pose_source, "sensors": _sensors(plan, target)}
+    if plan.boxes is not None and not plan.recording.has_labels:
+        extra["labels"] = "boxes"
+    if not plan.recording.rays:
+        extra["rays"] = False
     where = f"{writer.location}/{layout.METADATA}"
     existing = writer.read_document(layout.METADATA)
     before = None if existing is None else Metadata.from_json(existing, where)
-    if before is not None and before.extra.get("poses") != origin:
+    if before is not None and before.extra.get("poses") != plan.pose_source:
         raise ConflictError(
             where,
-            expected=f"poses from {origin}",
+            expected=f"poses from {plan.pose_source}",
             found=str(before.extra.get("poses", "others")),
             advice="write to another place",
         )
-    documents = {layout.METADATA: agree_metadata(writer, metadata)}
+    documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
+    documents[layout.TIMES] = agree_times(writer, plan.times - plan.times[0])
+    if target.voxels and plan.recording.voxels is not None:
+        params = voxel_params(plan.recording.voxels, target)
+        documents[layout.params_file(layout.grid_folder(plan.recording.voxels))] = to_json(params)
+    _write(plan, documents)
     estimated = writer.read_document(layout.POSES) if plan.poses is None else None
     if estimated is not None:
         stored = layout.decode_poses(estimated, f"{writer.location}/{layout.POSES}")
-        plan.poses = mirror_poses(stored) if target.mirrored else stored
-    elif plan.poses is None:
-        steps.expect(len(plan.recording.frames))
-        plan.poses = estimate_poses(plan.recording, converter, steps)
-    documents[layout.POSES] = agree_poses(writer, mirror_poses(plan.poses) if target.mirrored else plan.poses)
-    documents[layout.TIMES] = agree_times(writer, plan.times)
-    if target.voxels is not None:
-        params = _voxel_params(target.voxels, target)
-        documents[layout.params_file(layout.grid_folder(target.voxels))] = to_json(params)
+        plan.take_estimate(mirror_poses(stored) if target.mirrored else stored)
+    if plan.poses is not None:
+        write_poses(plan, target)
+
+
+def write_poses(plan: RecordingPlan, target: Target) -> None:
+    """Write poses.txt.
+
+    Raises:
+        ConflictError: other poses exist there.
+    """
+    assert plan.poses is not None
+    poses = mirror_poses(plan.poses) if target.mirrored else plan.poses
+    _write(plan, {layout.POSES: agree_poses(plan.writer, poses)})
+
+
+def write_heights(plan: RecordingPlan, height_m: float) -> None:
+    """Add the height of the first sensor above the ground to carlasc.json, if it is not known."""
+    data = plan.writer.read_document(layout.METADATA)
+    if data is None:
+        return
+    metadata = Metadata.from_json(data, f"{plan.writer.location}/{layout.METADATA}")
+    sensors = [dict(sensor) for sensor in metadata.extra.get("sensors", [])]
+    if sensors and "height_m" not in sensors[0]:
+        sensors[0] |= {"height_m": round(height_m, 2), "height_from": "ground"}
+        updated = replace(metadata, extra={**metadata.extra, "sensors": sensors})
+        plan.writer.write_document(layout.METADATA, updated.to_json())
+
+
+def _write(plan: RecordingPlan, documents: dict[str, bytes | None]) -> None:
     for document, data in documents.items():
         if data is not None:
-            writer.write_document(document, data)
+            plan.writer.write_document(document, data)
 
 
-def _voxel_params(spec: GridSpec, target: Target) -> dict[str, object]:
+def _sensors(plan: RecordingPlan, target: Target) -> list[dict[str, object]]:
+    """Return the record of each sensor in carlasc.json: its name, 12 numbers of its pose in the frame of scans, and its height if known."""
+    records = []
+    for sensor in plan.recording.sensors:
+        pose = invert(plan.recording.vehicle_T_scan) @ sensor.vehicle_T_sensor
+        pose = mirror_poses(pose) if target.mirrored else pose
+        record: dict[str, object] = {"name": sensor.name, "scan_T_sensor": pose[:3].reshape(-1).tolist()}
+        records.append(record | ({} if sensor.height_m is None else {"height_m": sensor.height_m}))
+    return records
+
+
+def voxel_params(spec: GridSpec, target: Target) -> dict[str, object]:
+    """Return the params.json of the data set's own voxel grid, whose right-handed geometry is `spec`."""
     record = {"version": carlasc.__version__, "source": "voxels"}
+    spec = mirror_spec(spec) if target.mirrored else spec
     return spec.to_params(target.classes.num_channels) | {"carlasc": record}

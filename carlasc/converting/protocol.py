@@ -5,8 +5,9 @@ Another distribution adds a converter by a class that inherits `Converter` and a
     [project.entry-points."carlasc.converters"]
     name = "package.module:Class"
 
-A converter gives everything as the other data set has it: in right-handed axes (y to the left) and with its class ids. Mirroring,
-remapping, poses from scans, flow and grids are the same for all converters, and `carlasc.convert` does them.
+A converter gives everything as the other data set has it: in right-handed axes (x forward, y to the left, z up) and with its class ids.
+What a data set does not have is absent. Mirroring, remapping, poses from scans, deskewing, labels and flow from boxes, and grids are the
+same for all converters, and `carlasc.convert` does them.
 """
 
 from __future__ import annotations
@@ -14,39 +15,79 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc import storage
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.geometry import Transform, check_rigid, slerp
 from carlasc.core.grids import GridSpec
+from carlasc.errors import ArgumentError, FormatError
 
 Split = Literal["Train", "Val", "Test"]
 
 
 @dataclass(frozen=True)
-class FrameContent:
-    """The content of one frame of another data set.
+class Sensor:
+    """A LiDAR of a recording, and how its points are given.
 
     Attributes:
-        points: (N, 4) float32: x, y, z in metres, right-handed sensor frame, and remission.
-        labels: (N,) class ids of the data set, 0 unlabelled; None if the frame has no labels.
+        name: the data set's name of it.
+        vehicle_T_sensor: (4, 4) float64 pose of the sensor in the frame of the vehicle.
+        points_in: "sensor" if its points are given in its own frame, "vehicle" if in that of the vehicle.
+        deskewed: whether the points are where they would be if all were taken at the time of the frame. If not, clouds with `seconds`
+            are corrected by the motion of the vehicle.
+        height_m: height of the sensor above the ground; None if it is not known.
+        calibrated: whether `vehicle_T_sensor` is known. If not, it is an assumption: the identity, or what `Recording.notes` says.
+    """
+
+    name: str = "lidar"
+    vehicle_T_sensor: Transform = field(default_factory=lambda: np.eye(4))
+    points_in: Literal["sensor", "vehicle"] = "sensor"
+    deskewed: bool = True
+    height_m: float | None = None
+    calibrated: bool = True
+
+    def __post_init__(self) -> None:
+        check_rigid(self.vehicle_T_sensor, f"sensor {self.name}")
+
+    @property
+    def vehicle_T_points(self) -> Transform:
+        """(4, 4) from the frame of the points to that of the vehicle."""
+        return self.vehicle_T_sensor if self.points_in == "sensor" else np.eye(4)
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """(3,) position of the sensor in the frame of the points, metres."""
+        return np.zeros(3) if self.points_in == "sensor" else self.vehicle_T_sensor[:3, 3]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The points that one sensor took for a frame.
+
+    Attributes:
+        points: (N, 4) float32: x, y, z in metres, right-handed, in the frame that the sensor says, and remission (0 if unknown).
+        labels: (N,) class ids of the data set, 0 unlabelled; None if the points have no labels.
         instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same number in all frames of the
-            recording, whether it moves or not. None if the frame has no instances.
-        others: further fields of the layout with a row per point, by name; vectors right-handed. They are written as they are.
-        boxes: tracked boxes with class ids of the data set, right-handed sensor frame; tracks have the numbers of `instances` where
-            the frame has both. None if the frame was not annotated.
+            recording, whether it moves or not, and in its boxes. None if the points have no instances.
+        seconds: (N,) time of each point after the time of the frame; None if it is unknown.
+        origins: (N, 3) float32, where the ray of each point began, metres, in the frame of the points; None: at the sensor.
+        others: further fields of the layout with a row per point, by name; vectors right-handed, in the frame of the points.
+        sensor: index of the sensor in `Recording.sensors`.
     """
 
     points: NDArray[np.float32]
     labels: NDArray[np.unsignedinteger] | None = None
     instances: NDArray[np.uint32] | None = None
+    seconds: NDArray[np.floating] | None = None
+    origins: NDArray[np.float32] | None = None
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    boxes: Boxes | None = None
+    sensor: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,33 +102,65 @@ class VoxelContent:
 
     labels: NDArray[np.unsignedinteger]
     known: NDArray[np.bool_]
-    files: Mapping[str, bytes]
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the vehicle was.
+
+    Attributes:
+        world_T_vehicle: (K, 4, 4) float64, right-handed.
+        seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose i is that of frame i.
+
+    Raises:
+        FormatError: shapes do not match, a pose is not rigid, or times do not increase.
+    """
+
+    world_T_vehicle: NDArray[np.float64]
+    seconds: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        check_rigid(self.world_T_vehicle, "poses")
+        if self.seconds is not None and len(self.seconds) != len(self.world_T_vehicle):
+            raise FormatError(
+                "poses", expected=f"a time for each of {len(self.world_T_vehicle)}", found=f"{len(self.seconds)} times"
+            )
+        if self.seconds is not None and not (np.diff(self.seconds) > 0).all():
+            row = int(np.argmin(np.diff(self.seconds))) + 1
+            raise FormatError("poses", expected="times that increase", found=f"none at pose {row}")
+
+    def at(self, seconds: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return (..., 4, 4) world_T_vehicle at some times (...,), by the clock of `seconds`, which must be known.
+
+        Between two poses, positions are interpolated linearly and rotations by slerp. Before the first and after the last pose, the
+        nearest motion goes on.
+        """
+        assert self.seconds is not None
+        return slerp(self.world_T_vehicle, self.seconds, seconds)
 
 
 class FrameHandle(ABC):
     """One frame. It holds paths and numbers only, so that it can be pickled into a worker and read there.
 
     Attributes:
-        number: the frame's number, from 0. Line `number` of poses and times belongs to this frame.
+        number: the frame's number, from 0. Row `number` of times belongs to this frame, and of poses without times.
         location: the name of the frame in error messages: the file of its points.
+        labelled: whether its points have labels, if the recording has labels at all.
     """
 
     number: int
     location: str
+    labelled: bool = True
 
     @abstractmethod
-    def read(self) -> FrameContent:
-        """Read points, labels and instances.
+    def read(self) -> Sequence[Cloud]:
+        """Read what each sensor saw. A conversion reads a frame once.
 
         Raises:
             MissingDataError: a file does not exist.
             FormatError: a file does not hold what it must.
         """
-
-    def read_labels(self) -> tuple[NDArray[np.unsignedinteger] | None, NDArray[np.uint32] | None]:
-        """Read only labels and instances. Override it where they have files of their own, which is faster."""
-        content = self.read()
-        return content.labels, content.instances
 
     def read_voxels(self) -> VoxelContent | None:
         """Read the frame's voxel grid; None if it has none."""
@@ -97,23 +170,34 @@ class FrameHandle(ABC):
 class Recording(ABC):
     """One sequence of another data set.
 
+    The frame of its vehicle has x forward, y to the left and z up. In the layout, a scan has these axes too, and its origin is the first
+    sensor.
+
     Attributes:
         name: name of the sequence in the layout, such as "KITTI_00".
         split: the split that it belongs to.
         location: its name in error messages.
         frames: its frames, by increasing number.
-        has_labels: whether frames have labels and instances.
+        sensors: its LiDARs; the first is the origin of scans.
+        has_labels: whether points of some frames have labels.
+        has_instances: whether points of some frames have instances.
+        voxels: geometry of its own voxel grids, right-handed, in the frame of scans; None if it has none.
+        rays: whether each point was seen from its sensor, so that there is free space between the two. A cloud whose sensor is not
+            known has no rays, and no grids are made from its scans.
     """
 
     name: str
     split: Split
     location: str
     frames: Sequence[FrameHandle]
-    has_labels: bool
+    sensors: Sequence[Sensor] = (Sensor(),)
+    has_labels: bool = False
+    has_instances: bool = False
+    voxels: GridSpec | None = None
+    rays: bool = True
 
-    @abstractmethod
-    def poses(self, *, force: bool = False) -> NDArray[np.float64] | None:
-        """Return (F, 4, 4) world_T_sensor by frame number, right-handed; None if the recording has no poses.
+    def poses(self, *, force: bool = False) -> Trajectory | None:
+        """Return the poses of the vehicle; None if the recording has none.
 
         Args:
             force: continue without a calibration that the poses need.
@@ -122,38 +206,37 @@ class Recording(ABC):
             FormatError: a file does not hold what it must.
             MissingDataError: a file without which the poses cannot be used does not exist.
         """
+        return None
 
     def times(self) -> NDArray[np.float64] | None:
-        """Return (F,) seconds by frame number; None if the recording has no times."""
+        """Return (F,) seconds by frame number; None if the recording has no times. Frames that do not exist may have any time."""
+        return None
+
+    def boxes(self) -> Mapping[int, Boxes] | None:
+        """Return the tracked boxes of each annotated frame, by number, in the frame of the vehicle; None if the data set has none.
+
+        Labels are class ids of the data set. A frame without an entry was not annotated; an entry without boxes means that the
+        annotators saw nothing.
+
+        Raises:
+            FormatError: a file does not hold what it must.
+        """
         return None
 
     def problems(self) -> list[tuple[int, str]]:
         """Return (frame number, message in one line) of frames that should exist and do not."""
         return []
 
+    def notes(self) -> list[str]:
+        """Return what users must know of the recording, one line each, such as what is missing and what was assumed instead."""
+        return []
 
-class Exporter(ABC):
-    """Makes another data set's files from a sequence of the layout. It returns their bytes, and `carlasc.export` writes them."""
-
-    @abstractmethod
-    def folders(self, names: Sequence[str]) -> dict[str, str]:
-        """Return the folder of each sequence, by the sequence's name, relative to the root of the data set."""
-
-    @abstractmethod
-    def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
-        """Return the files that a sequence has once, by their path in its folder."""
-
-    @abstractmethod
-    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
-        """Return the paths of the files that `make_frame` gives."""
-
-    @abstractmethod
-    def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, bytes | memoryview]:
-        """Return a frame's files, by their path in the sequence's folder.
-
-        Raises:
-            CarlascError: the frame cannot be read, or cannot be expressed in the other format.
-        """
+    @cached_property
+    def vehicle_T_scan(self) -> Transform:
+        """(4, 4), from the frame of the scans in the layout to that of the vehicle: the axes are the same."""
+        transform = np.eye(4)
+        transform[:3, 3] = self.sensors[0].vehicle_T_sensor[:3, 3]
+        return transform
 
 
 class Converter(ABC):
@@ -161,26 +244,36 @@ class Converter(ABC):
 
     Attributes:
         source: folder of the data set, or of one of its sequences.
+        options: what the user gave beside it, by name; all are text.
         title: what it reads, in a few words.
+        option_names: the options that it takes.
         classes: the data set's class table.
         to_carla: maps its ids to CarlaSC's.
         sensor: the sensor that took the scans.
         min_range_m: nearer points are left out of grids: they belong to the vehicle that carries the sensor.
         max_range_m: farther points are left out of grids: they are too sparse to tell free space from occupied space.
-        voxels: geometry of the data set's own voxel grids, right-handed; None if it has none.
+        license: licence of the data, such as "CC BY-NC-SA 4.0", which holds for what is made from them too; None if it is not known.
     """
 
     title: ClassVar[str]
+    option_names: ClassVar[tuple[str, ...]] = ()
     classes: ClassVar[ClassTable]
     to_carla: ClassVar[Remap]
     sensor: ClassVar[str | None] = None
     min_range_m: ClassVar[float | None] = None
     max_range_m: ClassVar[float | None] = None
-    voxels: ClassVar[GridSpec | None] = None
+    license: ClassVar[str | None] = None
 
-    def __init__(self, source: Path) -> None:
-        """Remember where the data set is."""
-        self.source = source
+    def __init__(self, source: Path, **options: str) -> None:
+        """Remember where the data set is.
+
+        Raises:
+            ArgumentError: the converter has no such option.
+        """
+        if unknown := sorted(set(options) - set(self.option_names)):
+            names = f"one of {', '.join(self.option_names)}" if self.option_names else "no options for this data set"
+            raise ArgumentError("option", expected=names, found=", ".join(unknown))
+        self.source, self.options = source, options
 
     @abstractmethod
     def sequences(self) -> list[Recording]:
@@ -189,8 +282,3 @@ class Converter(ABC):
         Raises:
             MissingDataError: none exists; says what was looked for.
         """
-
-    @classmethod
-    def exporter(cls, **options: Any) -> Exporter | None:
-        """Return the exporter that writes the data set's own format; None if it can only be read."""
-        return None

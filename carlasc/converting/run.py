@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from concurrent.futures import Executor
-from contextlib import ExitStack, closing
-from dataclasses import replace
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from carlasc.converting.frames import Block, FrameJob, Target, Velocity, convert_block, write_fields
 from carlasc.converting.places import check_outside
 from carlasc.converting.plans import (
     RecordingPlan,
@@ -19,15 +17,17 @@ from carlasc.converting.plans import (
     check_voxel_grid,
     choose_recordings,
     plan_recording,
-    write_documents,
 )
 from carlasc.converting.protocol import Converter
 from carlasc.converting.registry import load_converter
+from carlasc.converting.regridding import Regridding
 from carlasc.converting.results import ConvertResult, Failure, Progress, Steps
+from carlasc.converting.stages import Conversion
+from carlasc.converting.target import Target
 from carlasc.converting.trajectory import PoseSource
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError
-from carlasc.running.processes import count_workers, run_all
+from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.running.processes import count_workers, one_pool
 from carlasc.storage.folders.folder import FolderSink
 from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.protocol import Sink
@@ -36,13 +36,11 @@ if TYPE_CHECKING:
     from carlasc.groundtruth.options import FromScans, Voting
 
 Grids = Literal["scans", "voxels", "none"]
-Flow = Literal["instances", "none"]
-
-_BLOCK = 8  # frames that a worker converts in one task
+Flow = Literal["auto", "none"]
 
 
 def convert(
-    name: str,
+    name: str | type[Converter],
     source: str | os.PathLike[str],
     out: str | os.PathLike[str] | Sink,
     *,
@@ -54,8 +52,10 @@ def convert(
     spec: GridSpec | None = None,
     observe: FromScans | None = None,
     voting: Voting | None = None,
+    follow_ground: bool = True,
     poses: PoseSource = "auto",
-    flow: Flow = "instances",
+    flow: Flow = "auto",
+    options: Mapping[str, str] | None = None,
     allow_unknown: bool = False,
     force: bool = False,
     workers: int | None = None,
@@ -68,10 +68,11 @@ def convert(
     Worker processes import the main module again: scripts call this under `if __name__ == "__main__":`, or with `workers=1`.
 
     Args:
-        name: the converter: "kitti", "poss", or one of another distribution (see `converter_names`).
+        name: the converter: "kitti", "argoverse2", ..., or one of another distribution (see `converter_names`); or a class that
+            inherits `Converter`.
         source: folder of the data set, or of one of its sequences.
         out: folder to write to, or any Sink (then without grids).
-        sequences: which ones, by the last part of their names ("00"); None converts all.
+        sequences: which ones, by their names or the last part of them ("00"); None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids.
         axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
@@ -80,9 +81,12 @@ def convert(
         spec: with "scans": the grid; None takes the published coarse one.
         observe: with "scans": which scans are merged, and how moving points are treated.
         voting: with "scans": how votes are counted.
+        follow_ground: with "scans": move the grid up or down by whole voxels where the ground is below it, or far above its lower
+            bound; False keeps the bounds of `spec`.
         poses: "file", "kiss-icp" (estimated from the scans), or "auto": the file where it exists, else estimated.
-        flow: "instances" estimates the velocity of every moving actor from its points; "none" writes no flow. Without labels no
-            flow is written.
+        flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
+            the actor's points, if they are numbered; "none" writes no flow.
+        options: what the converter takes beside the source, as text: see its page in the documentation.
         allow_unknown: treat class ids that the table does not have as unlabelled.
         force: accept poses under which the scans do not overlap, or whose calibration is missing.
         workers: number of frames that are converted at the same time; None uses all cores.
@@ -94,78 +98,68 @@ def convert(
 
     Raises:
         ArgumentError: an argument has a wrong value, or no converter has that name.
-        MissingDataError: a sequence or the poses do not exist.
+        MissingDataError: `source`, a sequence or the poses do not exist.
         FormatError: poses or times do not fit the frames, or the scans.
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
     start, workers = time.perf_counter(), count_workers(workers)
-    converter = load_converter(name)
-    _check(name, converter, classes=classes, axes=axes, grids=grids, split=split, poses=poses, flow=flow)
+    converter = load_converter(name) if isinstance(name, str) else name
+    _check(converter, classes=classes, axes=axes, grids=grids, split=split, poses=poses, flow=flow)
     root = Path(source)
     sink = out if isinstance(out, Sink) else FolderSink(out)
     _check_sink(root, sink, grids)
-    recordings = choose_recordings(converter(root).sequences(), root, sequences, split)
-    target = Target(
-        converter.classes,
-        converter.to_carla if classes == "carla" else None,
-        mirrored=axes == "left",
-        allow_unknown=allow_unknown,
-        voxels=converter.voxels if grids == "voxels" else None,
-    )
+    if not root.exists():
+        raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
+    recordings = choose_recordings(converter(root, **(options or {})).sequences(), root, sequences, split)
+    remap = converter.to_carla if classes == "carla" else None
+    target = Target(converter.classes, remap, axes == "left", allow_unknown, voxels=grids == "voxels")
     metadata = Metadata(
         axes,
         target.classes,
         converter.sensor,
         converter.min_range_m,
         converter.max_range_m,
-        f"{name} {root.name}",
+        f"{name if isinstance(name, str) else name.__name__} {root.name}",
+        {} if converter.license is None else {"license": converter.license},
     )
-
     plans = [
-        plan_recording(recording, converter, sink, poses, flow=flow == "instances", force=force)
-        for recording in recordings
+        plan_recording(recording, converter, sink, poses, flow=flow == "auto", force=force) for recording in recordings
     ]
     for plan in plans:
+        _check_grids(plan, grids)
         check_voxel_grid(plan, target)
     steps = Steps(progress, sum(len(plan.recording.frames) for plan in plans))
-    failures, notes, made = [], [], 0
-    with ExitStack() as writers:
+    done: list[Conversion] = []
+    with one_pool(workers, executor) as pool, ExitStack() as writers:
         for plan in plans:
             writers.enter_context(plan.writer)
-            write_documents(plan, target, converter, metadata, steps)
-            velocities = _actor_velocities(plan, target, workers, executor, steps)
-            without_flow = 0
-            blocks = _blocks(plan, target, velocities)
-            steps(len(plan.recording.frames) - sum(len(block.jobs) for block in blocks))
-            with closing(run_all(convert_block, blocks, workers=workers, executor=executor)) as results:
-                for result in results:
-                    for number, outputs in result.outputs.items():
-                        write_fields(plan.writer, number, outputs)
-                    failures += [Failure(plan.recording.location, *failure) for failure in result.failures]
-                    without_flow += result.without_flow
-                    steps(len(result.block.jobs))
-            failed = {f.frame for f in failures if f.sequence == plan.recording.location}
-            made += sum(plan.recording.frames[i].number not in failed for i in plan.missing)
-            failures += [Failure(plan.recording.location, *problem) for problem in plan.recording.problems()]
-            notes += _notes(plan, without_flow)
-    grid_paths, more = (
-        _regrid(plans, spec, observe, voting, force, workers, executor, steps, failures)
-        if grids == "scans"
-        else ((), [])
-    )
+            done.append(Conversion(plan, converter, target, workers, pool, steps))
+            done[-1].run(metadata)
+    failures = [failure for conversion in done for failure in conversion.failures]
+    notes = [note for conversion in done for note in conversion.notes]
+    grid_paths: list[str] = []
+    if grids == "scans":
+        regridding = Regridding(spec, observe, voting, follow_ground, force, workers, executor, steps)
+        fitted, remarks = regridding.fit(done, sink.location)
+        notes += remarks
+        for conversion in done:
+            result = regridding.run(conversion, fitted)
+            grid_paths += result.grids
+            notes += result.notes
+            failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
     return ConvertResult(
         tuple(plan.writer.location for plan in plans),
-        made,
-        sum(len(plan.recording.frames) - len(plan.missing) for plan in plans),
+        sum(conversion.made for conversion in done),
+        sum(len(plan.recording.frames) - len(plan.unfinished) for plan in plans),
         tuple(failures),
-        grid_paths,
-        tuple(notes + more),
+        tuple(grid_paths),
+        tuple(notes),
         time.perf_counter() - start,
     )
 
 
-def _check(name: str, converter: type[Converter], **given: str) -> None:
+def _check(converter: type[Converter], **given: str) -> None:
     allowed: dict[str, tuple[str, ...]] = {
         "classes": ("carla", converter.classes.name),
         "axes": get_args(Axes),
@@ -177,12 +171,15 @@ def _check(name: str, converter: type[Converter], **given: str) -> None:
     for option, value in given.items():
         if value not in allowed[option]:
             raise ArgumentError(option, expected=f"one of {', '.join(allowed[option])}", found=repr(value))
-    if given["grids"] == "voxels" and converter.voxels is None:
+
+
+def _check_grids(plan: RecordingPlan, grids: Grids) -> None:
+    if grids == "scans" and not plan.recording.rays:
         raise ArgumentError(
             "grids",
-            expected="scans or none",
-            found="voxels",
-            advice=f"the data set {name} has no voxel grids of its own",
+            expected="voxels or none",
+            found=f"scans for {plan.recording.location}",
+            advice="nobody knows where its points were seen from, so free space cannot be told from unknown space",
         )
 
 
@@ -193,86 +190,3 @@ def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
         raise ArgumentError(
             "grids", expected=f"none with {sink.location}", found=grids, advice="convert to a folder, then pack it"
         )
-
-
-def _actor_velocities(
-    plan: RecordingPlan, target: Target, workers: int, executor: Executor | None, steps: Steps
-) -> dict[int, dict[int, Velocity]] | None:
-    """Return the velocity of each moving actor by frame and actor; None where no flow is written."""
-    if "flow" not in plan.fields:
-        return None
-    if not plan.missing:
-        return {}
-    from carlasc.converting.actors import estimate_actor_velocities
-
-    assert plan.poses is not None
-    return estimate_actor_velocities(
-        plan.recording, plan.poses, plan.times, target.source, workers=workers, executor=executor, steps=steps
-    )
-
-
-def _blocks(plan: RecordingPlan, target: Target, velocities: dict[int, dict[int, Velocity]] | None) -> list[Block]:
-    """Return the frames to convert: those that lack a field, or all frames where each may have voxels."""
-    missing = set(plan.missing)
-    jobs = [
-        FrameJob(handle, index in missing, None if velocities is None else velocities.get(handle.number, {}))
-        for index, handle in enumerate(plan.recording.frames)
-        if index in missing or target.voxels is not None
-    ]
-    return [Block(tuple(jobs[i : i + _BLOCK]), target, plan.writer) for i in range(0, len(jobs), _BLOCK)]
-
-
-def _notes(plan: RecordingPlan, without_flow: int) -> list[str]:
-    notes, where = [], plan.writer.location
-    if not plan.recording.has_labels:
-        notes.append(f"{where}: scans have no labels, so neither labels nor instances nor flow were written")
-    if without_flow:
-        notes.append(
-            f"{where}: {without_flow} moving points belong to no numbered actor; their flow is unknown and set to 0"
-        )
-    gaps = plan.recording.frames[-1].number + 1 - len(plan.recording.frames)
-    if gaps:
-        notes.append(f"{where}: {gaps} of {gaps + len(plan.recording.frames)} frames have no scan")
-    return notes
-
-
-def _regrid(
-    plans: Sequence[RecordingPlan],
-    spec: GridSpec | None,
-    observe: FromScans | None,
-    voting: Voting | None,
-    force: bool,
-    workers: int,
-    executor: Executor | None,
-    steps: Steps,
-    failures: list[Failure],
-) -> tuple[tuple[str, ...], list[str]]:
-    """Make grids from the converted scans: each frame's grid from the scans around it in time."""
-    from carlasc.groundtruth import FromScans, Voting, regrid
-
-    paths: list[str] = []
-    notes: list[str] = []
-    for plan in plans:
-        folder = Path(plan.writer.location)
-        last = 0
-        steps.expect(len(plan.recording.frames))
-
-        def advance(done: int, total: int) -> None:
-            nonlocal last
-            steps(done - last)
-            last = done
-
-        result = regrid(
-            folder,
-            spec or GridSpec.published(),
-            folder.parent,
-            observe=replace(observe or FromScans(), force=force),
-            voting=voting or Voting(),
-            workers=workers,
-            executor=executor,
-            progress=advance,
-        )
-        paths += result.grids
-        notes += result.notes
-        failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
-    return tuple(paths), notes

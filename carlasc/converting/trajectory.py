@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.protocol import Converter, Recording
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.converting.assembling import Rig, assemble
+from carlasc.converting.protocol import Converter, Recording, Trajectory
+from carlasc.core.geometry import relative_to
+from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
+from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
@@ -20,44 +24,103 @@ PoseSource = Literal["file", "kiss-icp", "auto"]
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
+_SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences: what no vehicle does at the rate of scans
+_JITTER_M = 0.05
 
 
-def read_poses(recording: Recording, pose_source: PoseSource, *, force: bool) -> NDArray[np.float64] | None:
-    """Return (F, 4, 4) first_T_sensor by frame number from the recording's files; None if they are to be estimated.
+def read_times(recording: Recording) -> NDArray[np.float64]:
+    """Return (F,) seconds by frame number, by the recording's own clock; 10 Hz from 0 if the recording has no times.
+
+    Raises:
+        FormatError: a frame has no time.
+    """
+    frames = recording.frames[-1].number + 1
+    times = recording.times()
+    if times is None:
+        return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
+    if len(times) < frames:
+        raise FormatError(
+            recording.location,
+            expected=f"a time for each frame up to {frames - 1}",
+            found=f"{len(times)} times",
+            advice="copy the file of times again",
+        )
+    return np.asarray(times[:frames], np.float64)
+
+
+def read_trajectory(
+    recording: Recording, times: NDArray[np.float64], pose_source: PoseSource, *, force: bool
+) -> Trajectory | None:
+    """Return the poses of the vehicle at their own times, from the recording's files; None if they are to be estimated.
+
+    Poses without times of their own are those of the frames.
 
     Raises:
         MissingDataError: the file of poses does not exist, and they are not to be estimated.
         FormatError: a frame has no pose.
     """
-    poses = None if pose_source == KISS_ICP else recording.poses(force=force)
-    if poses is None:
+    trajectory = None if pose_source == KISS_ICP else recording.poses(force=force)
+    if trajectory is None:
         if pose_source == FILE:
             raise MissingDataError(
-                recording.location,
-                expected="poses.txt",
-                found="nothing",
-                advice=f"copy it, or {_ESTIMATE}",
+                recording.location, expected="a file of poses", found="none", advice=f"copy it, or {_ESTIMATE}"
             )
         return None
     last = recording.frames[-1].number
-    if len(poses) <= last:
-        raise FormatError(
-            recording.location,
-            expected=f"a pose for each frame up to {last}",
-            found=f"{len(poses)} lines in the file of poses",
-            advice=f"copy it again, or {_ESTIMATE}",
-        )
-    relative: NDArray[np.float64] = np.linalg.inv(poses[0]) @ poses[: last + 1]
-    return relative
+    if trajectory.seconds is None:
+        if len(trajectory.world_T_vehicle) <= last:
+            raise FormatError(
+                recording.location,
+                expected=f"a pose for each frame up to {last}",
+                found=f"{len(trajectory.world_T_vehicle)} lines in the file of poses",
+                advice=f"copy it again, or {_ESTIMATE}",
+            )
+        return at_frames(trajectory.world_T_vehicle[: last + 1], times)
+    return trajectory
 
 
-def estimate_poses(recording: Recording, converter: type[Converter], step: Callable[[], object]) -> NDArray[np.float64]:
+def at_frames(world_T_vehicle: NDArray[np.float64], times: NDArray[np.float64]) -> Trajectory:
+    """Return the trajectory of (F, 4, 4) poses of frames. Where times do not increase, frames are taken to be 0.1 s apart."""
+    if not (np.diff(times) > 0).all():
+        times = np.arange(len(times), dtype=np.float64) * layout.FRAME_PERIOD_S
+    return Trajectory(world_T_vehicle, times)
+
+
+def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (F, 4, 4) first_T_scan by frame number. Poses of the frames are taken as they are, others are interpolated."""
+    given = trajectory.world_T_vehicle
+    same = trajectory.seconds is not None and np.array_equal(trajectory.seconds, times)
+    poses = (given if same or len(given) == 1 else trajectory.at(times)) @ recording.vehicle_T_scan
+    return relative_to(poses[0], poses)
+
+
+def jitter(poses: NDArray[np.float64]) -> float:
+    """Return by how many metres (F, 4, 4) poses of frames jump about a smooth path: the noise of a receiver without a filter, for instance."""
+    places = poses[:, :3, 3]
+    if len(places) < 2 * len(_SMOOTH):
+        return 0.0
+    jumps = np.stack([np.convolve(places[:, axis], _SMOOTH, mode="valid") for axis in range(3)], axis=1)
+    return float(np.median(np.linalg.norm(jumps, axis=1)) / np.linalg.norm(_SMOOTH))
+
+
+def jitter_note(poses: NDArray[np.float64]) -> str | None:
+    """Return a note if poses jump; None if they do not."""
+    found = jitter(poses)
+    if found < _JITTER_M:
+        return None
+    return f"poses jump by about {100 * found:.0f} cm from one to the next, which blurs grids: {_ESTIMATE}"
+
+
+def estimate_poses(
+    recording: Recording, converter: type[Converter], times: NDArray[np.float64], step: Callable[[], object]
+) -> NDArray[np.float64]:
     """Estimate the pose of each scan with KISS-ICP. A frame without a scan gets the pose of the scan before it.
 
-    Scans that cannot be read are skipped: their conversion reports them.
+    Points of sensors that are not corrected for motion are corrected by the estimate, if their times are known. Scans that cannot be
+    read are skipped: their conversion reports them. So are scans with too few points.
 
     Returns:
-        (F, 4, 4) first_T_sensor by frame number, right-handed.
+        (F, 4, 4) first_T_scan by frame number, right-handed.
 
     Raises:
         MissingDataError: no scan can be read.
@@ -65,30 +128,64 @@ def estimate_poses(recording: Recording, converter: type[Converter], step: Calla
     """
     from carlasc.motion import odometry
 
+    rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
     found: list[int] = []
+    seconds: deque[NDArray[np.floating]] = deque()
 
-    def scans() -> Any:
+    def scans() -> Iterator[NDArray[np.float32]]:
         for handle in recording.frames:
             step()
             try:
-                points = handle.read().points
-            except (FormatError, MissingDataError):
+                scan = assemble(handle.read(), rig, None, handle.location)
+            except (CarlascError, OSError):
+                continue
+            if len(scan.points) < odometry.MIN_POINTS:
                 continue
             found.append(handle.number)
-            yield points[np.isfinite(points).all(axis=1), :3]
+            seconds.append(scan.fields.get("seconds", np.zeros(len(scan.points), np.float32)))
+            yield scan.points[:, :3]
 
-    nearest, farthest = converter.min_range_m or 0.0, converter.max_range_m or 100.0
-    poses = odometry.estimate_poses(scans(), min_range_m=nearest, max_range_m=farthest)
-    if not len(poses):
+    nearest, farthest = odometry_range(converter)
+    poses = odometry.estimate_poses(
+        scans(),
+        seconds=(seconds.popleft() for _ in recording.frames),  # read beside the points
+        times=times[[handle.number for handle in recording.frames]],
+        min_range_m=nearest,
+        max_range_m=farthest,
+    )
+    return fill_gaps(found, poses, recording)
+
+
+def odometry_range(converter: type[Converter]) -> tuple[float, float]:
+    """Return the least and the greatest range of the points that odometry uses, in metres."""
+    return converter.min_range_m or 0.0, converter.max_range_m or 100.0
+
+
+def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
+    """Return (F, 4, 4) poses by frame number from those of some frames: others have the pose of the frame before.
+
+    Raises:
+        MissingDataError: there is none.
+    """
+    if not frames:
         raise MissingDataError(
-            recording.location, expected="scans to estimate poses from", found="none that can be read"
+            recording.location,
+            expected="scans to estimate poses from",
+            found="none that can be read and has enough points",
         )
-    lines = np.searchsorted(found, np.arange(recording.frames[-1].number + 1), side="right") - 1
+    lines = np.searchsorted(frames, np.arange(recording.frames[-1].number + 1), side="right") - 1
     return poses[np.clip(lines, 0, None)]
 
 
-def check_poses(recording: Recording, converter: type[Converter], poses: NDArray[np.float64]) -> None:
-    """Check that the scans overlap under their poses.
+def check_poses(recording: Recording, converter: type[Converter], poses: NDArray[np.float64]) -> str | None:
+    """Check that the scans overlap under their poses, which reads some scans.
+
+    Poses of another point of the vehicle, or some frames late, are accepted with a note, which is returned.
+
+    Args:
+        recording: its scans.
+        converter: says which classes do not move.
+        poses: (F, 4, 4) first_T_scan by frame number.
 
     Raises:
         FormatError: they do not; says which mistake the poses look like, and what to do.
@@ -118,29 +215,12 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
             recording.location,
             expected=expected,
             found=f"scans that are about ({x:.1f}, {y:.1f}, {z:.1f}) m away from each other",
-            advice=f"check that poses.txt and calib.txt belong to this sequence, {_ESTIMATE}, or {_ACCEPT}",
+            advice=f"check that poses and calibration belong to this sequence, {_ESTIMATE}, or {_ACCEPT}",
         )
-
-
-def times_from_first(recording: Recording) -> NDArray[np.float64]:
-    """Return (F,) seconds since the first frame, by frame number; 10 Hz if the recording has no times.
-
-    Raises:
-        FormatError: a frame has no time.
-    """
-    frames = recording.frames[-1].number + 1
-    times = recording.times()
-    if times is None:
-        return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
-    if len(times) < frames:
-        raise FormatError(
-            recording.location,
-            expected=f"a time for each frame up to {frames - 1}",
-            found=f"{len(times)} lines in times.txt",
-            advice="copy it again",
-        )
-    since: NDArray[np.float64] = times[:frames] - times[0]
-    return since
+    if diagnosis.misfit is None:
+        return None
+    found, advice = describe_misfit(diagnosis.misfit)
+    return f"{found}: {advice}, or {_ESTIMATE}"
 
 
 class _Scans(Sequence):
@@ -151,6 +231,8 @@ class _Scans(Sequence):
         self.split, self.name, self.coordinates = recording.split, recording.name, "cartesian"
         self.metadata = Metadata("right", converter.classes)
         self._handles = {handle.number: handle for handle in recording.frames}
+        self._rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
+        self._last: tuple[int, dict[str, NDArray[Any]]] = (-1, {})
 
     def fields(self) -> frozenset[str]:
         return frozenset(("points", "labels") if self.recording.has_labels else ("points",))
@@ -159,12 +241,13 @@ class _Scans(Sequence):
         return np.array(list(self._handles), np.int64) if field in self.fields() else np.empty(0, np.int64)
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
-        if field == "points":
-            return self._handles[frame].read().points
-        labels, _ = self._handles[frame].read_labels()
-        if labels is None:
-            raise MissingDataError(self.location, expected="labels", found="none")
-        return labels
+        if self._last[0] != frame:
+            handle = self._handles[frame]
+            scan = assemble(handle.read(), self._rig, None, handle.location)
+            self._last = frame, {"points": scan.points} | ({} if scan.labels is None else {"labels": scan.labels})
+        if field not in self._last[1]:
+            raise MissingDataError(self.location, expected=field, found="none")
+        return self._last[1][field]
 
     def documents(self) -> tuple[str, ...]:
         return ()

@@ -71,6 +71,8 @@ def test_failed_frames_are_listed_and_the_exit_code_is_1(source, tmp_path):
         ),
         (("--classes", "poss"), 2, "--classes: expected one of carla, semantickitti"),
         (("--sequences", "05"), 1, "expected the sequences 05, found only 00"),
+        (("--option", "color=red"), 2, "--option: expected no options for this data set, found color"),
+        (("--option", "a=1", "--option", "a=2"), 2, "--option: expected NAME=VALUE, each name once, found 'a=2'"),
         (("--preset", "coarse", "--res", "0.2"), 2, "expected one of --res, --size and --preset"),
     ],
 )
@@ -83,6 +85,6 @@ def test_mistakes_are_one_line_and_the_right_exit_code(source, tmp_path, options
 
 
 def test_an_unknown_converter_is_wrong_usage(source, tmp_path):
-    result = run("convert", "nuscenes", source, tmp_path / "out")
+    result = run("convert", "waymo", source, tmp_path / "out")
     assert result.exit_code == 2
-    assert "expected one of kitti, poss" in result.stderr
+    assert "expected one of argoverse2, " in result.stderr

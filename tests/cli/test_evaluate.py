@@ -97,3 +97,25 @@ def test_too_few_sequences_to_compare_are_said_in_one_line(data):
     result = run(*data, "--compare", data[0])
     assert (result.exit_code, result.output.count("\n")) == (2, 1)
     assert "at least 5" in result.output
+
+
+def test_files_of_semantickitti_are_scored_by_its_rules(tmp_path):
+    size = (256, 256, 32)
+    truth = np.zeros(size, "<u2")
+    truth[10:20, 120:130, 2] = 40
+    prediction = truth.copy()
+    prediction[10:15, 120:130, 2] = 10
+    for name, labels in (("voxels", truth), ("predictions", prediction)):
+        folder = tmp_path / "sequences" / "08" / name
+        folder.mkdir(parents=True)
+        labels.tofile(folder / "000000.label")
+    mask = tmp_path / "sequences" / "08" / "voxels" / "000000.invalid"
+    mask.write_bytes(np.packbits(np.zeros(size, bool)).tobytes())
+    mask.with_suffix(".bin").write_bytes(np.packbits(truth > 0).tobytes())  # the occupancy of a scan, no counts
+    values = json.loads(run(tmp_path, tmp_path, "--json").stdout)
+    assert (values["convention"], values["frames"]) == ("semantickitti", 1)
+    assert values["class_iou"]["road"] == pytest.approx(0.5)
+    assert values["iou"] == 1.0
+    near = json.loads(run(tmp_path, tmp_path, "--json", "--far", "2.9").stdout)
+    assert near["class_iou"]["road"] == pytest.approx(0.0)  # the first half of the road, from 2 to 3 m, is called a car
+    assert near["scored_voxels"] < values["scored_voxels"] == 256 * 256 * 32

@@ -12,7 +12,7 @@ from helpers.tiny_kitti import write_labels, write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert, converter_names, load_converter
-from carlasc.errors import ArgumentError, DependencyError
+from carlasc.errors import ArgumentError, DependencyError, MissingDataError
 from carlasc.storage import Sink
 from carlasc.storage.protocol import SequenceWriter
 
@@ -20,7 +20,7 @@ PLAIN = {"grids": "none", "flow": "none", "workers": 1}
 
 THIRD_PARTY = """
 import numpy as np
-from carlasc.converting import Converter, FrameContent, FrameHandle, Recording
+from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Trajectory
 from carlasc.core.classes import Remap
 from carlasc.core.tables import CARLA
 
@@ -29,13 +29,13 @@ class Handle(FrameHandle):
         self.number, self.location = number, f"lab {number}"
     def read(self):
         points = np.full((5, 4), self.number + 1, np.float32)
-        return FrameContent(points, np.full(5, 7, np.uint8), np.zeros(5, np.uint32))
+        return [Cloud(points, np.full(5, 7, np.uint8), np.zeros(5, np.uint32))]
 
 class Rec(Recording):
-    name, split, location, has_labels = "LAB_a", "Test", "lab", True
+    name, split, location, has_labels, has_instances = "LAB_a", "Test", "lab", True, True
     frames = [Handle(0), Handle(1)]
     def poses(self, *, force=False):
-        return np.tile(np.eye(4), (2, 1, 1))
+        return Trajectory(np.tile(np.eye(4), (2, 1, 1)))
 
 class Lab(Converter):
     title, classes, to_carla = "our laboratory", CARLA, Remap("lab", CARLA, CARLA, {i: i for i in CARLA.names})
@@ -81,8 +81,16 @@ def test_a_converter_that_does_not_load_is_named(installed):
 
 
 def test_what_a_converter_lacks_is_an_argument_error(installed, tmp_path):
-    with pytest.raises(ArgumentError, match="lab has no voxel grids"):
-        convert("lab", tmp_path, tmp_path / "out", grids="voxels")
+    with pytest.raises(MissingDataError, match="lab: expected voxel grids, found none"):
+        convert("lab", installed, tmp_path / "out", grids="voxels", force=True)
+    with pytest.raises(ArgumentError, match="option: expected no options for this data set, found color"):
+        convert("lab", installed, tmp_path / "out", options={"color": "red"})
+
+
+def test_a_source_that_does_not_exist_is_named(tmp_path):
+    for name in ("synthcity", "kitti-raw"):
+        with pytest.raises(MissingDataError, match="typo: expected a folder, found nothing: check the path"):
+            convert(name, tmp_path / "typo", tmp_path / "out")
 
 
 def test_semanticposs_has_its_own_classes_and_poses_of_the_lidar(tmp_path):

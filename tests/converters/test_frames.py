@@ -1,13 +1,13 @@
 """From a frame of another data set to the fields of the layout, on frames in memory."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
 from carlasc.converting import (
-    FrameContent,
+    Cloud,
+    Sensor,
+    Trajectory,
     VoxelContent,
     mirror_boxes,
     mirror_grid,
@@ -15,11 +15,12 @@ from carlasc.converting import (
     mirror_poses,
     mirror_spec,
 )
-from carlasc.converting.frames import Block, FrameJob, Target, convert_block, make_fields
+from carlasc.converting.assembling import Motion, Rig, assemble
 from carlasc.converting.places import check_outside
-from carlasc.converting.plans import choose_recordings, plan_recording, write_documents
-from carlasc.converting.results import Steps
-from carlasc.converting.trajectory import read_poses, times_from_first
+from carlasc.converting.plans import begin, choose_recordings, plan_recording
+from carlasc.converting.scans import Block, FrameJob, convert_block, make_fields
+from carlasc.converting.target import Target
+from carlasc.converting.trajectory import jitter, read_times, read_trajectory, scan_poses
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
@@ -30,12 +31,13 @@ GRID = layout.grid_folder(VOXELS)
 TO_CARLA = REMAPS["semantickitti_to_carla"]
 LEFT = Target(SEMANTICKITTI, TO_CARLA, mirrored=True)
 RIGHT = Target(SEMANTICKITTI, None, mirrored=False)
+RIG = Rig((Sensor(),), np.eye(4))
 
 
 def frame_of(labels, instances=None, number=0):
     points = np.arange(4 * len(labels), dtype=np.float32).reshape(-1, 4) + 1
     instances = np.zeros(len(labels), np.uint32) if instances is None else np.array(instances, np.uint32)
-    return MemoryFrame(number, FrameContent(points, np.array(labels, np.uint16), instances))
+    return MemoryFrame(number, Cloud(points, np.array(labels, np.uint16), instances))
 
 
 def test_only_y_of_points_and_vectors_changes_its_sign():
@@ -69,19 +71,6 @@ def test_mirrored_boxes_hold_the_mirrored_points():
     np.testing.assert_allclose(mirror_boxes(mirrored).quaternions, boxes.quaternions, atol=1e-15)
 
 
-def test_boxes_are_mirrored_and_get_the_classes_that_are_written():
-    boxes = some_boxes()
-    frame = MemoryFrame(0, FrameContent(np.ones((1, 4), np.float32), boxes=boxes))
-    left = Boxes.from_table(make_fields(frame.read(), FrameJob(frame, True), LEFT)[0]["boxes"])
-    right = make_fields(frame.read(), FrameJob(frame, True), RIGHT)[0]["boxes"]
-    assert left.labels.tolist() == [10, 4] and left.centers.tolist() == [[10, -3, -1], [5, 2, 0]]
-    assert left.tracks.tolist() == [2, 9] and left.annotated.tolist() == [True, False]
-    assert right.tobytes() == boxes.to_table().tobytes()
-    strange = FrameContent(np.ones((1, 4), np.float32), boxes=replace(boxes, labels=boxes.labels + np.uint32(200)))
-    with pytest.raises(FormatError, match=r"boxes of .*: expected class ids of semantickitti, found 210"):
-        make_fields(strange, FrameJob(frame, True), LEFT)
-
-
 def test_a_mirrored_grid_has_its_classes_at_the_mirrored_places():
     grid = np.arange(VOXELS.num_voxels).reshape(VOXELS.size)
     mirrored = mirror_spec(VOXELS)
@@ -91,18 +80,15 @@ def test_a_mirrored_grid_has_its_classes_at_the_mirrored_places():
     np.testing.assert_array_equal(mirror_grid(grid).reshape(-1)[places], grid.reshape(-1))
 
 
-def test_flow_is_the_velocity_of_each_points_actor_and_is_mirrored_with_the_points():
+def test_a_scan_is_mirrored_and_mapped_and_its_points_come_last():
     frame = frame_of([252, 252, 40, 254], [5, 6, 0, 7])
-    job = FrameJob(frame, True, {5: (1.0, 2.0, 3.0), 7: (0.0, 0.5, 0.0)})
-    right, without = make_fields(frame.read(), job, RIGHT)
-    assert right["flow"].tolist() == [[1, 2, 3], [0, 0, 0], [0, 0, 0], [0, 0.5, 0]]
-    assert without == 1  # actor 6 moves, and its velocity is unknown
-    left, _ = make_fields(frame.read(), job, LEFT)
-    assert left["flow"].tolist() == [[1, -2, 3], [0, 0, 0], [0, 0, 0], [0, -0.5, 0]]
-    assert left["points"].tolist() == (frame.read().points * [1, -1, 1, 1]).tolist()
+    scan = assemble(frame.read(), RIG, None, "scan")
+    left = make_fields(scan, LEFT, "scan")
+    assert left["points"].tolist() == (frame.content.points * [1, -1, 1, 1]).tolist()
     assert left["labels"].tolist() == [10, 10, 7, 4]
-    assert "flow" not in make_fields(frame.read(), FrameJob(frame, True), RIGHT)[0]
+    assert left["instances"].tolist() == [5, 6, 0, 7]
     assert list(left)[-1] == "points"
+    assert make_fields(scan, RIGHT, "scan")["points"] is frame.content.points
 
 
 def test_ids_beyond_16_bits_are_unknown_ids_and_not_wrapped():
@@ -121,7 +107,7 @@ def voxels_of(labels, known=None):
 
 def convert_voxels(target, voxels, writer):
     frame = MemoryFrame(0, frame_of([0]).content, voxels)
-    return convert_block(Block((FrameJob(frame, False),), target, writer))
+    return convert_block(Block((FrameJob(frame, False),), target, writer, RIG, VOXELS))[0]
 
 
 def test_own_voxels_are_mapped_mirrored_and_kept():
@@ -130,9 +116,9 @@ def test_own_voxels_are_mapped_mirrored_and_kept():
     known = np.ones(VOXELS.size, bool)
     known[2, 3, 1] = False
     writer = MemoryWriter()
-    target = Target(SEMANTICKITTI, TO_CARLA, mirrored=True, voxels=VOXELS)
+    target = Target(SEMANTICKITTI, TO_CARLA, mirrored=True, voxels=True)
     result = convert_voxels(target, voxels_of(labels, known), writer)
-    found, counts = result.outputs[0][f"{GRID}/labels"], result.outputs[0][f"{GRID}/counts"]
+    found, counts = result.outputs[f"{GRID}/labels"], result.outputs[f"{GRID}/counts"]
     assert found[0, -1, 0] == 7
     assert counts[0, -1, 0] == 1
     assert counts[1, -1, 0] == 0  # occupied, but of a class that has no target
@@ -145,23 +131,24 @@ def test_own_voxels_are_mapped_mirrored_and_kept():
 def test_voxels_that_are_written_already_are_not_read_again():
     writer = MemoryWriter()
     writer.write(f"{GRID}/counts", 0, np.ones(VOXELS.size))
-    target = Target(SEMANTICKITTI, None, mirrored=False, voxels=VOXELS)
+    target = Target(SEMANTICKITTI, None, mirrored=False, voxels=True)
     result = convert_voxels(target, voxels_of(np.zeros(VOXELS.size, np.uint16)), writer)
-    assert result.outputs[0] == {}
+    assert result.outputs == {}
     assert writer.texts == {}
 
 
 def test_a_frame_that_cannot_be_read_is_a_failure_and_a_store_that_cannot_be_written_ends_the_run():
     jobs = (FrameJob(MemoryFrame(0, None), True), FrameJob(frame_of([0], number=1), True))
-    result = convert_block(Block(jobs, RIGHT, MemoryWriter()))
-    assert [frame for frame, _ in result.failures] == [0]
-    assert list(result.outputs) == [1]
+    failed, read = convert_block(Block(jobs, RIGHT, MemoryWriter(), RIG))
+    assert "expected points, found nothing" in failed.failure
+    assert (failed.number, read.number, read.failure) == (0, 1, None)
+    assert "points" in read.outputs
 
     class Full(MemoryWriter):
         def write_document(self, name, data):
             raise StorageError("disk", problem="is full")
 
-    target = Target(SEMANTICKITTI, None, mirrored=False, voxels=VOXELS)
+    target = Target(SEMANTICKITTI, None, mirrored=False, voxels=True)
     with pytest.raises(StorageError):
         convert_voxels(target, voxels_of(np.zeros(VOXELS.size, np.uint16)), Full())
 
@@ -170,22 +157,109 @@ def recording_of(poses, times=None, frames=(0, 1)):
     return MemoryRecording([frame_of([0], number=number) for number in frames], poses, times)
 
 
-def test_poses_and_times_are_relative_to_the_first_frame():
+def test_poses_are_relative_to_the_first_frame_and_in_the_frame_of_the_first_sensor():
     world = np.stack([translation((5, 0, 0)) @ rotation_z(1.0), translation((6, 1, 0)) @ rotation_z(1.2)])
-    relative = read_poses(recording_of(world), "auto", force=False)
-    np.testing.assert_allclose(relative[0], np.eye(4), atol=1e-12)
-    np.testing.assert_allclose(world[0] @ relative[1], world[1])
-    np.testing.assert_allclose(times_from_first(recording_of(world, np.array([3.0, 3.25]))), [0, 0.25])
-    np.testing.assert_allclose(times_from_first(recording_of(world, frames=(0, 3))), [0, 0.1, 0.2, 0.3])
+    recording = recording_of(world)
+    recording.sensors = (Sensor("roof", translation((1.0, 0.0, 1.5)) @ rotation_z(0.5)),)
+    times = read_times(recording)
+    trajectory = read_trajectory(recording, times, "auto", force=False)
+    poses = scan_poses(trajectory, recording, times)
+    scans = world @ translation((1.0, 0.0, 1.5))  # the axes are those of the vehicle
+    np.testing.assert_allclose(poses, np.linalg.inv(scans[0]) @ scans, atol=1e-12)
+
+
+def test_times_are_those_of_the_recording_or_a_tenth_of_a_second_apart():
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    assert read_times(recording_of(poses, np.array([3.0, 3.25]))).tolist() == [3.0, 3.25]
+    np.testing.assert_allclose(read_times(recording_of(poses, frames=(0, 3))), [0, 0.1, 0.2, 0.3])
+    with pytest.raises(FormatError, match="expected a time for each frame up to 1, found 1 times"):
+        read_times(recording_of(poses, np.array([3.0])))
+
+
+def test_poses_at_their_own_times_are_interpolated():
+    recording = recording_of(None)
+    turning = np.stack([rotation_z(0.0), translation((2, 0, 0)) @ rotation_z(0.4)])
+    recording.poses = lambda *, force=False: Trajectory(turning, np.array([10.0, 10.2]))
+    recording.times = lambda: np.array([10.05, 10.1])
+    times = read_times(recording)
+    poses = scan_poses(read_trajectory(recording, times, "auto", force=False), recording, times)
+    half = translation((1, 0, 0)) @ rotation_z(0.2)
+    quarter = translation((0.5, 0, 0)) @ rotation_z(0.1)
+    np.testing.assert_allclose(poses[1], np.linalg.inv(quarter) @ half, atol=1e-12)
+
+
+def test_the_jitter_of_poses_is_told_from_the_motion_of_the_vehicle():
+    seconds = np.arange(200) * 0.1
+    smooth = np.tile(np.eye(4), (200, 1, 1))
+    smooth[:, 0, 3], smooth[:, 1, 3] = 12 * seconds + np.sin(seconds), 2 * np.sin(0.5 * seconds)
+    noisy = smooth.copy()
+    noisy[:, :3, 3] += np.random.default_rng(0).normal(scale=0.06, size=(200, 3))
+    assert jitter(smooth) < 0.002
+    assert 0.06 < jitter(noisy) < 0.14  # the length of three numbers of 6 cm
 
 
 def test_poses_of_the_file_are_not_read_where_they_are_to_be_estimated():
-    assert read_poses(recording_of(np.tile(np.eye(4), (2, 1, 1))), "kiss-icp", force=False) is None
-    assert read_poses(recording_of(None), "auto", force=False) is None
+    poses, times = np.tile(np.eye(4), (2, 1, 1)), np.arange(2.0)
+    assert read_trajectory(recording_of(poses), times, "kiss-icp", force=False) is None
+    assert read_trajectory(recording_of(None), times, "auto", force=False) is None
+    with pytest.raises(MissingDataError, match="memory: expected a file of poses, found none"):
+        read_trajectory(recording_of(None), times, "file", force=False)
+    with pytest.raises(FormatError, match="expected a pose for each frame up to 1, found 1 lines"):
+        read_trajectory(recording_of(poses[:1]), times, "file", force=False)
+
+
+def driving(speed, seconds):
+    """A vehicle that drives along x, with a pose every second."""
+    at = np.arange(-2.0, 5.0)
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, 0, 3] = speed * at
+    return Motion(Trajectory(poses, at), seconds)
+
+
+def test_points_are_moved_to_the_time_of_the_frame_and_keep_the_place_of_their_ray():
+    points = np.array([[10, 0, 0, 1], [10, 0, 0, 2], [10, 0, 0, 3]], np.float32)
+    cloud = Cloud(points, seconds=np.array([-0.5, 0.0, 0.5]))
+    rolling = Rig((Sensor("turns", deskewed=False),), np.eye(4))
+    scan = assemble([cloud], rolling, driving(2.0, 1.0), "scan")
+    np.testing.assert_allclose(scan.points, [[9, 0, 0, 1], [10, 0, 0, 2], [11, 0, 0, 3]], atol=1e-6)
+    assert np.abs(scan.fields["origins"][:, 0] - [-1, 0, 1]).max() <= 0.13  # neighbouring places count as one
+    corrected = assemble([cloud], Rig((Sensor("corrected"),), np.eye(4)), driving(2.0, 1.0), "scan")
+    assert corrected.points is points
+    np.testing.assert_array_equal(corrected.fields["origins"], scan.fields["origins"])
+    standing = assemble([cloud], rolling, driving(0.0, 1.0), "scan")
+    assert not standing.fields["origins"].any()
+    assert "origins" not in assemble([cloud], RIG, None, "scan").fields
+
+
+def test_clouds_of_several_sensors_are_put_together_in_the_axes_of_the_vehicle():
+    sensors = (Sensor("roof", translation((0, 0, 2)) @ rotation_z(np.pi / 2)), Sensor("front", translation((3, 0, 1))))
+    vehicle_T_scan = translation((0, 0, 2))
+    ahead = np.array([[5, 0, 0, 1]], np.float32)
+    clouds = [Cloud(ahead, np.array([10], np.uint8)), Cloud(ahead, sensor=1)]
+    scan = assemble(clouds, Rig(sensors, vehicle_T_scan), None, "scan")
+    np.testing.assert_allclose(scan.points, [[0, 5, 0, 1], [8, 0, -1, 1]], atol=1e-6)
+    assert scan.labels.tolist() == [10, 0] and scan.instances is None
+    assert scan.fields["sensor"].tolist() == [0, 1]
+    np.testing.assert_allclose(scan.fields["origins"], [[0, 0, 0], [3, 0, -1]])
+
+
+@pytest.mark.parametrize(
+    ("cloud", "problem"),
+    [
+        (Cloud(np.zeros((2, 3), np.float32)), r"scan: points: expected shape \(N, 4\) float32"),
+        (Cloud(np.zeros((2, 4), np.float32), np.zeros(3, np.uint8)), "scan: labels: expected one for each of 2 points"),
+        (Cloud(np.zeros((2, 4), np.float32), sensor=1), "scan: expected a sensor 0..0, found 1"),
+    ],
+)
+def test_clouds_that_do_not_fit_are_named(cloud, problem):
+    with pytest.raises(FormatError, match=problem):
+        assemble([cloud], RIG, None, "scan")
+    with pytest.raises(FormatError, match="expected points of at least one sensor"):
+        assemble([], RIG, None, "scan")
 
 
 class Lab:
-    classes, to_carla, sensor, voxels = SEMANTICKITTI, TO_CARLA, None, None
+    classes, to_carla, sensor = SEMANTICKITTI, TO_CARLA, None
     min_range_m = max_range_m = None
 
 
@@ -203,7 +277,7 @@ def test_estimated_poses_of_an_earlier_run_are_used_in_right_handed_axes():
     writer.write_document(layout.POSES, layout.encode_poses(stored))
     writer.write_document(layout.METADATA, Metadata(extra={"poses": "kiss-icp"}).to_json())
     plan = plan_recording(recording_of(None), Lab, MemorySink(writer), "kiss-icp", flow=False, force=False)
-    write_documents(plan, LEFT, Lab, Metadata(), Steps(None, 0))
+    begin(plan, LEFT, Metadata())
     np.testing.assert_allclose(plan.poses, mirror_poses(stored), atol=1e-9)
     np.testing.assert_allclose(layout.decode_poses(writer.texts[layout.POSES], "poses"), stored, atol=1e-9)
 
@@ -214,7 +288,7 @@ def test_poses_of_another_origin_are_a_conflict():
     poses = np.tile(np.eye(4), (2, 1, 1))
     plan = plan_recording(recording_of(poses), Lab, MemorySink(writer), "file", flow=False, force=True)
     with pytest.raises(ConflictError, match="expected poses from file, found kiss-icp"):
-        write_documents(plan, LEFT, Lab, Metadata(), Steps(None, 0))
+        begin(plan, LEFT, Metadata())
 
 
 def test_a_sequence_whose_scans_are_all_missing_is_named(tmp_path):
@@ -222,7 +296,7 @@ def test_a_sequence_whose_scans_are_all_missing_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="expected sequences with scans in the split all"):
         choose_recordings([empty], tmp_path, None, "all")
     empty.problems = lambda: [(0, "no scan")]
-    with pytest.raises(MissingDataError, match="memory/velodyne: expected scans, found none"):
+    with pytest.raises(MissingDataError, match="memory: expected scans, found none"):
         choose_recordings([empty], tmp_path, None, "all")
 
 

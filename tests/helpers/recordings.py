@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import FrameContent, FrameHandle, Recording, VoxelContent
+from carlasc.converting import Cloud, FrameHandle, Recording, Trajectory, VoxelContent
 from carlasc.errors import FormatError
 from carlasc.storage import SequenceWriter
 
@@ -16,14 +16,14 @@ from carlasc.storage import SequenceWriter
 class MemoryFrame(FrameHandle):
     """A frame that holds its content; None stands for a file that cannot be read."""
 
-    def __init__(self, number: int, content: FrameContent | None, voxels: VoxelContent | None = None) -> None:
+    def __init__(self, number: int, content: Cloud | None, voxels: VoxelContent | None = None) -> None:
         self.number, self.content, self.voxels = number, content, voxels
         self.location = f"scan {number}"
 
-    def read(self) -> FrameContent:
+    def read(self) -> list[Cloud]:
         if self.content is None:
             raise FormatError(self.location, expected="points", found="nothing")
-        return self.content
+        return [self.content]
 
     def read_voxels(self) -> VoxelContent | None:
         return self.voxels
@@ -32,7 +32,7 @@ class MemoryFrame(FrameHandle):
 class MemoryRecording(Recording):
     """A recording of such frames."""
 
-    name, split, location, has_labels = "MEM_00", "Train", "memory", True
+    name, split, location, has_labels, has_instances = "MEM_00", "Train", "memory", True, True
 
     def __init__(
         self,
@@ -42,8 +42,8 @@ class MemoryRecording(Recording):
     ) -> None:
         self.frames, self._poses, self._times = frames, poses, times
 
-    def poses(self, *, force: bool = False) -> NDArray[np.float64] | None:
-        return self._poses
+    def poses(self, *, force: bool = False) -> Trajectory | None:
+        return None if self._poses is None else Trajectory(self._poses)
 
     def times(self) -> NDArray[np.float64] | None:
         return self._times

@@ -1,0 +1,209 @@
+"""The clouds of a frame as one scan: in the frame of the layout, at one instant, with the place where each ray began."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.protocol import Cloud, Sensor, Trajectory
+from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.errors import FormatError
+
+_TICK_S = 1e-4  # points of so short a time have the same pose: at 30 m/s this is 3 mm
+_APART_M = 0.25  # places of one sensor within a sweep that are nearer to each other count as one
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The sensors of a recording, and where they are.
+
+    Attributes:
+        sensors: the LiDARs.
+        vehicle_T_scan: (4, 4), from the frame of the scans in the layout to that of the vehicle.
+    """
+
+    sensors: tuple[Sensor, ...]
+    vehicle_T_scan: Transform
+
+    @property
+    def needs_motion(self) -> bool:
+        """Whether points can only be put in place where the motion of the vehicle is known."""
+        return any(not sensor.deskewed for sensor in self.sensors)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of the vehicle around a frame.
+
+    Attributes:
+        trajectory: poses with times.
+        seconds: time of the frame, by the same clock.
+    """
+
+    trajectory: Trajectory
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """One scan, right-handed, in the frame of the layout, with the class ids of the data set.
+
+    Attributes:
+        points: (N, 4) float32.
+        labels: (N,) class ids; None if no cloud has labels. Those of clouds without labels are 0.
+        instances: (N,) uint32, in the same way.
+        fields: further fields of the layout by name.
+    """
+
+    points: NDArray[np.float32]
+    labels: NDArray[np.unsignedinteger] | None
+    instances: NDArray[np.uint32] | None
+    fields: dict[str, NDArray[Any]]
+
+
+def assemble(clouds: Sequence[Cloud], rig: Rig, motion: Motion | None, where: str) -> Assembled:
+    """Put the clouds of a frame together, in their order. Every point is kept.
+
+    Points that were taken one after the other are moved to where they would be at the time of the frame, if their times and the motion of
+    the vehicle are known.
+
+    Args:
+        clouds: at least one.
+        rig: the sensors.
+        motion: the motion of the vehicle; None if it is not known.
+        where: the frame, for errors.
+
+    Raises:
+        FormatError: a cloud names a sensor that does not exist, or its fields do not fit its points.
+    """
+    if not clouds:
+        raise FormatError(where, expected="points of at least one sensor", found="none")
+    for cloud in clouds:
+        _check(cloud, rig, where)
+    placed = [_place(cloud, rig, motion) for cloud in clouds]
+    points = np.concatenate([points for points, _ in placed]) if len(placed) > 1 else placed[0][0]
+    origins = np.concatenate([origins for _, origins in placed])
+    fields: dict[str, NDArray[Any]] = {}
+    if len(rig.sensors) > 1:
+        fields["sensor"] = np.concatenate([np.full(len(cloud.points), cloud.sensor, np.uint8) for cloud in clouds])
+    seconds = _joined([cloud.seconds for cloud in clouds], clouds, np.float32)
+    if seconds is not None:
+        fields["seconds"] = seconds
+    # All frames of a recording have origins, or none has: also those in which the vehicle stands.
+    if origins.any() or any(_follows_motion(cloud, rig, motion) for cloud in clouds):
+        fields["origins"] = origins
+    for name in clouds[0].others:
+        fields[name] = np.concatenate([_other(cloud, name, rig, where) for cloud in clouds])
+    labels = _joined([cloud.labels for cloud in clouds], clouds, np.uint32)
+    instances = _joined([cloud.instances for cloud in clouds], clouds, np.uint32)
+    return Assembled(points, labels, instances, fields)
+
+
+def _check(cloud: Cloud, rig: Rig, where: str) -> None:
+    count = len(cloud.points)
+    if cloud.points.ndim != 2 or cloud.points.shape[1] != 4 or cloud.points.dtype != np.float32:
+        found = f"{cloud.points.shape} {cloud.points.dtype}"
+        raise FormatError(f"{where}: points", expected="shape (N, 4) float32", found=found)
+    if not 0 <= cloud.sensor < len(rig.sensors):
+        raise FormatError(where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=str(cloud.sensor))
+    fields = {"labels": cloud.labels, "instances": cloud.instances, "seconds": cloud.seconds, "origins": cloud.origins}
+    for name, values in (fields | dict(cloud.others)).items():
+        if values is not None and len(values) != count:
+            raise FormatError(f"{where}: {name}", expected=f"one for each of {count} points", found=str(len(values)))
+
+
+def _follows_motion(cloud: Cloud, rig: Rig, motion: Motion | None) -> bool:
+    """Return whether it is known where the sensor was at each point of a cloud."""
+    sensor = rig.sensors[cloud.sensor]
+    return cloud.seconds is not None and motion is not None and (sensor.calibrated or not sensor.deskewed)
+
+
+def _place(cloud: Cloud, rig: Rig, motion: Motion | None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the (N, 4) points and the (N, 3) origins of their rays, in the frame of the scan."""
+    sensor = rig.sensors[cloud.sensor]
+    scan_T_vehicle = invert(rig.vehicle_T_scan)
+    scan_T_points = scan_T_vehicle @ sensor.vehicle_T_points
+    if cloud.seconds is None or motion is None or not _follows_motion(cloud, rig, motion):
+        points = _moved(scan_T_points, cloud.points)
+        if cloud.origins is not None:
+            return points, transform_points(scan_T_points, cloud.origins).astype(np.float32)
+        return points, np.tile(_origin(sensor, scan_T_points), (len(points), 1))
+    ticks, tick_of = np.unique(np.round(np.asarray(cloud.seconds, np.float64) / _TICK_S), return_inverse=True)
+    now = motion.trajectory.at(np.array([motion.seconds]))[0]
+    vehicle_T_then = invert(now) @ motion.trajectory.at(motion.seconds + ticks * _TICK_S)
+    scan_T_then = scan_T_vehicle @ vehicle_T_then @ sensor.vehicle_T_points
+    points = _moved(scan_T_points, cloud.points) if sensor.deskewed else _moved_each(scan_T_then[tick_of], cloud.points)
+    if cloud.origins is not None:
+        origins = transform_points(scan_T_points, cloud.origins).astype(np.float32)
+    else:
+        origins = _thinned((scan_T_then[:, :3, :3] @ sensor.origin + scan_T_then[:, :3, 3]), sensor, scan_T_points)[
+            tick_of
+        ]
+    return points, origins
+
+
+def _origin(sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
+    """Return the place of a sensor in the frame of the scan; that frame's origin itself up to rounding."""
+    origin = transform_points(scan_T_points, sensor.origin)
+    origin[np.abs(origin) < 1e-9] = 0
+    return origin.astype(np.float32)
+
+
+def _thinned(path: NDArray[np.float64], sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
+    """Return (T, 3) places of a sensor over a sweep, of which neighbours within `_APART_M` are the same."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    if length[-1] < _APART_M:
+        return np.tile(_origin(sensor, scan_T_points), (len(path), 1))
+    parts = int(np.ceil(length[-1] / _APART_M))
+    part = np.minimum((length / length[-1] * parts).astype(int), parts - 1)
+    counts = np.maximum(np.bincount(part), 1)
+    middle = np.stack([np.bincount(part, path[:, axis]) / counts for axis in range(3)], axis=1)
+    return middle[part].astype(np.float32)
+
+
+def _moved(scan_T_points: Transform, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (N, 4) points in the frame of the scan; the same numbers where the frames are the same."""
+    if np.array_equal(scan_T_points, np.eye(4)):
+        return points
+    moved = points.copy()
+    moved[:, :3] = transform_points(scan_T_points, points[:, :3])
+    return moved
+
+
+def _moved_each(scan_T_point: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (N, 4) points, each moved by its own transform."""
+    moved = points.copy()
+    moved[:, :3] = (
+        np.einsum("nij,nj->ni", scan_T_point[:, :3, :3], points[:, :3], dtype=np.float64) + scan_T_point[:, :3, 3]
+    )
+    return moved
+
+
+def _joined(parts: Sequence[NDArray[Any] | None], clouds: Sequence[Cloud], dtype: type) -> NDArray[Any] | None:
+    """Return the values of all clouds; 0 for those of clouds that have none; None if no cloud has any."""
+    if all(part is None for part in parts):
+        return None
+    if len(parts) == 1:
+        return parts[0] if dtype is np.uint32 else np.asarray(parts[0], dtype)
+    filled: list[NDArray[Any]] = [
+        np.zeros(len(cloud.points), dtype) if part is None else part.astype(dtype)
+        for part, cloud in zip(parts, clouds, strict=True)
+    ]
+    return np.concatenate(filled)
+
+
+def _other(cloud: Cloud, name: str, rig: Rig, where: str) -> NDArray[Any]:
+    from carlasc.storage import layout
+
+    if name not in cloud.others:
+        sensor = rig.sensors[cloud.sensor].name
+        raise FormatError(where, expected=f"the field {name} from all sensors", found=f"none from {sensor}")
+    values = cloud.others[name]
+    if layout.field_named(name).kind != "vector":
+        return values
+    rotation = (invert(rig.vehicle_T_scan) @ rig.sensors[cloud.sensor].vehicle_T_points)[:3, :3]
+    return (values @ rotation.T).astype(values.dtype)

@@ -1,0 +1,149 @@
+"""The protocol of exporters: an exporter expresses sequences of the layout as the files of another data set.
+
+Another distribution adds one by a class that inherits `FrameExporter` or `SequenceExporter`, and an entry point:
+
+    [project.entry-points."carlasc.exporters"]
+    name = "package.module:Class"
+
+The options of an exporter are the arguments of its constructor. It holds values only, so that it can be pickled into a worker.
+`carlasc.export` chooses the frames, calls workers, writes every file whole, and continues what an earlier run began.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from numpy.typing import NDArray
+
+from carlasc import storage
+
+Files = Mapping[str, bytes | memoryview]
+"""Bytes of files, by their path in a folder."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A sequence that was exported.
+
+    Attributes:
+        sequence: the sequence.
+        folder: its folder, relative to the root of the other data set.
+        frames: numbers of the frames that exist in the output, sorted.
+    """
+
+    sequence: storage.Sequence
+    folder: str
+    frames: tuple[int, ...]
+
+
+class Exporter(ABC):
+    """What exporters of both kinds have.
+
+    Attributes:
+        title: what it writes, in a few words.
+    """
+
+    title: ClassVar[str]
+
+    @property
+    def product(self) -> str:
+        """What is written. Two products of an exporter have no files in common, so both may be written to one folder."""
+        return "data"
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The values that the content of the files depends on, for JSON. A run does not continue one with other settings."""
+        return vars(self)
+
+    @abstractmethod
+    def folders(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the folder of each sequence of a source, by the sequence's name, relative to the root of the other data set."""
+
+    def check(self, sequence: storage.Sequence) -> list[str]:
+        """Check that a sequence has what the export needs, before anything is written.
+
+        Returns:
+            What users must know of the result, one line each.
+
+        Raises:
+            CarlascError: it cannot be exported; says what is missing.
+        """
+        return []
+
+    def frames(self, sequence: storage.Sequence) -> list[int]:
+        """Return the sorted numbers of the frames to export."""
+        return sequence.scan_frames().tolist()
+
+    def documents(self, sequence: storage.Sequence) -> Files:
+        """Return the files that a sequence has once, by their path in its folder."""
+        return {}
+
+    def index(self, root: Path, exported: Sequence[Exported]) -> Files:
+        """Return the files that the data set has once, by their path in `root`. They are written last.
+
+        Args:
+            root: folder of the other data set. It may hold sequences of earlier exports.
+            exported: the sequences of this export.
+        """
+        return {}
+
+
+class FrameExporter(Exporter):
+    """Writes one or more files for each frame. Frames are made and written side by side."""
+
+    @abstractmethod
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
+        """Return the paths of the files that `make_frame` gives."""
+
+    @abstractmethod
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
+        """Return a frame's files, by their path in the sequence's folder.
+
+        Raises:
+            CarlascError: the frame cannot be read, or cannot be expressed in the other format.
+        """
+
+
+class SequenceFile(AbstractContextManager["SequenceFile"]):
+    """A file that is being written and takes the frames of a sequence one by one."""
+
+    @abstractmethod
+    def add(self, frame: int, content: Mapping[str, NDArray[Any]]) -> None:
+        """Write a frame. Frames come in increasing order.
+
+        Raises:
+            CarlascError: the frame cannot be expressed in the format. Nothing of it is written.
+        """
+
+
+class SequenceExporter(Exporter):
+    """Writes one file for each sequence, with all of its frames. Frames are made side by side, and written by one process."""
+
+    @abstractmethod
+    def file(self, sequence: storage.Sequence) -> str:
+        """Return the path of the sequence's file in its folder."""
+
+    @abstractmethod
+    def frames_in(self, path: Path, sequence: storage.Sequence) -> Collection[int]:
+        """Return the frames that a finished file of a sequence holds.
+
+        Raises:
+            FormatError: it is no such file.
+        """
+
+    @abstractmethod
+    def open(self, path: Path, sequence: storage.Sequence) -> SequenceFile:
+        """Open a new file to write to. It gets its name when all frames have been added."""
+
+    @abstractmethod
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, NDArray[Any]]:
+        """Return the arrays of a frame, by name.
+
+        Raises:
+            CarlascError: the frame cannot be read, or cannot be expressed in the other format.
+        """

@@ -1,0 +1,215 @@
+"""The second stage of a conversion, in workers: what needs the motion of actors is added to the scans that the first stage wrote.
+
+Scans are read from where they were written, not from the data set again, if the store can read them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.actors import Velocity
+from carlasc.converting.assembling import Motion, Rig, assemble
+from carlasc.converting.axes import mirror_boxes, mirror_points
+from carlasc.converting.nearby import labels_nearby
+from carlasc.converting.protocol import FrameHandle
+from carlasc.converting.scans import make_fields, write_fields
+from carlasc.converting.target import Target
+from carlasc.core.boxes import Boxes
+from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
+from carlasc.core.scans import Scan
+from carlasc.errors import CarlascError, StorageError
+from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
+from carlasc.storage.protocol import SequenceWriter
+
+_FAR_M = 100.0  # objects farther away than this are not filled in
+
+
+@dataclass(frozen=True)
+class FinishJob:
+    """A frame to finish.
+
+    Attributes:
+        handle: the frame.
+        first_T_scan: (4, 4) its pose.
+        motion: the motion of the vehicle around it.
+        velocities: velocity of each moving actor, where actors are numbered.
+        tracks: the tracks of boxes at the frame, with classes of the target; None where the data set has no boxes.
+        boxes: the annotated boxes of the frame, right-handed, in the frame of the scan; None where it was not annotated.
+        nearby: the labelled frames before and after it, if it has no labels and others have.
+        labelled: whether its points have labels in the data set. Those that an interrupted run made from boxes are made again.
+    """
+
+    handle: FrameHandle
+    first_T_scan: Transform
+    motion: Motion | None = None
+    velocities: Mapping[int, Velocity] = field(default_factory=dict)
+    tracks: tuple[Track, ...] | None = None
+    boxes: Boxes | None = None
+    nearby: tuple[FinishJob, ...] = ()
+    labelled: bool = True
+
+
+@dataclass(frozen=True)
+class FinishBlock:
+    """Several frames that a worker finishes in one task.
+
+    Attributes:
+        jobs: the frames.
+        target: how they are written.
+        writer: where they are written.
+        rig: the sensors.
+        flow: whether flow is written.
+    """
+
+    jobs: tuple[FinishJob, ...]
+    target: Target
+    writer: SequenceWriter
+    rig: Rig
+    flow: bool = True
+
+
+@dataclass
+class FinishResult:
+    """What was added to a frame.
+
+    Attributes:
+        number: frame number.
+        outputs: its fields, where the writer cannot be used in workers.
+        failure: error message, if it failed.
+    """
+
+    number: int
+    outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    failure: str | None = None
+
+
+def finish_block(block: FinishBlock) -> list[FinishResult]:
+    """Finish several frames, and write them if the writer can be used in workers."""
+    return [_finish(job, block) for job in block.jobs]
+
+
+def _finish(job: FinishJob, block: FinishBlock) -> FinishResult:
+    result = FinishResult(job.handle.number)
+    try:
+        written = _read_back(job, block)
+        outputs = (_by_instances if job.tracks is None else _by_boxes)(written, job, block)
+    except StorageError:
+        raise  # every other frame would fail in the same way
+    except (CarlascError, OSError) as error:
+        result.failure = str(error)
+        return result
+    if block.writer.concurrent:
+        write_fields(block.writer, result.number, outputs)
+    else:
+        result.outputs = outputs
+    return result
+
+
+def _read_back(job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
+    """Return points, instances, and labels of the data set, of a frame as they were written; only those that exist."""
+    number, writer = job.handle.number, block.writer
+    kept = ("points", "labels", "instances") if job.labelled else ("points", "instances")
+    fields = [name for name in kept if writer.has(name, number)]
+    written = {name: writer.read(name, number) for name in fields}
+    if "points" in written and all(array is not None for array in written.values()):
+        return {name: array for name, array in written.items() if array is not None}
+    scan = assemble(job.handle.read(), block.rig, job.motion, job.handle.location)
+    return make_fields(scan, block.target, job.handle.location)
+
+
+def _by_instances(written: Mapping[str, NDArray[Any]], job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
+    """Return the flow of a scan whose points have numbers: the velocity of each point's actor, zero for all other points."""
+    if "instances" not in written or not block.flow:
+        return {}
+    instances = written["instances"]
+    flow = np.zeros((len(instances), 3), np.float32)
+    numbered = np.flatnonzero(instances)
+    for actor, velocity in job.velocities.items():
+        flow[numbered[instances[numbered] == actor]] = velocity
+    return {"flow": mirror_points(flow) if block.target.mirrored else flow}
+
+
+def _by_boxes(written: Mapping[str, NDArray[Any]], job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
+    """Return labels, instances, boxes and flow of a scan whose objects have boxes. Labels and instances of the data set are kept."""
+    assert job.tracks is not None
+    classes, mirrored = block.target.classes, block.target.mirrored
+    points = mirror_points(written["points"]) if mirrored else written["points"]
+    labels = written.get("labels")
+    scan = Scan(np.ascontiguousarray(points[:, :3]), labels)
+    tracks = [track for track in job.tracks if track.pose(job.handle.number) is not None]
+    segments = segment_by_boxes(job.handle.number, scan, job.first_T_scan, tracks, ground=classes.ground)
+    fields: dict[str, NDArray[Any]] = {}
+    if labels is None:
+        fields["labels"] = _labels_of(scan.points, segments, classes, _labelled_nearby(job, block))
+    if "instances" not in written:
+        instances = np.zeros(len(scan), np.uint32)
+        for segment in segments:
+            instances[segment.members] = segment.instance
+        fields["instances"] = instances
+    boxes = _boxes_of(job, tracks)
+    fields["boxes"] = (mirror_boxes(boxes) if mirrored else boxes).to_table()
+    if block.flow:
+        flow = np.zeros((len(scan), 3), np.float32)
+        for segment in segments:
+            if segment.velocity is not None:
+                flow[segment.members] = rotate_vectors(invert(job.first_T_scan), segment.velocity)
+        fields["flow"] = mirror_points(flow) if mirrored else flow
+    return fields
+
+
+def _labels_of(
+    points: NDArray[np.float32],
+    segments: list[Segment],
+    classes: ClassTable,
+    labelled: list[tuple[NDArray[np.float64], NDArray[np.unsignedinteger]]],
+) -> NDArray[np.uint32]:
+    """Return the class of each point: that of the box that it is in, that of labelled points nearby, ground, or geometry without a class."""
+    labels = np.full(len(points), classes.geometry_id, np.uint32)
+    ground = ground_points(points)
+    if classes.ground_id is not None:
+        labels[ground] = classes.ground_id
+    nearby = labels_nearby(points, ground, labelled, classes)
+    labels[nearby > 0] = nearby[nearby > 0]
+    for segment in segments:
+        labels[segment.members] = segment.label
+    return labels
+
+
+def _labelled_nearby(
+    job: FinishJob, block: FinishBlock
+) -> list[tuple[NDArray[np.float64], NDArray[np.unsignedinteger]]]:
+    """Return points, in the frame of the scan of a job, and class ids of the labelled frames around it."""
+    found = []
+    for other in job.nearby:
+        written = _read_back(other, block)
+        if "labels" in written:
+            points = mirror_points(written["points"]) if block.target.mirrored else written["points"]
+            scan_T_other = invert(job.first_T_scan) @ other.first_T_scan
+            found.append((transform_points(scan_T_other, points[:, :3]), written["labels"]))
+    return found
+
+
+def _boxes_of(job: FinishJob, tracks: list[Track]) -> Boxes:
+    """Return the annotated boxes of a frame, and those of tracks that extend to it although nobody annotated them there."""
+    number = job.handle.number
+    there = set() if job.boxes is None else set(job.boxes.tracks.tolist())
+    scan_T_first = invert(job.first_T_scan)
+    filled: dict[int, tuple[Track, Transform]] = {}
+    for track in tracks:
+        pose = track.pose(number)
+        if pose is not None and track.instance not in there and np.linalg.norm((scan_T_first @ pose)[:3, 3]) < _FAR_M:
+            filled.setdefault(track.instance, (track, scan_T_first @ pose))
+    more = Boxes.from_poses(
+        np.array(list(filled), np.uint32),
+        np.array([track.label for track, _ in filled.values()], np.uint32),
+        np.array([pose for _, pose in filled.values()]).reshape(-1, 4, 4),
+        np.array([track.extent.upper - track.extent.lower for track, _ in filled.values()]).reshape(-1, 3),
+        np.zeros(len(filled), np.bool_),
+    )
+    return more if job.boxes is None else job.boxes.joined(more)

@@ -1,0 +1,192 @@
+"""Grids in another geometry, for data sets whose voxels and axes are given: resampling, and the frames of other data sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.axes import mirror_grid, mirror_spec
+from carlasc.core.grids import GridSpec
+from carlasc.storage.metadata import Axes
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+_SNAP = 1e-6  # in voxels: a centre that lies on a face, but for rounding, belongs to the voxel above it
+_SAME = 1e-4  # relative difference of voxel sizes that are equal, but for the float32 bounds of the layout
+
+
+@dataclass(frozen=True)
+class TargetFrame:
+    """The frame of another data set's grids, as seen from a scan of the layout in right-handed axes (x forward, y to the left).
+
+    Attributes:
+        height_m: height of the scan's origin, which is the sensor, above the origin of the other frame.
+        forward: axis that points forward: "x", with y to the left, or "y", with x to the right.
+    """
+
+    height_m: float = 0.0
+    forward: Literal["x", "y"] = "x"
+
+    def turn(self, grid: NDArray[_Scalar], axes: Axes) -> NDArray[_Scalar]:
+        """Return an array of a grid of the layout, (X, Y, Z), with the axes of the frame. It is a view."""
+        right = grid if axes == "right" else mirror_grid(grid)
+        return right if self.forward == "x" else right[:, ::-1].transpose(1, 0, 2)
+
+    def spec_in(self, spec: GridSpec, axes: Axes) -> GridSpec:
+        """Return the geometry of a grid of the layout in this frame."""
+        right = spec if axes == "right" else mirror_spec(spec)
+        (x0, y0, z0), (x1, y1, z1), (nx, ny, nz) = right.lower, right.upper, right.size
+        z0, z1 = z0 + self.height_m, z1 + self.height_m
+        if self.forward == "x":
+            return GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
+        return GridSpec("cartesian", (ny, nx, nz), (-y1, x0, z0), (-y0, x1, z1))
+
+    def spec_from(self, spec: GridSpec, axes: Axes) -> GridSpec:
+        """Return the grid of the layout that has a geometry in this frame: the inverse of `spec_in`."""
+        (x0, y0, z0), (x1, y1, z1), (nx, ny, nz) = spec.lower, spec.upper, spec.size
+        z0, z1 = z0 - self.height_m, z1 - self.height_m
+        if self.forward == "x":
+            right = GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
+        else:
+            right = GridSpec("cartesian", (ny, nx, nz), (y0, -x1, z0), (y1, -x0, z1))
+        return right if axes == "right" else mirror_spec(right)
+
+
+def is_same(one: GridSpec, other: GridSpec) -> bool:
+    """Return whether two Cartesian grids have the same voxels, but for the rounding of bounds."""
+    near = [np.allclose(getattr(one, bound), getattr(other, bound), rtol=0, atol=_SAME) for bound in ("lower", "upper")]
+    return one.size == other.size and all(near)
+
+
+def resample_to(
+    labels: NDArray[np.unsignedinteger], known: NDArray[np.bool_], source: GridSpec, target: GridSpec
+) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+    """Express a Cartesian grid in the voxels of another one, in the same frame.
+
+    Along an axis on which the target is not finer, a voxel of the source belongs to the voxel of the target that contains its centre.
+    Along an axis on which it is finer, a voxel of the target takes the voxel of the source that contains its own centre. Of the voxels of
+    the source that a voxel of the target gets so:
+
+    - if any is occupied, it takes the class of most of the occupied ones, the lowest of several;
+    - otherwise, if any is known, it is free;
+    - otherwise it is unknown.
+
+    Unlike `carlasc.groundtruth.resample`, which makes ground truth from finer ground truth, free voxels do not outvote occupied ones, so
+    that thin objects stay.
+
+    Args:
+        labels: (X, Y, Z) class ids of the source; 0 is free. Those of unknown voxels do not matter.
+        known: (X, Y, Z) bool.
+        source: geometry of the source.
+        target: geometry of the target.
+
+    Returns:
+        Labels of the target, 0 where it is free or unknown, and which of its voxels are known.
+    """
+    pairs = [_pair_axis(source, target, axis) for axis in range(3)]
+    cells = np.nonzero((labels != 0) & known)
+    rows = np.arange(len(cells[0]))
+    places: list[NDArray[np.int64]] = []
+    for axis, pair in enumerate(pairs):  # a cell may go to several voxels of the target
+        kept, place = _targets_of(cells[axis][rows], pair, source.size[axis])
+        rows, places = rows[kept], [earlier[kept] for earlier in places] + [place]
+    found = labels[tuple(cell[rows] for cell in cells)]
+    resampled = _majority(np.ravel_multi_index(tuple(places), target.size), found, target.num_voxels)
+    seen = known
+    for axis in sorted(
+        range(3), key=lambda axis: target.size[axis] / source.size[axis]
+    ):  # the array stays small for long
+        seen = _any_by_target(seen, pairs[axis], target.size[axis], axis)
+    return resampled.reshape(target.size), seen
+
+
+def _pair_axis(source: GridSpec, target: GridSpec, axis: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which cells of the source go to which cells of the target along an axis: two arrays, which do not decrease."""
+    sizes = source.voxel_size[axis], target.voxel_size[axis]
+    if sizes[1] >= sizes[0] * (1 - _SAME):
+        cells = np.arange(source.size[axis])
+        other = _cell_of(source.lower[axis] + (cells + 0.5) * sizes[0], target, axis)
+        inside = (other >= 0) & (other < target.size[axis])
+        return cells[inside], other[inside]
+    cells = np.arange(target.size[axis])
+    other = _cell_of(target.lower[axis] + (cells + 0.5) * sizes[1], source, axis)
+    inside = (other >= 0) & (other < source.size[axis])
+    return other[inside], cells[inside]
+
+
+def _targets_of(
+    cells: NDArray[np.int64], pair: tuple[NDArray[np.int64], NDArray[np.int64]], size: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the cells of the target that cells of the source go to along an axis.
+
+    Args:
+        cells: (N,) cells of the source.
+        pair: which cells of the source go to which of the target.
+        size: number of cells of the source along the axis.
+
+    Returns:
+        (M,) rows of `cells`, each as often as it goes to a cell of the target, and (M,) these cells.
+    """
+    count = np.bincount(pair[0], minlength=size)
+    start = np.cumsum(count) - count
+    times = count[cells]
+    rows = np.repeat(np.arange(len(cells)), times)
+    within = np.arange(len(rows)) - np.repeat(np.cumsum(times) - times, times)
+    return rows, pair[1][start[cells[rows]] + within]
+
+
+def _cell_of(positions: NDArray[np.float64], spec: GridSpec, axis: int) -> NDArray[np.int64]:
+    cells = (positions - spec.lower[axis]) / spec.voxel_size[axis]
+    return np.floor(cells + _SNAP).astype(np.int64)
+
+
+def _majority(
+    voxel: NDArray[np.int64], labels: NDArray[np.unsignedinteger], num_voxels: int
+) -> NDArray[np.unsignedinteger]:
+    """Return (num_voxels,) the label that occurs most often in each voxel, the lowest of several, 0 where there is none."""
+    result = np.zeros(num_voxels, labels.dtype)
+    channels = int(labels.max(initial=0)) + 1
+    pairs, counts = np.unique(voxel * channels + labels, return_counts=True)
+    order = np.lexsort((-(pairs % channels), counts))  # the last one written wins
+    result[pairs[order] // channels] = (pairs[order] % channels).astype(labels.dtype)
+    return result
+
+
+def _any_by_target(
+    values: NDArray[np.bool_], pair: tuple[NDArray[np.int64], NDArray[np.int64]], size: int, axis: int
+) -> NDArray[np.bool_]:
+    """Return `values` with the cells of the target along an axis: each is true if any of the cells of the source that go to it is."""
+    values = np.moveaxis(values, axis, 0)
+    result = np.zeros((size, *values.shape[1:]), np.bool_)
+    cells, places = pair
+    first = np.flatnonzero(np.diff(places, prepend=-1))
+    rank = np.arange(len(places)) - np.repeat(first, np.diff(first, append=len(places)))
+    for number in range(int(rank.max(initial=-1)) + 1):  # no voxel of the target occurs twice in a pass
+        now = rank == number
+        result[places[now]] |= values[cells[now]]
+    return np.moveaxis(result, 0, axis)
+
+
+def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]:
+    """Return what is lost where a grid is expressed in the voxels of another one, in a line each; nothing if they are the same.
+
+    Args:
+        source: geometry of the grid, in the target's frame.
+        target: geometry of the other data set's grids.
+        name: name of the grid.
+    """
+    notes = []
+    if (source.voxel_size > target.voxel_size * (1 + _SAME)).any():
+        sizes = (" x ".join(f"{size:.3g}" for size in spec.voxel_size) for spec in (source, target))
+        notes.append(
+            "the voxels of the grid {} are larger than those that are written: {} m, not {} m".format(name, *sizes)
+        )
+    slack = source.voxel_size / 2
+    if (np.array(source.lower) > target.lower + slack).any() or (np.array(source.upper) < target.upper - slack).any():
+        low, high = (np.maximum(source.lower, target.lower), np.minimum(source.upper, target.upper))
+        share = float(np.prod(np.maximum(high - low, 0)) / np.prod(np.subtract(target.upper, target.lower)))
+        notes.append(f"the grid {name} covers {100 * share:.0f} % of the volume that is written: the rest is unknown")
+    return notes

@@ -1,0 +1,281 @@
+"""The stages of the conversion of one recording: its scans are read once and written, then what the motion of actors says is added."""
+
+from __future__ import annotations
+
+from bisect import bisect
+from collections import deque
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from operator import attrgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.actors import ActorMotion, Velocity
+from carlasc.converting.finishing import FinishBlock, FinishJob, finish_block
+from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
+from carlasc.converting.protocol import Converter, FrameHandle
+from carlasc.converting.results import Failure, Steps
+from carlasc.converting.scans import Block, FrameJob, FrameResult, convert_block, write_fields
+from carlasc.converting.target import Target
+from carlasc.converting.trajectory import estimate_poses, fill_gaps, jitter_note, odometry_range
+from carlasc.core.boxes import Boxes
+from carlasc.groundtruth.heights import Ground, find_ground
+from carlasc.motion import Track, tracks_from_boxes
+from carlasc.running.processes import run_all
+from carlasc.storage.metadata import Metadata
+
+_BLOCK = 8  # frames that a worker converts in one task
+_GROUND_FRAMES = 5  # scans in which the ground is looked for
+_GROUND_REACH_M = 25.0
+_NEAR_M = 250.0  # boxes farther away from the sensor hold no points
+
+
+@dataclass
+class Conversion:
+    """The conversion of one recording.
+
+    Attributes:
+        plan: what is read, and where it is written.
+        converter: its kind of data set.
+        target: how frames are written.
+        workers: number of frames that are worked on at the same time.
+        pool: runs the work; None for this process.
+        steps: is called after each frame of each stage.
+        failures: frames that failed.
+        notes: remarks about the result, one line each.
+        ground: the ground in some of its scans; None if there is none, or it cannot be read back.
+    """
+
+    plan: RecordingPlan
+    converter: type[Converter]
+    target: Target
+    workers: int
+    pool: Executor | None
+    steps: Steps
+    failures: list[Failure] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    ground: Ground | None = None
+    _failed: set[int] = field(default_factory=set)
+    _unnumbered: int = 0
+
+    def run(self, metadata: Metadata) -> None:
+        """Convert the recording, or what an earlier run left to do."""
+        plan = self.plan
+        begin(plan, self.target, metadata)
+        if plan.poses is None and plan.rig.needs_motion:
+            self._estimate_first()
+        velocities = self._read_scans()
+        if plan.poses is not None:
+            write_poses(plan, self.target)
+        self._finish(velocities)
+        self._find_ground()
+        self.failures += [Failure(plan.recording.location, *problem) for problem in plan.recording.problems()]
+        self.notes += self._remarks()
+
+    @property
+    def made(self) -> int:
+        """Number of frames that were converted."""
+        return len(self.plan.unfinished - self._failed)
+
+    def _estimate_first(self) -> None:
+        """Estimate the poses before scans are written, because scans are corrected by them: each scan is then read twice."""
+        plan = self.plan
+        self.steps.expect(len(plan.recording.frames))
+        plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps))
+        write_poses(plan, self.target)
+
+    def _read_scans(self) -> Mapping[int, Mapping[int, Velocity]]:
+        """Read each frame once, and write its scan; return the velocities of numbered actors by frame.
+
+        Poses are estimated on the way if there are none, and actors are followed if their motion is to be estimated.
+        """
+        plan, converter = self.plan, self.converter
+        follow = plan.flow and plan.boxes is None and bool(plan.unfinished)
+        estimate = plan.poses is None
+        chosen = [
+            handle
+            for handle in plan.recording.frames
+            if follow or estimate or handle.number in plan.missing or self.target.voxels
+        ]
+        self.steps(len(plan.recording.frames) - len(chosen))
+        jobs = [FrameJob(handle, handle.number in plan.missing, plan.motion(handle)) for handle in chosen]
+        voxels = plan.recording.voxels if self.target.voxels else None
+        blocks = [
+            Block(tuple(jobs[i : i + _BLOCK]), self.target, plan.writer, plan.rig, voxels, estimate, follow)
+            for i in range(0, len(jobs), _BLOCK)
+        ]
+        actors = ActorMotion(converter.classes, self.workers, self.pool)
+        found: dict[int, NDArray[np.float64]] = {}
+        for result, pose in self._placed(self._results(blocks)):
+            if estimate:
+                found[result.number] = pose
+            if follow:
+                actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
+                self._unnumbered += result.unnumbered
+        if estimate:
+            plan.take_estimate(fill_gaps(list(found), np.array(list(found.values())), plan.recording))
+        return actors.finish()
+
+    def _placed(self, results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, NDArray[np.float64]]]:
+        """Yield the frames that were read with their poses, which are estimated on the way if they are not known."""
+        usable = (result for result in results if result.failure is None)
+        if self.plan.poses is not None:
+            for result in usable:
+                yield result, self.plan.poses[result.number]
+            return
+        from carlasc.motion.odometry import MIN_POINTS, follow_scans
+
+        waiting: deque[FrameResult] = deque()
+
+        def scans() -> Iterator[NDArray[np.float32]]:
+            for result in usable:
+                if result.points is not None and len(result.points) >= MIN_POINTS:
+                    points, result.points = result.points, None
+                    waiting.append(result)
+                    yield points
+
+        nearest, farthest = odometry_range(self.converter)
+        for pose in follow_scans(scans(), min_range_m=nearest, max_range_m=farthest):
+            yield waiting.popleft(), pose
+
+    def _results(self, blocks: list[Block]) -> Iterator[FrameResult]:
+        with closing(run_all(convert_block, blocks, workers=self.workers, executor=self.pool)) as results:
+            for frames in results:
+                for result in frames:
+                    write_fields(self.plan.writer, result.number, result.outputs)
+                    if result.failure is not None:
+                        self._fail(result.number, result.failure)
+                    yield result
+                self.steps(len(frames))
+
+    def _finish(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> None:
+        """Add labels, instances, boxes and flow, as far as the motion of actors gives them."""
+        plan = self.plan
+        wanted = [
+            handle
+            for handle in plan.recording.frames
+            if plan.added and handle.number in plan.unfinished and handle.number not in self._failed
+        ]
+        if not wanted or plan.poses is None:
+            return
+        self.steps.expect(len(wanted))
+        tracks, boxes = self._box_tracks()
+        blocks = []
+        for begin_ in range(0, len(wanted), _BLOCK):
+            part = wanted[begin_ : begin_ + _BLOCK]
+            near = None if tracks is None else _near(tracks, part, plan.poses)
+            jobs = [
+                FinishJob(
+                    handle,
+                    plan.poses[handle.number],
+                    plan.motion(handle),
+                    velocities.get(handle.number, {}),
+                    near,
+                    boxes.get(handle.number),
+                    self._labelled_around(handle),
+                    plan.recording.has_labels and handle.labelled,
+                )
+                for handle in part
+            ]
+            blocks.append(FinishBlock(tuple(jobs), self.target, plan.writer, plan.rig, plan.flow))
+        with closing(run_all(finish_block, blocks, workers=self.workers, executor=self.pool)) as results:
+            for frames in results:
+                for result in frames:
+                    write_fields(plan.writer, result.number, result.outputs)
+                    if result.failure is not None:
+                        self._fail(result.number, result.failure)
+                self.steps(len(frames))
+
+    def _labelled_around(self, handle: FrameHandle) -> tuple[FinishJob, ...]:
+        """Return the labelled frames before and after one that has no labels although others have."""
+        plan = self.plan
+        if handle.labelled or not plan.recording.has_labels or plan.poses is None:
+            return ()
+        place = bisect(self._labelled, handle.number, key=attrgetter("number"))
+        near = self._labelled[max(place - 1, 0) : place + 1]
+        return tuple(FinishJob(other, plan.poses[other.number], plan.motion(other)) for other in near)
+
+    @cached_property
+    def _labelled(self) -> list[FrameHandle]:
+        """The frames with labels of their own."""
+        return [
+            handle for handle in self.plan.recording.frames if handle.labelled and handle.number not in self._failed
+        ]
+
+    def _box_tracks(self) -> tuple[list[Track] | None, dict[int, Boxes]]:
+        """Return the tracks of the recording's boxes, and the boxes of each annotated frame, in the classes of the target."""
+        plan = self.plan
+        if plan.boxes is None or plan.poses is None:
+            return None, {}
+        where = f"boxes of {plan.recording.location}"
+        boxes = {
+            number: replace(own, labels=self.target.map_labels(own.labels, f"{where}: frame {number}"))
+            for number, own in plan.boxes.items()
+        }
+        numbers = sorted({handle.number for handle in plan.recording.frames} | set(boxes))
+        times = {number: float(plan.times[number]) for number in numbers}
+        return tracks_from_boxes(boxes, {number: plan.poses[number] for number in boxes}, times), boxes
+
+    def _find_ground(self) -> None:
+        """Find the ground in some of the scans, and write the height of the sensor if the data set does not say it."""
+        plan, frames = self.plan, [handle.number for handle in self.plan.recording.frames]
+        chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int)}
+        scans = [
+            points
+            for number in sorted(chosen - self._failed)
+            if plan.writer.has("points", number) and (points := plan.writer.read("points", number)) is not None
+        ]
+        self.ground = find_ground(scans, _GROUND_REACH_M)
+        if self.ground is not None:
+            write_heights(plan, self.ground.below_m)
+
+    def _fail(self, number: int, message: str) -> None:
+        self._failed.add(number)
+        self.failures.append(Failure(self.plan.recording.location, number, message))
+
+    def _remarks(self) -> list[str]:
+        plan = self.plan
+        notes = list(plan.recording.notes())
+        if not plan.recording.rays:
+            notes.append("nobody knows where points were seen from, so no grids are made from them")
+        elif plan.pose_source != "file":
+            notes.append("there are no poses: they were estimated from the scans with KISS-ICP")
+        elif plan.poses is not None:
+            notes += [note for note in (plan.note, jitter_note(plan.poses)) if note]
+        if plan.recording.times() is None and plan.recording.rays:
+            notes.append("there are no times: frames are taken to be 0.1 s apart")
+        if plan.boxes is not None and not plan.recording.has_labels:
+            notes.append(
+                "points have no labels: those in boxes got the class of the box, others are ground or of no class"
+            )
+        elif plan.boxes is not None and not all(handle.labelled for handle in plan.recording.frames):
+            unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
+            notes.append(
+                f"{unlabelled} scans have no labels: their points got the class of the box that they are in, or of labelled points nearby"
+            )
+        elif plan.boxes is None and not plan.recording.has_labels:
+            notes.append("scans have no labels, so neither labels nor instances nor flow were written")
+        if self._unnumbered:
+            notes.append(
+                f"{self._unnumbered} moving points belong to no numbered actor; their flow is unknown and set to 0"
+            )
+        first, last = plan.recording.frames[0].number, plan.recording.frames[-1].number
+        if gaps := last - first + 1 - len(plan.recording.frames):
+            notes.append(f"{gaps} of the {last - first + 1} frames from {first} to {last} have no scan")
+        return [f"{plan.writer.location}: {note}" for note in notes]
+
+
+def _near(tracks: list[Track], handles: list[FrameHandle], poses: NDArray[np.float64]) -> tuple[Track, ...]:
+    """Return the tracks that come near the sensor in some frames, cut to these frames: few enough to be sent to a worker."""
+    here = poses[handles[0].number, :2, 3]
+    near = []
+    for track in tracks:
+        part = track.between(handles[0].number, handles[-1].number)
+        places = part.world_T_actor[:, :2, 3]
+        if len(places) and float(np.square(places - here).sum(axis=1).min()) < _NEAR_M**2:
+            near.append(part)
+    return tuple(near)

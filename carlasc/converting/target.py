@@ -1,0 +1,76 @@
+"""What a conversion writes: in which axes, and in which classes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable, Remap
+from carlasc.errors import FormatError
+
+_IDS = np.iinfo(np.uint16).max + 1
+_UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
+_MAX_LISTED = 8
+
+
+@dataclass(frozen=True)
+class Target:
+    """How frames are written.
+
+    Attributes:
+        source: class table of the ids that are read.
+        remap: maps them to other ids; None keeps them.
+        mirrored: whether y is mirrored, from right-handed axes to CarlaSC's left-handed ones.
+        allow_unknown: whether ids that the table does not have become unlabelled.
+        voxels: whether the data set's own voxel grids are written.
+    """
+
+    source: ClassTable
+    remap: Remap | None
+    mirrored: bool
+    allow_unknown: bool = False
+    voxels: bool = False
+
+    @property
+    def classes(self) -> ClassTable:
+        """Table of the ids that are written."""
+        return self.source if self.remap is None else self.remap.target
+
+    def map_labels(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.uint32]:
+        """Return the ids that are written for the ids that were read.
+
+        Raises:
+            FormatError: an id is unknown; names it, and how often it occurs. `where` names the labels.
+        """
+        ids = self.source.names if self.remap is None else self.remap.mapping
+        lookup = _lookup_table(tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values()))
+        mapped = lookup[labels if labels.dtype.itemsize <= 2 else np.minimum(labels, _IDS - 1)]
+        if mapped.size and int(mapped.max()) == _UNKNOWN:
+            unknown = mapped == _UNKNOWN
+            if not self.allow_unknown:
+                raise FormatError(
+                    where,
+                    expected=f"class ids of {self.source.name}",
+                    found=_list_ids(labels[unknown]),
+                    advice="treat them as unlabelled with `allow_unknown=True`",
+                )
+            mapped[unknown] = 0
+        return mapped
+
+
+@lru_cache(maxsize=8)
+def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Return the target of every 16-bit id, `_UNKNOWN` where it has none."""
+    lookup = np.full(_IDS, _UNKNOWN, np.uint32)
+    lookup[list(ids)] = targets
+    return lookup
+
+
+def _list_ids(labels: NDArray[np.unsignedinteger]) -> str:
+    ids, counts = np.unique(labels, return_counts=True)
+    named = [f"{i} ({n} times)" for i, n in zip(ids.tolist(), counts.tolist(), strict=True)]
+    more = f" and {len(named) - _MAX_LISTED} more" if len(named) > _MAX_LISTED else ""
+    return ", ".join(named[:_MAX_LISTED]) + more

@@ -1,0 +1,211 @@
+"""A small simulated drive with known truth: what tests of converters write in the format of another data set, and compare with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.protocol import Sensor
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
+
+KINDS = ("none", "road", "building", "vegetation", "pole", "car", "van", "pedestrian", "cyclist")
+"""What things are; the numbers of `DriveScan.kinds` are places in this tuple. 0 does not occur."""
+MOVABLE = ("car", "van", "pedestrian", "cyclist")
+"""Kinds of things that have boxes and numbers."""
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A cuboid in the world, upright.
+
+    Attributes:
+        kind: one of `KINDS`.
+        center: (x, y, z) at time 0, metres.
+        size: length, width, height.
+        heading: radians about z.
+        speed: metres per second along the heading.
+    """
+
+    kind: str
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    heading: float = 0.0
+    speed: float = 0.0
+
+    def world_T_box(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the (..., 4, 4) pose of the box at some times."""
+        poses = np.broadcast_to(rotation_z(self.heading), (*np.shape(seconds), 4, 4)).copy()
+        way = np.asarray(seconds)[..., None] * (self.speed * np.array([np.cos(self.heading), np.sin(self.heading)]))
+        poses[..., :2, 3] = np.array(self.center[:2]) + way
+        poses[..., 2, 3] = self.center[2]
+        return poses
+
+
+def _street() -> tuple[Thing, ...]:
+    houses = [Thing("building", (x, side * 14.0, 4.0), (9.0, 6.0, 8.0)) for x in range(-20, 80, 14) for side in (-1, 1)]
+    poles = [Thing("pole", (x + 0.5, 7.5, 2.5), (0.2, 0.2, 5.0)) for x in range(-24, 80, 16)]
+    trees = [Thing("vegetation", (x + 3.0, -8.5, 2.0), (1.6, 1.6, 4.0), 0.4) for x in range(-20, 80, 11)]
+    return (
+        *houses,
+        *poles,
+        *trees,
+        Thing("car", (12.0, 1.0, 0.8), (4.4, 1.8, 1.5), 0.0, 8.0),
+        Thing("car", (40.0, 4.5, 0.8), (4.2, 1.8, 1.5), np.pi, 7.0),
+        Thing("van", (9.0, -4.0, 1.0), (5.0, 2.0, 1.9), 0.05),
+        Thing("pedestrian", (7.0, 5.5, 0.9), (0.6, 0.6, 1.75), 0.3, 1.4),
+        Thing("cyclist", (3.0, -2.2, 0.9), (1.8, 0.6, 1.75), 0.0, 4.5),
+    )
+
+
+@dataclass(frozen=True)
+class DriveScan:
+    """What one sensor saw for one frame.
+
+    Attributes:
+        points: (N, 4) float32, x, y, z in metres in the frame of the sensor at the time of each point, and remission 0 to 1.
+        deskewed: (N, 4) float32, the same points in the frame of the sensor at the time of the frame.
+        kinds: (N,) uint8 places in `KINDS`.
+        instances: (N,) uint32, the track of the thing, 0 if it has no box.
+        seconds: (N,) float64 after the time of the frame.
+        world_T_sensor: (N, 4, 4) pose of the sensor at each point.
+    """
+
+    points: NDArray[np.float32]
+    deskewed: NDArray[np.float32]
+    kinds: NDArray[np.uint8]
+    instances: NDArray[np.uint32]
+    seconds: NDArray[np.float64]
+    world_T_sensor: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedDrive:
+    """A vehicle that drives along a street with traffic, right-handed: x forward, y left, z up. Everything is exact and deterministic.
+
+    The frame of the vehicle is at its rear axle, `axle_m` above the ground. Each sensor turns once around a frame if `rolling`, from half
+    a period before the frame's time to half a period after; otherwise all of its points are taken at the frame's time.
+
+    Attributes:
+        frames: number of frames.
+        period_s: time between frames.
+        sensors: its LiDARs.
+        rolling: whether points of a scan are taken one after the other.
+        clockwise: whether sensors that turn do so clockwise, seen from above.
+        speed: of the vehicle, metres per second.
+        axle_m: height of the origin of the vehicle's frame above the ground.
+        things: what is in the street.
+        channels: number of laser beams.
+        columns: number of azimuths.
+    """
+
+    frames: int = 8
+    period_s: float = 0.1
+    sensors: tuple[Sensor, ...] = field(
+        default_factory=lambda: (
+            Sensor("lidar", np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])),
+        )
+    )
+    rolling: bool = False
+    clockwise: bool = False
+    speed: float = 6.0
+    axle_m: float = 0.0
+    things: tuple[Thing, ...] = field(default_factory=_street)
+    channels: int = 20
+    columns: int = 180
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(F,) seconds."""
+        return np.arange(self.frames, dtype=np.float64) * self.period_s
+
+    def world_T_vehicle(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the (..., 4, 4) poses of the vehicle at some times: it sways gently from side to side."""
+        at = np.asarray(seconds, np.float64)
+        x = self.speed * at
+        poses = np.zeros((*at.shape, 4, 4))
+        poses[..., 2, 2] = poses[..., 3, 3] = 1.0
+        slope = 0.06 * np.cos(0.1 * x)
+        cos, sin = 1 / np.hypot(1, slope), slope / np.hypot(1, slope)
+        poses[..., 0, 0], poses[..., 0, 1], poses[..., 1, 0], poses[..., 1, 1] = cos, -sin, sin, cos
+        poses[..., 0, 3], poses[..., 1, 3], poses[..., 2, 3] = x, 0.6 * np.sin(0.1 * x), self.axle_m
+        return poses
+
+    def boxes(self, frame: int, labels: dict[str, int] | None = None) -> Boxes:
+        """Return the boxes of the movable things within 60 m at a frame, in the frame of the vehicle.
+
+        Args:
+            frame: its number.
+            labels: the class id of each kind; None takes the places in `KINDS`.
+        """
+        vehicle_T_world = invert(self.world_T_vehicle(frame * self.period_s))
+        found = [
+            (track, thing, vehicle_T_world @ thing.world_T_box(frame * self.period_s))
+            for track, thing in enumerate(self._movable, 1)
+        ]
+        found = [row for row in found if np.linalg.norm(row[2][:3, 3]) < 60.0]
+        ids = {kind: place for place, kind in enumerate(KINDS)} if labels is None else labels
+        return Boxes.from_poses(
+            np.array([track for track, _, _ in found], np.uint32),
+            np.array([ids[thing.kind] for _, thing, _ in found], np.uint32),
+            np.array([pose for _, _, pose in found]).reshape(-1, 4, 4),
+            np.array([thing.size for _, thing, _ in found]).reshape(-1, 3),
+        )
+
+    def scan(self, frame: int, sensor: int = 0) -> DriveScan:
+        """Return what a sensor saw for a frame."""
+        mount = self.sensors[sensor].vehicle_T_sensor
+        elevation = np.deg2rad(np.linspace(-24.0, 8.0, self.channels))
+        azimuth = np.arange(self.columns) * (2 * np.pi / self.columns) - np.pi
+        sweep = (np.arange(self.columns) / self.columns - 0.5) * self.period_s
+        turn = (-sweep if self.clockwise else sweep) * self.rolling
+        azimuth, turn = np.repeat(azimuth, self.channels), np.repeat(turn, self.channels)
+        elevation = np.tile(elevation, self.columns)
+        rays = np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+        )
+        at = frame * self.period_s + turn
+        poses = self.world_T_vehicle(at) @ mount
+        origins, directions = poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], rays)
+        reach, hit = self._nearest(origins, directions, at)
+        seen = reach < 60.0
+        reach, hit, poses, turn = reach[seen], hit[seen], poses[seen], turn[seen]
+        own = (rays[seen] * reach[:, None]).astype(np.float32)
+        world = np.einsum("nij,nj->ni", poses[:, :3, :3], own.astype(np.float64)) + poses[:, :3, 3]
+        then = transform_points(invert(self.world_T_vehicle(frame * self.period_s) @ mount), world).astype(np.float32)
+        remission = np.round(0.1 + 0.05 * hit % 0.8, 2).astype(np.float32)[:, None]
+        kinds = np.array([KINDS.index("road"), *(KINDS.index(thing.kind) for thing in self.things)], np.uint8)
+        tracks = {thing: track for track, thing in enumerate(self._movable, 1)}
+        instances = np.array([0, *(tracks.get(thing, 0) for thing in self.things)], np.uint32)
+        return DriveScan(
+            np.hstack([own, remission]), np.hstack([then, remission]), kinds[hit], instances[hit], turn, poses
+        )
+
+    @property
+    def _movable(self) -> tuple[Thing, ...]:
+        return tuple(thing for thing in self.things if thing.kind in MOVABLE)
+
+    def _nearest(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64], at: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return how far each ray gets, and what it meets: 0 the ground, n the n-th thing from 1."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.where(directions[:, 2] < 0, -origins[:, 2] / directions[:, 2], np.inf)
+            hit = np.zeros(len(at), np.int64)
+            for number, thing in enumerate(self.things, 1):
+                box_T_world = invert(thing.world_T_box(at))
+                start = np.einsum("nij,nj->ni", box_T_world[:, :3, :3], origins) + box_T_world[:, :3, 3]
+                ray = np.einsum("nij,nj->ni", box_T_world[:, :3, :3], directions)
+                half = np.array(thing.size) / 2
+                one, other = (-half - start) / ray, (half - start) / ray
+                enter, leave = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
+                nearer = (enter <= leave) & (enter > 0) & (enter < reach)
+                reach[nearer], hit[nearer] = enter[nearer], number
+        return reach, hit
+
+
+def world_T_sensor(drive: SimulatedDrive, frame: int, sensor: int = 0) -> Transform:
+    """Return the (4, 4) pose of a sensor at the time of a frame."""
+    return drive.world_T_vehicle(frame * drive.period_s) @ drive.sensors[sensor].vehicle_T_sensor
