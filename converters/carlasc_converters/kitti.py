@@ -6,16 +6,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Converter, Exporter, FrameContent, FrameHandle, Recording, Split, VoxelContent
+from carlasc.converting import (
+    Cloud,
+    Converter,
+    FrameHandle,
+    Recording,
+    Sensor,
+    Split,
+    Trajectory,
+    VoxelContent,
+)
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.tables import REMAPS, SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
+from carlasc_converters.kitti_files import (
+    HEIGHT_M,
+    MAX_RANGE_M,
+    MIN_RANGE_M,
+    SCANNER,
+    Calibration,
+    frames_of,
+    read_array,
+    read_scan,
+)
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
 _STANDING = {  # class of moving actors -> class of the same actors when they stand
@@ -28,12 +47,12 @@ class SemanticKitti(Converter):
     """Reads SemanticKITTI, one of its sequences, or KITTI odometry data."""
 
     title: ClassVar[str] = "SemanticKITTI, or KITTI odometry data without labels"
+    license = "CC BY-NC-SA 3.0"
     classes = SEMANTICKITTI
     to_carla = REMAPS["semantickitti_to_carla"]
-    sensor = "Velodyne HDL-64E"
-    min_range_m = 2.5
-    max_range_m = 70.0
-    voxels = GRID
+    sensor = SCANNER
+    min_range_m = MIN_RANGE_M
+    max_range_m = MAX_RANGE_M
 
     def sequences(self) -> list[Recording]:
         """Return the sequences, by number.
@@ -44,25 +63,21 @@ class SemanticKitti(Converter):
         folders = find_sequences(self.source)
         return [KittiRecording(folder, f"KITTI_{folder.name}", _split_of(folder.name)) for folder in folders]
 
-    @classmethod
-    def exporter(cls, **options: Any) -> Exporter:
-        """Return the exporter that writes SemanticKITTI's files."""
-        from carlasc_converters.kitti_export import KittiExporter
-
-        return KittiExporter(**options)
-
 
 class KittiRecording(Recording):
-    """One sequence: a folder with velodyne/, labels/, voxels/, poses.txt, calib.txt and times.txt.
+    """One sequence: a folder with velodyne/, labels/, voxels/, poses.txt, calib.txt and times.txt. The LiDAR is its vehicle.
 
     Attributes:
         folder: this folder.
     """
 
+    sensors = (Sensor("velodyne", height_m=HEIGHT_M),)
+
     def __init__(self, folder: Path, name: str, split: Split) -> None:
         self.folder, self.name, self.split = folder, name, split
         self.location = str(folder)
-        self.has_labels = bool(frames_of(folder / "labels", ".label"))
+        self.has_labels = self.has_instances = bool(frames_of(folder / "labels", ".label"))
+        self.voxels = GRID if frames_of(folder / "voxels", ".label") else None
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
@@ -72,14 +87,14 @@ class KittiRecording(Recording):
     def _handle(self, number: int) -> FrameHandle:
         return KittiFrame(str(self.folder), number, self.has_labels)
 
-    def poses(self, *, force: bool = False) -> NDArray[np.float64] | None:
+    def poses(self, *, force: bool = False) -> Trajectory | None:
         """Return inv(Tr) @ P @ Tr for each pose P in poses.txt, because the file holds poses of the left camera."""
         path = next((path for path in self._pose_files() if path.is_file()), None)
         if path is None:
             return None
         camera_poses = layout.decode_poses(path.read_bytes(), str(path))
         camera_T_lidar = self._calibration(path, force=force)
-        return np.linalg.inv(camera_T_lidar) @ check_rigid(camera_poses, str(path)) @ camera_T_lidar
+        return Trajectory(np.linalg.inv(camera_T_lidar) @ check_rigid(camera_poses, str(path)) @ camera_T_lidar)
 
     def _pose_files(self) -> tuple[Path, ...]:
         """Return where poses may be: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""
@@ -87,16 +102,16 @@ class KittiRecording(Recording):
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
         path = self.folder / "calib.txt"
-        found = read_calibration(path) if path.is_file() else None
-        if found is not None and "Tr" in found:
-            return check_rigid(found["Tr"], f"{path}: Tr")
+        found = Calibration.read(path) if path.is_file() else None
+        if found is not None and "Tr" in found.values:
+            return found.transform("Tr")
         if force:
             return np.eye(4)
         error = MissingDataError if found is None else FormatError
         raise error(
             path,
             expected=f"Tr, which takes LiDAR points to the camera whose poses {poses.name} holds",
-            found="no such file" if found is None else f"only {', '.join(found) or 'other lines'}",
+            found="no such file" if found is None else f"only {', '.join(found.values) or 'other lines'}",
             advice='copy calib.txt of the KITTI odometry data, estimate poses from the scans with `poses="kiss-icp"`, or, if the'
             " poses are those of the LiDAR, accept them with `force=True`",
         )
@@ -135,12 +150,10 @@ class KittiFrame(FrameHandle):
     def _label_file(self) -> str:
         return f"{self.folder}/labels/{self.number:06d}.label"
 
-    def read(self) -> FrameContent:
+    def read(self) -> Sequence[Cloud]:
         """Read points, classes and instances."""
-        points = _read_array(self.location, np.dtype("<f4"), 4)
-        if not len(points):
-            raise FormatError(self.location, expected="points", found="an empty file", advice="copy it again")
-        labels, instances = self.read_labels()
+        points = read_scan(self.location)
+        labels, instances = self._read_labels()
         if labels is not None and len(labels) != len(points):
             raise FormatError(
                 self._label_file,
@@ -148,13 +161,13 @@ class KittiFrame(FrameHandle):
                 found=str(len(labels)),
                 advice="the file belongs to another scan, or is incomplete",
             )
-        return FrameContent(points, labels, instances)
+        return [Cloud(points, labels, instances)]
 
-    def read_labels(self) -> tuple[NDArray[np.uint16] | None, NDArray[np.uint32] | None]:
+    def _read_labels(self) -> tuple[NDArray[np.uint16] | None, NDArray[np.uint32] | None]:
         """Read classes (the low 16 bits) and instances (the high 16 bits)."""
         if not self.labelled:
             return None, None
-        both = _read_array(self._label_file, np.dtype("<u4"), 1)[:, 0]
+        both = read_array(self._label_file, np.dtype("<u4"), 1)[:, 0]
         labels = both.astype(np.uint16)  # keeps the low 16 bits
         actors = both >> 16
         # SemanticKITTI numbers the instances of each class from 1, so the class is part of an actor's number.
@@ -189,63 +202,10 @@ def find_sequences(root: Path) -> list[Path]:
     )
 
 
-def frames_of(folder: Path, suffix: str) -> list[int]:
-    """Return the sorted frame numbers of a folder's files; none if the folder does not exist."""
-    if not folder.is_dir():
-        return []
-    numbers = (layout.frame_of(path.name, suffix) for path in folder.iterdir())
-    return sorted(number for number in numbers if number is not None)
-
-
-def read_calibration(path: Path) -> dict[str, Transform]:
-    """Read calib.txt: "NAME:" and 12 numbers per line. Lines with other values are ignored.
-
-    Returns:
-        (4, 4) by name.
-
-    Raises:
-        FormatError: the file is not text, or Tr does not have 12 numbers.
-    """
-    try:
-        lines = path.read_text().splitlines()
-    except UnicodeDecodeError as error:
-        raise FormatError(
-            path, expected="NAME: and 12 numbers per line", found=f"a file that is not text ({error})"
-        ) from error
-    found = {}
-    for line in lines:
-        name, colon, values = line.partition(":")
-        try:
-            numbers = [float(value) for value in values.split()]
-        except ValueError:
-            numbers = []
-        if colon and len(numbers) == 12:
-            found[name.strip()] = np.vstack([np.reshape(numbers, (3, 4)), (0.0, 0.0, 0.0, 1.0)])
-        elif name.strip() == "Tr":
-            raise FormatError(path, expected="12 numbers after Tr:", found=repr(values.strip()))
-    return found
-
-
 def _split_of(name: str) -> Split:
     """Return the split of a sequence by its number; folders with other names belong to the training split."""
     number = int(name) if name.isascii() and name.isdigit() else 0
     return "Val" if number == _VALIDATION else "Test" if _TEST_FIRST <= number <= 21 else "Train"
-
-
-def _read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
-    try:
-        data = np.fromfile(path, np.uint8)
-    except FileNotFoundError:
-        raise MissingDataError(path, expected="a file", found="nothing", advice="copy it again") from None
-    row = dtype.itemsize * columns
-    if len(data) % row:
-        raise FormatError(
-            path,
-            expected=f"a multiple of {row} bytes",
-            found=str(len(data)),
-            advice="the file is incomplete: copy it again",
-        )
-    return data.view(dtype).reshape(-1, columns)
 
 
 _CLASS_PART = np.arange(1 << 16, dtype=np.uint32) << 16

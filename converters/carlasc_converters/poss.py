@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from carlasc.converting import Converter, Recording
+from carlasc.converting import Converter, Recording, Sensor, Split
 from carlasc.core.geometry import Transform
 from carlasc.core.tables import REMAPS, SEMANTICPOSS
 from carlasc_converters.kitti import KittiRecording, find_sequences
@@ -39,6 +39,12 @@ class SemanticPoss(Converter):
 
 class PossRecording(KittiRecording):
     """One sequence. If it has no calib.txt, its poses are those of the LiDAR."""
+
+    sensors = (Sensor("pandora"),)
+
+    def __init__(self, folder: Path, name: str, split: Split) -> None:
+        super().__init__(folder, name, split)
+        self.voxels = None
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
         return super()._calibration(poses, force=force) if (self.folder / "calib.txt").is_file() else np.eye(4)

@@ -181,6 +181,33 @@ def test_cylindrical_grids_stand_beside(tmp_path):
     assert sequence_of(tmp_path / "out", path).grid("evaluation", 2).labels.shape == (128, 128, 8)
 
 
+def test_a_recording_says_what_it_has(simulated, tmp_path):
+    from carlasc_converters.kitti import SemanticKitti
+    from carlasc_converters.kitti_voxels import GRID
+
+    (recording,) = SemanticKitti(simulated[0]).sequences()
+    assert (recording.has_labels, recording.has_instances, recording.voxels) == (True, True, GRID)
+    assert (recording.sensors[0].deskewed, recording.sensors[0].height_m) == (True, 1.73)
+    write_tiny_kitti(tmp_path, labels=False)
+    (recording,) = SemanticKitti(tmp_path).sequences()
+    assert (recording.has_labels, recording.has_instances, recording.voxels) == (False, False, None)
+    assert recording.boxes() is None
+
+
+def test_semanticposs_without_a_calibration_has_poses_of_the_lidar(tmp_path):
+    from carlasc_converters.poss import SemanticPoss
+
+    folder = write_tiny_kitti(tmp_path, "02", voxels=True)
+    (recording,) = SemanticPoss(tmp_path).sequences()
+    assert (recording.name, recording.split, recording.voxels) == ("POSS_02", "Val", None)
+    with_calibration = recording.poses().world_T_vehicle
+    (folder / "calib.txt").unlink()
+    assert with_calibration[2, 0, 3] == pytest.approx(1.0)
+    written = carlasc.storage.layout.decode_poses((folder / "poses.txt").read_bytes(), "poses")
+    assert np.array_equal(recording.poses().world_T_vehicle, written)
+    assert np.abs(written - with_calibration).max() > 0.5
+
+
 def test_handles_are_light(simulated):
     from carlasc_converters.kitti import SemanticKitti
 
@@ -191,7 +218,7 @@ def test_handles_are_light(simulated):
 def test_the_real_points_are_read(real, tmp_path):
     from carlasc_converters.kitti import SemanticKitti
 
-    content = SemanticKitti(real / "semantickitti").sequences()[0].frames[0].read()
+    (content,) = SemanticKitti(real / "semantickitti").sequences()[0].frames[0].read()
     assert content.points.shape == (50, 4)
     assert set(np.unique(content.labels).tolist()) <= set(REMAPS["semantickitti_to_carla"].mapping)
     assert 0 <= content.points[:, 3].min() <= content.points[:, 3].max() <= 1  # remission

@@ -1,0 +1,280 @@
+"""CarlaOcc: scans of a semantic LiDAR in CARLA 0.10, and voxel grids made from the meshes of its towns.
+
+The files: https://carlaocc.readthedocs.io, and the project's own code (`data_saver.py`, `gen_pano_occ.py`, `data_converter.py`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory, VoxelContent
+from carlasc.core.classes import ClassTable, Color, Remap
+from carlasc.core.geometry import check_rigid
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA, remap_named
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc_converters.npz import read_arrays
+from carlasc_converters.ply import PlyVertices
+
+_TAGS: tuple[tuple[str, Color], ...] = (  # tags of CARLA 0.9.14 and later, in order, and CarlaOcc's Rock
+    ("None", (255, 255, 255)), ("Road", (128, 64, 128)), ("Sidewalk", (244, 35, 232)), ("Building", (70, 70, 70)),
+    ("Wall", (102, 102, 156)), ("Fence", (100, 40, 40)), ("Pole", (153, 153, 153)), ("TrafficLight", (250, 170, 30)),
+    ("TrafficSign", (220, 220, 0)), ("Vegetation", (107, 142, 35)), ("Terrain", (145, 170, 100)), ("Sky", (70, 130, 180)),
+    ("Pedestrian", (220, 20, 60)), ("Rider", (255, 0, 0)), ("Car", (0, 0, 142)), ("Truck", (0, 0, 70)), ("Bus", (0, 60, 100)),
+    ("Train", (0, 80, 100)), ("Motorcycle", (0, 0, 230)), ("Bicycle", (119, 11, 32)), ("Static", (110, 190, 160)),
+    ("Dynamic", (170, 120, 50)), ("Other", (55, 90, 80)), ("Water", (45, 60, 150)), ("RoadLine", (157, 234, 50)),
+    ("Ground", (81, 0, 81)), ("Bridge", (150, 100, 100)), ("RailTrack", (230, 150, 140)), ("GuardRail", (180, 165, 180)),
+    ("Rock", (180, 130, 70)),
+)  # fmt: skip
+CLASSES = ClassTable(
+    "carlaocc",
+    {tag: name for tag, (name, _) in enumerate(_TAGS)},
+    {tag: color for tag, (_, color) in enumerate(_TAGS)},
+    movable=frozenset(range(12, 20)),
+    deformable=frozenset({12}),
+    ground=frozenset({1, 2, 10, 23, 24, 25, 26, 27}),
+    geometry_only=22,  # Other
+)
+_PERIOD_S = 0.1  # the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
+_GRIDS = ("vs_0_4_surround_view", "vs_0_2_forward_view", "vs_0_1")  # the first that exists is the default
+_SCANS, _PROPERTIES = "semantic_lidar", ("x", "y", "z", "ObjIdx", "ObjTag")
+_COPY = "the file is incomplete: copy it again"
+
+
+class CarlaOcc(Converter):
+    """Reads CarlaOcc, or one of its sequences.
+
+    Options:
+        voxels: which of its grids are read: the name of a folder in `occupancy/`, such as vs_0_2_forward_view.
+    """
+
+    title: ClassVar[str] = "CarlaOcc: CARLA 0.10 with voxels from meshes"
+    option_names = ("voxels",)
+    classes = CLASSES
+    to_carla = Remap(
+        "carlaocc_to_carla", CLASSES, CARLA, {**remap_named("carla0914_to_carla").mapping, 29: CARLA.id_of("Terrain")}
+    )
+    sensor = "simulated semantic LiDAR, 32 channels"
+    min_range_m = 2.5
+    max_range_m = 70.0
+
+    def sequences(self) -> list[Recording]:
+        """Return the sequences, by name.
+
+        Raises:
+            MissingDataError: no sequence exists.
+            ArgumentError: no sequence has the grid that the option `voxels` names.
+        """
+        folders = [self.source.resolve()] if (self.source / _SCANS).is_dir() else []
+        if not folders and self.source.is_dir():
+            folders = sorted(path for path in self.source.iterdir() if (path / _SCANS).is_dir())
+        if not folders:
+            raise MissingDataError(
+                self.source,
+                expected=f"folders such as Town01_Opt_Seq07 with {_SCANS}/ in them",
+                found="none",
+                advice="give the folder that holds them, after the archives are unpacked",
+            )
+        splits = _read_splits(folders[0].parent)
+        existing = sorted({path.name for folder in folders for path in folder.glob("occupancy/*") if path.is_dir()})
+        wanted = self.options.get("voxels")
+        if wanted is not None and wanted not in existing:
+            raise ArgumentError("voxels", expected=f"one of {', '.join(existing) or 'no grids'}", found=wanted)
+        grid = wanted or next((name for name in (*_GRIDS, *existing) if name in existing), None)
+        return [CarlaOccRecording(folder, splits.get(folder.name, "Train"), grid) for folder in folders]
+
+
+class CarlaOccRecording(Recording):
+    """One sequence: a folder with semantic_lidar/, poses/ and occupancy/.
+
+    Attributes:
+        folder: this folder.
+        grid: folder of the grids that are read, in `occupancy/`; None if there are none.
+    """
+
+    has_labels = has_instances = True
+    sensors = (Sensor("lidar", height_m=1.73),)
+
+    def __init__(self, folder: Path, split: Split, grid: str | None) -> None:
+        self.folder, self.split, self.location = folder, split, str(folder)
+        self.name = f"CARLAOCC_{folder.name.replace('_', '-')}"  # what follows the last "_" selects a sequence
+        self.grid = grid if grid is not None and (folder / "occupancy" / grid).is_dir() else None
+
+    @cached_property
+    def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
+        """The frames that have a scan."""
+        grids = self._grid_files
+        reference = str(next(iter(grids.values()), ""))
+        return [
+            CarlaOccFrame(number, str(path), str(grids[number]) if number in grids else None, reference)
+            for number, path in _numbered(self.folder / _SCANS, ".ply").items()
+        ]
+
+    @cached_property
+    def _grid_files(self) -> dict[int, Path]:
+        return {} if self.grid is None else _numbered(self.folder / "occupancy" / self.grid, ".npz")
+
+    @cached_property
+    def voxels(self) -> GridSpec | None:  # type: ignore[override]
+        """The geometry that the first file of the grids gives; None if there are none."""
+        return next((_read_geometry(path) for path in self._grid_files.values()), None)
+
+    def poses(self, *, force: bool = False) -> Trajectory | None:
+        """Return poses/lidar.txt: the number of a frame and 16 numbers per line, right-handed.
+
+        Raises:
+            FormatError: a line has other values, a transform is not rigid, frames do not increase, or one has no pose.
+        """
+        path = self.folder / "poses" / "lidar.txt"
+        if not path.is_file():
+            return None
+        try:
+            rows = np.loadtxt(path, ndmin=2)
+        except ValueError as error:
+            raise FormatError(path, expected="17 numbers per line", found=f"something else ({error})") from error
+        if rows.shape[1] != 17:
+            raise FormatError(path, expected="17 numbers per line: frame and 4 x 4 pose", found=str(rows.shape[1]))
+        if missing := sorted({frame.number for frame in self.frames} - set(rows[:, 0].astype(int).tolist())):
+            raise FormatError(path, expected=f"a pose for frame {missing[0]}", found=f"none for {len(missing)} frames")
+        poses = check_rigid(rows[:, 1:].reshape(-1, 4, 4), str(path))
+        try:
+            return Trajectory(poses, rows[:, 0] * _PERIOD_S)
+        except FormatError as error:
+            raise error.within(path) from error
+
+    def times(self) -> NDArray[np.float64]:
+        """Return the times of a simulation with ten frames per second."""
+        last = max((frame.number for frame in self.frames), default=-1)
+        return np.arange(last + 1, dtype=np.float64) * _PERIOD_S
+
+    def problems(self) -> list[tuple[int, str]]:
+        """Return the frames that have a grid, but no scan."""
+        scanned = {frame.number for frame in self.frames}
+        return [
+            (
+                number,
+                str(MissingDataError(self.folder / _SCANS / f"{number:04d}.ply", expected="a scan", found="no file")),
+            )
+            for number in sorted(set(self._grid_files) - scanned)
+        ]
+
+
+@dataclass(frozen=True)
+class CarlaOccFrame(FrameHandle):
+    """One frame's files.
+
+    Attributes:
+        number: its number.
+        location: file of the scan.
+        grid: file of the voxel grid; None if the frame has none.
+        reference: another file of the same grids, whose geometry this one must have.
+    """
+
+    number: int
+    location: str
+    grid: str | None
+    reference: str
+
+    def read(self) -> Sequence[Cloud]:
+        """Read points, tags, and the numbers of actors of classes that move.
+
+        Raises:
+            FormatError: the file is no PLY file of a semantic LiDAR, or it is incomplete.
+        """
+        rows = PlyVertices.open(self.location, _PROPERTIES).read()
+        if not len(rows):
+            raise FormatError(self.location, expected="points", found="none", advice="copy it again")
+        points = np.zeros((len(rows), 4), np.float32)
+        for column, name in enumerate("xyz"):
+            points[:, column] = rows[name]
+        labels = rows["ObjTag"].astype(np.uint32)
+        moves = np.isin(labels, sorted(CLASSES.movable))
+        instances = np.where(moves, np.maximum(rows["ObjIdx"], 0), 0).astype(np.uint32)
+        return (Cloud(points, labels, instances),)
+
+    def read_voxels(self) -> VoxelContent | None:
+        """Read the frame's grid: what meshes fill has a class, everything else is free. All voxels are known.
+
+        Raises:
+            FormatError: the file is no grid, or its geometry is not that of the others.
+        """
+        if self.grid is None:
+            return None
+        spec, expected = _read_geometry(self.grid), _read_geometry(self.reference)
+        if spec != expected:
+            raise FormatError(
+                self.grid,
+                expected=f"the geometry of {self.reference}: {expected} from {expected.lower}",
+                found=f"{spec} from {spec.lower}",
+            )
+        rows = read_arrays(self.grid, ("occupancy",), _COPY)[0]
+        if rows.ndim != 2 or rows.shape[1] != 4 or rows.dtype != np.uint16:
+            raise FormatError(self.grid, expected="occupancy (N, 4) uint16", found=f"{rows.shape} {rows.dtype}")
+        cells = rows[:, :3].astype(np.int64)
+        if outside := int((cells >= spec.size).any(axis=1).sum()):
+            raise FormatError(self.grid, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside")
+        semantic = semantic_ids(rows[:, 3])
+        labels = np.zeros(spec.size, np.uint8)
+        known = np.ones(spec.size, np.bool_)
+        labels[tuple(cells.T)] = semantic
+        known[tuple(cells[semantic == 0].T)] = False  # occupied by something without a class
+        return VoxelContent(labels, known)
+
+
+def semantic_ids(codes: NDArray[np.unsignedinteger]) -> NDArray[np.uint8]:
+    """Return the classes of voxel labels, which also hold an instance.
+
+    The documentation says `1000 * class + instance`, the code that made the files `2048 * class + instance`. Most voxels belong to
+    classes whose instance is always 0, and no label above 0 is a multiple of both, so the labels tell which of the two they follow.
+    """
+    decimal, binary = int(np.count_nonzero(codes % 1000 == 0)), int(np.count_nonzero(codes % 2048 == 0))
+    return (codes // (1000 if decimal > binary else 2048)).astype(np.uint8)
+
+
+def _numbered(folder: Path, suffix: str) -> dict[int, Path]:
+    """Return the files with names such as 0012.ply by number, in order."""
+    paths = folder.iterdir() if folder.is_dir() else ()
+    named = [path for path in paths if path.suffix == suffix and path.stem.isascii() and path.stem.isdigit()]
+    return {int(path.stem): path for path in sorted(named, key=lambda path: int(path.stem))}
+
+
+def _read_geometry(path: str | Path) -> GridSpec:
+    """Return the geometry of a grid, in the frame of the LiDAR.
+
+    Raises:
+        FormatError: the file does not describe a grid.
+    """
+    step, origin, size = read_arrays(path, ("voxel_size", "voxel_origin", "volume_size"), _COPY)
+    try:
+        lower = np.asarray(origin, np.float64).reshape(3)
+        cells = np.asarray(size, np.int64).reshape(3)
+        x, y, z = cells.tolist()
+        # Decimals first, because the origin is float32 and the size of a voxel is not: the bounds are then those of the documentation,
+        # in float32, as `--bounds` gives them.
+        low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
+        return GridSpec("cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])).with_bounds(low, up)
+    except (TypeError, ValueError) as error:
+        raise FormatError(
+            path, expected="voxel_size, and 3 values of voxel_origin and volume_size", found=str(error)
+        ) from error
+
+
+def _read_splits(root: Path) -> dict[str, Split]:
+    """Return the split of each sequence: the one that lists most of its frames, in lines "town sequence frame"."""
+    counts: dict[str, Counter[Split]] = {}
+    names: tuple[tuple[str, Split], ...] = (("train", "Train"), ("val", "Val"), ("test", "Test"))
+    for file, split in names:
+        path = root / "splits" / f"{file}.txt"
+        for line in path.read_text().splitlines() if path.is_file() else ():
+            if len(words := line.split()) == 3:
+                town = "Town10HD" if words[0] == "10" else f"Town{words[0]}"
+                counts.setdefault(f"{town}_Opt_Seq{words[1]}", Counter())[split] += 1
+    return {name: found.most_common(1)[0][0] for name, found in counts.items()}

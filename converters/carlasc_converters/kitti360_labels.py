@@ -1,0 +1,120 @@
+"""Labels of KITTI-360's scans, from its accumulated point clouds: scans have none of their own.
+
+A cloud covers a window of frames. `static/` holds what stands; `dynamic/` holds what moves, with the frame of each point as its time stamp.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import import_extra
+from carlasc_converters.ply import PlyVertices
+
+MAX_DISTANCE_M = 0.2  # a point farther than this from every labelled one stays unlabelled
+_WINDOW = re.compile(r"(\d{10})_(\d{10})\.ply")
+_PER_CLASS = 1000  # instance = 1000 * class + number in the class, 0 for none
+_MAX_CLASS = 65535  # what does not fit into 16 bits is no class: it is reported as this one
+_COLUMNS = ("x", "y", "z", "semantic", "instance")
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Points with labels, prepared for the search of nearest neighbours.
+
+    Attributes:
+        tree: a `scipy.spatial.cKDTree` of the points; None if there are none.
+        labels: (N,) uint16 class ids.
+        instances: (N,) uint32.
+    """
+
+    tree: Any
+    labels: NDArray[np.uint16]
+    instances: NDArray[np.uint32]
+
+    @classmethod
+    def of(cls, rows: NDArray[np.void]) -> Labelled:
+        """Return the points of some vertices of a file."""
+        spatial = import_extra("scipy.spatial", "kitti")
+        points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        # An unbalanced tree is built several times faster, and as fast to search where points lie on surfaces.
+        tree = spatial.cKDTree(points, leafsize=32, compact_nodes=False, balanced_tree=False) if len(rows) else None
+        labels = np.clip(rows["semantic"], 0, _MAX_CLASS).astype(np.uint16)
+        numbered = np.clip(rows["instance"], 0, None).astype(np.uint32)
+        return cls(tree, labels, np.where(numbered % _PER_CLASS > 0, numbered, 0).astype(np.uint32))
+
+    def nearest(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the distance and the index of the nearest point to each of (M, 3); infinite if none is near enough."""
+        if self.tree is None:
+            return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+        distances, indices = self.tree.query(points, distance_upper_bound=MAX_DISTANCE_M)
+        return distances, np.where(np.isfinite(distances), indices, 0)
+
+
+def windows_of(static: Path) -> dict[str, tuple[int, int]]:
+    """Return the first and the last frame of each window, by the name of its file; empty if the folder does not exist."""
+    names: Iterable[str] = (path.name for path in static.iterdir()) if static.is_dir() else ()
+    found = {name: match for name in sorted(names) if (match := _WINDOW.fullmatch(name))}
+    return {name: (int(match[1]), int(match[2])) for name, match in found.items()}
+
+
+def window_at(windows: dict[str, tuple[int, int]], frame: int) -> str | None:
+    """Return the window in which a frame is farthest from both ends, because windows overlap; None if it is in none."""
+    depths = {name: min(frame - first, last - frame) for name, (first, last) in windows.items()}
+    best = max(depths, key=lambda name: depths[name], default=None)
+    return best if best is not None and depths[best] >= 0 else None
+
+
+def label_points(
+    folder: Path, window: str, frame: int, world: NDArray[np.float64]
+) -> tuple[NDArray[np.uint16], NDArray[np.uint32]]:
+    """Return the class and the instance of each point of a scan: those of the nearest labelled point within `MAX_DISTANCE_M`.
+
+    Points that stand count in all frames of the window, points that move only in their own frame.
+
+    Args:
+        folder: the folder that holds static/ and dynamic/.
+        window: the name of the window's files.
+        frame: number of the scan.
+        world: (N, 3) the points, in the frame of the world.
+
+    Raises:
+        FormatError: a file is damaged, or its points have no labels.
+        DependencyError: scipy is not installed.
+    """
+    labels, instances = np.zeros(len(world), np.uint16), np.zeros(len(world), np.uint32)
+    nearest = np.full(len(world), np.inf)
+    moving = _moving(str(folder / "dynamic" / window), frame) if (folder / "dynamic" / window).is_file() else None
+    for cloud in (_standing(str(folder / "static" / window)), moving):
+        if cloud is not None:
+            distances, indices = cloud.nearest(world)
+            nearer = distances < nearest
+            labels[nearer], instances[nearer] = cloud.labels[indices[nearer]], cloud.instances[indices[nearer]]
+            nearest = np.minimum(nearest, distances)
+    return labels, instances
+
+
+@lru_cache(maxsize=1)  # one window per process: frames are read in their order
+def _standing(path: str) -> Labelled:
+    return Labelled.of(PlyVertices.open(path, _COLUMNS).read())
+
+
+@lru_cache(maxsize=1)
+def _by_time(path: str) -> tuple[NDArray[np.void], NDArray[np.integer]]:
+    """Return the vertices of a dynamic file by increasing time stamp, and their time stamps."""
+    rows = np.array(PlyVertices.open(path, (*_COLUMNS, "timestamp")).read())
+    rows = rows[np.argsort(rows["timestamp"], kind="stable")]
+    return rows, np.ascontiguousarray(rows["timestamp"])
+
+
+def _moving(path: str, frame: int) -> Labelled:
+    rows, stamps = _by_time(path)
+    first, last = np.searchsorted(stamps, [frame, frame + 1])
+    return Labelled.of(rows[first:last])

@@ -1,0 +1,243 @@
+"""nuScenes: see the page `docs/sets/nuscenes.md`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, invert
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc_converters.nuscenes_classes import MINI_VALIDATION, NUSCENES, TO_CARLA, VALIDATION
+from carlasc_converters.nuscenes_frames import NuScenesFrame
+from carlasc_converters.nuscenes_tables import CHANNEL, Annotations, Scene, Tables
+from carlasc_converters.rigid import poses_of
+
+
+class NuScenes(Converter):
+    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), as far as they are installed.
+
+    Options:
+        version: the folder of the tables, if there are several, such as "v1.0-mini".
+        sweeps: "yes" for all LiDAR scans, which are 20 a second; "no" for key frames only, which are 2 a second.
+    """
+
+    title: ClassVar[str] = "nuScenes, with lidarseg and panoptic labels where they are installed"
+    license = "CC BY-NC-SA 4.0"
+    option_names = ("version", "sweeps")
+    classes = NUSCENES
+    to_carla = TO_CARLA
+    sensor = "Velodyne HDL-32E"
+    min_range_m = 2.5
+    max_range_m = 50.0
+
+    def sequences(self) -> list[Recording]:
+        """Return the scenes of which there are files, by name. This reads the tables.
+
+        Raises:
+            ArgumentError: an option has a value that it cannot have.
+            MissingDataError: there are no tables, a table does not exist, or no scene has files.
+            FormatError: a table does not hold what it must.
+        """
+        sweeps = self.options.get("sweeps", "yes")
+        if sweeps not in ("yes", "no"):
+            raise ArgumentError("sweeps", expected="yes or no", found=repr(sweeps))
+        tables = Tables(self._version())
+        tables.check_categories()
+        root, names = tables.folder.parent, _Names()
+        found: list[Recording] = []
+        for scene in tables.scenes:
+            present = {scan.file for scan in scene.scans if (root / scan.file).name in names.of(root / scan.file)}
+            if present:
+                found.append(NuScenesScene(tables, scene, present, all_scans=sweeps == "yes"))
+        if not found:
+            raise MissingDataError(
+                root,
+                expected=f"the LiDAR scans that {tables.folder.name} lists, such as samples/{CHANNEL}/*.pcd.bin",
+                found="none of them",
+                advice="unpack the archives of the sensor data beside the folder of the tables",
+            )
+        return found
+
+    def _version(self) -> Path:
+        """Return the folder of the tables."""
+        root, asked = self.source.resolve(), self.options.get("version")
+        if (root / "scene.json").is_file() and asked in (None, root.name):
+            return root
+        folders = sorted(path.parent for path in root.glob("v*/scene.json"))
+        listed = ", ".join(folder.name for folder in folders)
+        if not folders:
+            raise MissingDataError(
+                self.source,
+                expected="v1.0-mini/scene.json, or another version",
+                found="none" if root.is_dir() else "no such folder",
+                advice="give the folder that holds v1.0-mini/, samples/ and sweeps/",
+            )
+        chosen = [folder for folder in folders if asked in (None, folder.name)]
+        if len(chosen) != 1:
+            raise ArgumentError("version", expected=f"one of {listed}", found=repr(asked) if asked else "no choice")
+        return chosen[0]
+
+
+class _Names:
+    """The names of the files in folders. Each folder is listed once, because it may hold hundreds of thousands."""
+
+    def __init__(self) -> None:
+        self._folders: dict[Path, frozenset[str]] = {}
+
+    def of(self, file: Path) -> frozenset[str]:
+        """Return the names of the files in the folder of a file."""
+        folder = file.parent
+        if folder not in self._folders:
+            self._folders[folder] = frozenset(os.listdir(folder) if folder.is_dir() else ())
+        return self._folders[folder]
+
+
+class NuScenesScene(Recording):
+    """One scene.
+
+    Attributes:
+        tables: the tables that hold it.
+        scene: the scene.
+    """
+
+    def __init__(self, tables: Tables, scene: Scene, present: set[str], *, all_scans: bool) -> None:
+        """Choose the scans.
+
+        Args:
+            tables: the tables.
+            scene: the scene.
+            present: files of points that exist.
+            all_scans: whether scans between key frames are frames too, if there are any.
+        """
+        self.tables, self.scene = tables, scene
+        self.name, self.location = f"NUSC_{scene.name}", f"{tables.folder}: {scene.name}"
+        self.split = _split_of(scene.name, tables.folder.name)
+        self._between = any(scan.sample < 0 and scan.file in present for scan in scene.scans)
+        self._asked_for_all = all_scans
+        chosen = [scan for scan in scene.scans if scan.sample >= 0 or (all_scans and self._between)]
+        self._scans, self._present = chosen, present
+        self.has_labels = any(scan.labels or scan.instances for scan in chosen)
+        self.has_instances = any(scan.instances for scan in chosen)
+
+    @cached_property
+    def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
+        """The scans that exist."""
+        root, boxes = self.tables.folder.parent, self._boxes
+        sensor_T_vehicle = invert(self.sensors[0].vehicle_T_sensor)
+        return [
+            NuScenesFrame(
+                str(root / scan.file),
+                number,
+                None if scan.labels is None else str(root / scan.labels),
+                None if scan.instances is None else str(root / scan.instances),
+                boxes[number].transform(sensor_T_vehicle) if scan.instances and number in boxes else None,
+            )
+            for number, scan in enumerate(self._scans)
+            if scan.file in self._present
+        ]
+
+    @cached_property
+    def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
+        """The LiDAR on the roof. The frame of the vehicle lies on the ground."""
+        mounts = [self.tables.mounts[token] for token in sorted({scan.mount for scan in self.scene.scans})]
+        if any(not np.allclose(mount, mounts[0]) for mount in mounts):
+            raise FormatError(
+                self.location, expected=f"one calibration of {CHANNEL} in a scene", found=str(len(mounts))
+            )
+        return (Sensor(CHANNEL, mounts[0], points_in="sensor", deskewed=True, height_m=float(mounts[0][2, 3])),)
+
+    def poses(self, *, force: bool = False) -> Trajectory:
+        """Return the poses of the vehicle at all LiDAR scans of the scene, at their own times."""
+        rows = [scan.pose for scan in self.scene.scans]
+        try:
+            return Trajectory(self._global_T_vehicle(rows), self._seconds(self.tables.poses[0][rows]))
+        except FormatError as error:
+            raise error.within(f"{self.tables.path('ego_pose')}: {self.scene.name}") from error
+
+    def _global_T_vehicle(self, rows: Sequence[int]) -> NDArray[np.float64]:
+        """Return (N, 4, 4) poses of rows of the poses in the tables."""
+        numbers = self.tables.poses[1][rows]
+        return poses_of(numbers[:, 3:], numbers[:, :3], f"{self.tables.path('ego_pose')}: {self.scene.name}")
+
+    def times(self) -> NDArray[np.float64]:
+        """Return seconds after the first frame."""
+        return self._seconds(np.array([scan.timestamp for scan in self._scans], np.int64))
+
+    def _seconds(self, microseconds: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.asarray(microseconds - self._scans[0].timestamp, np.float64) * 1e-6
+
+    def boxes(self) -> Mapping[int, Boxes] | None:
+        """Return the boxes of the key frames. Tracks are numbered as the data set's panoptic labels are: by first appearance."""
+        return None if self.tables.annotations is None else self._boxes
+
+    @cached_property
+    def _boxes(self) -> dict[int, Boxes]:
+        """The boxes by frame."""
+        annotations = self.tables.annotations
+        if annotations is None:
+            return {}
+        keys = {number: scan for number, scan in enumerate(self._scans) if scan.sample >= 0}
+        rows = {number: annotations.of(scan.sample) for number, scan in keys.items()}
+        tracks = _tracks([rows[number] for number in sorted(rows, key=lambda number: keys[number].sample)])
+        poses = self._global_T_vehicle([scan.pose for scan in keys.values()])
+        found = {}
+        for (number, scan), global_T_vehicle in zip(keys.items(), poses, strict=True):
+            try:
+                found[number] = _boxes_of(rows[number], tracks, global_T_vehicle)
+            except FormatError as error:
+                raise error.within(f"{self.tables.path('sample_annotation')}: {scan.file}") from error
+        return found
+
+    def problems(self) -> list[tuple[int, str]]:
+        """Return the scans that the tables list and that have no file."""
+        root, advice = self.tables.folder.parent, "unpack the archives of the sensor data again"
+        missing = [(number, scan.file) for number, scan in enumerate(self._scans) if scan.file not in self._present]
+        errors = (
+            (
+                number,
+                MissingDataError(
+                    root / file, expected="a LiDAR scan that the tables list", found="no such file", advice=advice
+                ),
+            )
+            for number, file in missing
+        )
+        return [(number, str(error)) for number, error in errors]
+
+    def notes(self) -> list[str]:
+        """Say what the scene lacks."""
+        if self._asked_for_all and not self._between and any(scan.sample < 0 for scan in self.scene.scans):
+            return [
+                f"{self.location}: no scan between key frames exists in sweeps/: the frames are the key frames, 2 a second"
+            ]
+        return []
+
+
+def _boxes_of(rows: Annotations, tracks: Mapping[int, int], global_T_vehicle: Transform) -> Boxes:
+    """Return the boxes of a sample in the frame of the vehicle."""
+    global_T_box = poses_of(rows.numbers[:, 6:], rows.numbers[:, :3], "boxes")
+    numbers = np.array([tracks[instance] for instance in rows.instances.tolist()], np.uint32)
+    sizes = rows.numbers[:, [4, 3, 5]]  # the tables give width, length, height
+    return Boxes.from_poses(numbers, rows.labels, invert(global_T_vehicle) @ global_T_box, sizes)
+
+
+def _tracks(samples: Sequence[Annotations]) -> dict[int, int]:
+    """Return the number of each object of a scene from 1: the order in which its samples first name it."""
+    tracks: dict[int, int] = {}
+    for sample in samples:
+        for instance in sample.instances.tolist():
+            tracks.setdefault(instance, len(tracks) + 1)
+    return tracks
+
+
+def _split_of(scene: str, version: str) -> Split:
+    if "test" in version:
+        return "Test"
+    return "Val" if scene in (MINI_VALIDATION if "mini" in version else VALIDATION) else "Train"

@@ -1,0 +1,124 @@
+"""The scans of nuScenes: points, classes, and the numbers of objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.protocol import Cloud, FrameHandle
+from carlasc.core.boxes import Boxes
+from carlasc.errors import FormatError, MissingDataError
+from carlasc_converters.npz import read_arrays
+from carlasc_converters.nuscenes_classes import NUSCENES
+
+_COLUMNS = 5  # x, y, z, intensity, ring
+_PER_CLASS = 1000  # panoptic labels are 1000 * class + number of the object
+_UNMATCHED = 1 << 16  # added to the panoptic label of objects without a box: above the number of any track
+_SURFACE_M = 0.01  # points on the surface of a box count as inside, whatever was rounded
+
+
+@dataclass(frozen=True)
+class NuScenesFrame(FrameHandle):
+    """One LiDAR scan.
+
+    Attributes:
+        labels: the file of its point labels, or None.
+        instances: the file of its panoptic labels, or None.
+        boxes: its boxes in the frame of the sensor, which give panoptic instances the numbers of their tracks.
+    """
+
+    location: str
+    number: int
+    labels: str | None
+    instances: str | None
+    boxes: Boxes | None
+
+    @property
+    def labelled(self) -> bool:  # type: ignore[override]
+        """Whether the scan is a key frame with labels."""
+        return self.labels is not None or self.instances is not None
+
+    def read(self) -> Sequence[Cloud]:
+        """Read points, classes and instances."""
+        data = _read_bytes(self.location)
+        if not len(data) or len(data) % (4 * _COLUMNS):
+            raise FormatError(
+                self.location,
+                expected=f"a multiple of {4 * _COLUMNS} bytes ({_COLUMNS} float32 a point)",
+                found=str(len(data)),
+                advice="the file is incomplete: unpack it again",
+            )
+        points = np.frombuffer(data, "<f4").reshape(-1, _COLUMNS)[:, :4].copy()
+        points[:, 3] /= 255.0
+        panoptic = None if self.instances is None else _read_panoptic(self.instances)
+        labels: NDArray[Any] | None = None
+        if self.labels is not None:
+            labels = np.frombuffer(_read_bytes(self.labels), np.uint8)
+            _check_labels(labels, len(points), self.labels)
+        if panoptic is not None and self.instances is not None:
+            _check_labels(panoptic // _PER_CLASS, len(points), self.instances)
+            labels = panoptic // _PER_CLASS if labels is None else labels
+        instances = None if panoptic is None else number_instances(panoptic, points, self.boxes)
+        return (Cloud(points, labels, instances),)
+
+
+def number_instances(
+    panoptic: NDArray[np.uint16], points: NDArray[np.float32], boxes: Boxes | None
+) -> NDArray[np.uint32]:
+    """Return the number of each point's object: that of the box of the object's class which holds most of its points.
+
+    The data set made its panoptic labels from the boxes, so each object has one. An object without a box gets a number of its own above
+    those of the tracks, the same in all frames.
+
+    Args:
+        panoptic: (N,) panoptic labels.
+        points: (N, 4) the points.
+        boxes: the boxes of the frame, in the frame of the points; None if it has none.
+
+    Returns:
+        (N,) numbers, 0 for none.
+    """
+    numbers = np.zeros(len(panoptic), np.uint32)
+    inside = None if boxes is None else boxes.contains(points[:, :3], _SURFACE_M)
+    for value in np.unique(panoptic[panoptic % _PER_CLASS > 0]).tolist():
+        members = panoptic == value
+        numbers[members] = _UNMATCHED + value
+        if boxes is not None and inside is not None:
+            votes = np.where(boxes.labels == value // _PER_CLASS, inside[:, members].sum(axis=1), 0)
+            if votes.max(initial=0):
+                numbers[members] = boxes.tracks[votes.argmax()]
+    return numbers
+
+
+def _read_bytes(path: str) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise MissingDataError(
+            path, expected="a file that the tables list", found="nothing", advice="unpack it again"
+        ) from None
+
+
+def _read_panoptic(path: str) -> NDArray[np.uint16]:
+    """Return the panoptic labels of a file."""
+    labels = read_arrays(path, ("data",), "unpack it again")[0]
+    if labels.dtype.kind != "u" or labels.ndim != 1:
+        raise FormatError(path, expected="a row of unsigned integers", found=f"{labels.dtype}, shape {labels.shape}")
+    return labels
+
+
+def _check_labels(labels: NDArray[Any], points: int, path: str) -> None:
+    """Check that there is a class of the table for each point."""
+    if len(labels) != points:
+        raise FormatError(
+            path,
+            expected=f"a label for each of {points} points",
+            found=str(len(labels)),
+            advice="the file belongs to another scan, or is incomplete",
+        )
+    NUSCENES.check(labels, path)

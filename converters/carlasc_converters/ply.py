@@ -1,0 +1,211 @@
+"""Vertices of PLY files, in rows: ASCII, and binary of either byte order. Only what is asked for is read into memory.
+
+The format: https://paulbourke.net/dataformats/ply/. A text header lists elements and their properties; the rows of the elements follow.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError
+
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_CUT = "the file is incomplete: copy it again"
+_MAX_LINE = 4096  # bytes of a header line; more means that the file is no PLY file
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class PlyVertices:
+    """The vertices of a PLY file. It holds no open file, so that it can be pickled.
+
+    Attributes:
+        path: the file.
+        dtype: a structured type with a field per property, in the order and the byte order of the file.
+        count: number of vertices.
+        offset: where the body of the file begins, or, for a binary file, the first vertex.
+        lines: for a text file, the number of lines of its body before the first vertex; None for a binary file.
+    """
+
+    path: str
+    dtype: np.dtype[np.void]
+    count: int
+    offset: int
+    lines: int | None = None
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str], required: tuple[str, ...] = ()) -> Self:
+        """Read the header of a file.
+
+        Args:
+            path: the file.
+            required: names of properties that vertices must have.
+
+        Raises:
+            MissingDataError: the file does not exist.
+            FormatError: it is no PLY file, its vertices have a list property or lack a required one, or it is shorter than its header says.
+        """
+        try:
+            with Path(path).open("rb") as file:
+                kind, elements = _read_header(file, str(path))
+                offset = file.tell()
+        except FileNotFoundError:
+            raise MissingDataError(path, expected="a PLY file", found="nothing") from None
+        before = _before_vertices(elements, str(path))
+        dtype = _row_type(elements["vertex"][1], _BYTE_ORDERS[kind], str(path))
+        if missing := [name for name in required if name not in (dtype.names or ())]:
+            raise FormatError(
+                path,
+                expected=f"vertices with {', '.join(missing)}",
+                found=", ".join(dtype.names or ("none",)),
+                advice="it belongs to another data set, or to another version of this one",
+            )
+        if kind == "ascii":
+            return cls(str(path), dtype, elements["vertex"][0], offset, sum(elements[name][0] for name in before))
+        start = offset + sum(
+            elements[name][0] * _row_type(elements[name][1], "<", str(path)).itemsize for name in before
+        )
+        vertices = cls(str(path), dtype, elements["vertex"][0], start)
+        size = Path(path).stat().st_size
+        if size < start + vertices.count * dtype.itemsize:
+            found = max(0, size - start) // dtype.itemsize
+            raise FormatError(path, expected=f"{vertices.count} vertices", found=str(found), advice=_CUT)
+        return vertices
+
+    def __len__(self) -> int:
+        return self.count
+
+    def read(self) -> NDArray[np.void]:
+        """Return all vertices: an array of `dtype`, mapped from a binary file, read from a text file.
+
+        Raises:
+            FormatError: a text file has fewer vertices than its header says, or something else than numbers.
+        """
+        if self.lines is None:
+            return self.rows(0, self.count)
+        return next(self.chunks(max(1, self.count)), np.empty(0, self.dtype))
+
+    def rows(self, start: int, stop: int) -> NDArray[np.void]:
+        """Return the vertices `start:stop` of a binary file, mapped from it.
+
+        Memory is used for what is read from them, and only as long as the result exists.
+
+        Raises:
+            FormatError: the file is a text file, whose rows cannot be found without reading all rows before them.
+        """
+        if self.lines is not None:
+            raise FormatError(self.path, expected="a binary PLY file", found="a text file", advice="save it as binary")
+        start, stop, _ = slice(start, stop).indices(self.count)
+        if stop <= start:
+            return np.empty(0, self.dtype)
+        return np.memmap(self.path, self.dtype, "r", self.offset + start * self.dtype.itemsize, (stop - start,))
+
+    def chunks(self, size: int = _CHUNK) -> Iterator[NDArray[np.void]]:
+        """Yield all vertices in their order, at most `size` at a time. Only one chunk is in memory if the caller keeps none.
+
+        Raises:
+            FormatError: as for `read`.
+        """
+        if self.lines is None:
+            for start in range(0, self.count, size):
+                yield self.rows(start, start + size)
+            return
+        with Path(self.path).open("rb") as binary:
+            binary.seek(self.offset)
+            text = io.TextIOWrapper(binary, encoding="ascii")
+            for _ in islice(text, self.lines):
+                pass
+            for start in range(0, self.count, size):
+                yield self._parse(text, start, min(size, self.count - start))
+
+    def _parse(self, text: io.TextIOWrapper, start: int, count: int) -> NDArray[np.void]:
+        """Return the vertices of the next `count` lines.
+
+        `numpy.loadtxt` with a structured type is the fastest parser without another package: 1.2 million rows of six values per
+        second, where `split` and `fromstring` reach 0.7 to 0.8 million.
+        """
+        try:
+            lines = list(islice(text, count))
+            rows = np.loadtxt(lines, self.dtype, comments=None, ndmin=1) if lines else np.empty(0, self.dtype)
+        except ValueError as error:  # UnicodeDecodeError is one too
+            expected = f"{len(self.dtype.names or ())} numbers in each of {self.count} rows"
+            raise FormatError(
+                self.path, expected=expected, found=f"other values after row {start} ({error})", advice=_CUT
+            ) from error
+        if len(rows) < count:
+            raise FormatError(self.path, expected=f"{self.count} vertices", found=str(start + len(rows)), advice=_CUT)
+        return rows
+
+
+_Properties = list[tuple[str, str]]  # (name, type), in the order of the file; a list's type is "list"
+
+
+def _read_header(file: BinaryIO, path: str) -> tuple[str, dict[str, tuple[int, _Properties]]]:
+    """Return the kind of the file, and the count and the properties of its elements by name, in their order."""
+    if file.readline(_MAX_LINE).rstrip() != b"ply":
+        raise FormatError(path, expected='a PLY file, which begins with the line "ply"', found="something else")
+    kind, elements = "", dict[str, tuple[int, _Properties]]()
+    for line in iter(lambda: file.readline(_MAX_LINE), b""):
+        words = line.decode("latin-1").split()
+        try:
+            match words:
+                case [] | ["comment", *_] | ["obj_info", *_]:
+                    pass
+                case ["format", name, _] if name in _BYTE_ORDERS:
+                    kind = name
+                case ["element", name, count] if int(count) >= 0:
+                    elements[name] = (int(count), [])
+                case ["property", "list", _, _, name]:
+                    elements[next(reversed(elements))][1].append((name, "list"))
+                case ["property", type_name, name]:
+                    elements[next(reversed(elements))][1].append((name, type_name))
+                case ["end_header"]:
+                    break
+                case _:
+                    raise ValueError
+        except (ValueError, StopIteration):
+            found = repr(" ".join(words)[:60])
+            raise FormatError(path, expected="a line of a PLY header", found=found) from None
+    else:
+        raise FormatError(path, expected="a PLY header that ends with end_header", found="none", advice=_CUT)
+    if not kind:
+        raise FormatError(path, expected=f"a line with the format: {', '.join(_BYTE_ORDERS)}", found="none")
+    if "vertex" not in elements:
+        raise FormatError(path, expected="vertices", found=", ".join(elements) or "no elements")
+    return kind, elements
+
+
+def _before_vertices(elements: dict[str, tuple[int, _Properties]], path: str) -> list[str]:
+    """Return the names of the elements before the vertices."""
+    names = list(elements)
+    before = names[: names.index("vertex")]
+    for name in before:
+        if any(kind == "list" for _, kind in elements[name][1]):
+            raise FormatError(path, expected="vertices before elements with lists", found=f"{name} before them")
+    return before
+
+
+def _row_type(properties: _Properties, byte_order: str, path: str) -> np.dtype[Any]:
+    """Return the type of a row with these properties."""
+    for name, kind in properties:
+        if kind == "list":
+            raise FormatError(path, expected="one number per property", found=f"the list {name}")
+        if kind not in _TYPES:
+            raise FormatError(path, expected=f"types {', '.join(_TYPES)}", found=f"{kind} for the property {name}")
+    names = [name for name, _ in properties]
+    if not names or len(set(names)) < len(names):
+        raise FormatError(path, expected="properties with names of their own", found=", ".join(names) or "none")
+    return np.dtype([(name, byte_order + _TYPES[kind]) for name, kind in properties])

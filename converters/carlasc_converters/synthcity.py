@@ -1,0 +1,332 @@
+"""SynthCity: a simulated mobile-mapping cloud of a city, in Parquet tables, one per area of about 40 million points.
+
+The cloud has no trajectory, so it has no scans either. Each area is cut into tiles, each as large as a voxel grid, and a frame is one tile.
+Nobody knows where its points were seen from: voxels with points are known, everything else is unknown.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Trajectory, VoxelContent
+from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.geometry import translation
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, StorageError, import_extra
+
+_CLASSES = (  # name, class of CarlaSC; the data count from 0, here 0 is unlabelled
+    ("unlabelled", "Free"), ("building", "Building"), ("car", "Vehicle"), ("natural ground", "Terrain"), ("ground", "Ground"),
+    ("pole-like", "Pole"), ("road", "Road"), ("street furniture", "Static"), ("tree", "Vegetation"), ("pavement", "Sidewalk"),
+)  # fmt: skip
+_TARGETS = {index: CARLA.id_of(target) for index, (_, target) in enumerate(_CLASSES)}
+CLASSES = ClassTable(
+    "synthcity",
+    {index: name for index, (name, _) in enumerate(_CLASSES)},
+    {index: CARLA.colors[target] for index, target in _TARGETS.items()},
+    movable=frozenset({2}),
+    ground=frozenset({3, 4, 6, 9}),
+)
+_SYNONYMS = {  # names of columns, in lower case, letters only: those of the published tables are not known for certain
+    "x": {"x", "xcoord", "xcoordinate", "posx"},
+    "y": {"y", "ycoord", "ycoordinate", "posy"},
+    "z": {"z", "zcoord", "zcoordinate", "posz"},
+    "label": {"label", "labels", "labelid", "class", "classes", "classid", "classification", "category", "semantic"},
+}
+_COLUMNS = "x=NAME,y=NAME,z=NAME,label=NAME"
+_GRIDS = ("cartesian", "cartesian_fine")
+_HEIGHT_M = 1.8  # of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
+_GROUND_RADIUS_M, _GROUND_POINTS = 5.0, 20  # the ground is that around the middle of a tile, if it has so many points
+_BATCH = 1 << 18  # rows in memory
+_ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])  # x and y from the middle of the tile
+
+
+class SynthCity(Converter):
+    """Reads the areas of SynthCity, or one of them.
+
+    Options:
+        columns: the names of columns that are not found by themselves, such as "x=X_noise,y=Y_noise,label=Class".
+        grid: "cartesian" (the default) or "cartesian_fine": the published grid whose size and voxels tiles have.
+    """
+
+    title: ClassVar[str] = "SynthCity: tiles of a static cloud, voxels without free space"
+    option_names = ("columns", "grid")
+    classes = CLASSES
+    to_carla = Remap("synthcity_to_carla", CLASSES, CARLA, _TARGETS)
+    sensor = "simulated mobile mapping (BlenSor)"
+
+    def sequences(self) -> list[Recording]:
+        """Return the areas, by name.
+
+        Raises:
+            MissingDataError: no table exists.
+            FormatError: a file is no Parquet table, or its columns are not found.
+            ArgumentError: an option has a wrong value.
+            DependencyError: pyarrow is not installed.
+        """
+        grid = self.options.get("grid", _GRIDS[0])
+        if grid not in _GRIDS:
+            raise ArgumentError("grid", expected=f"one of {', '.join(_GRIDS)}", found=grid)
+        named = _parse_columns(self.options["columns"]) if "columns" in self.options else {}
+        files = [self.source] if self.source.is_file() else sorted(self.source.rglob("*.parquet"))
+        if not files:
+            raise MissingDataError(self.source, expected="Parquet tables, one per area", found="none")
+        return [SynthCityArea(path, _find_columns(path, named), GridSpec.published(grid)) for path in files]
+
+
+class SynthCityArea(Recording):
+    """One area. Its tiles lie on a lattice that is the same for all areas, and are numbered along y first.
+
+    The rows of each tile are kept in a file of a temporary folder, which is deleted with the recording and its frames.
+
+    Attributes:
+        path: its table.
+        columns: names of its columns x, y, z and label.
+        voxels: geometry of the voxel grids, about the middle of a tile.
+    """
+
+    split = "Train"
+    has_labels = True
+    rays = False
+    sensors = (Sensor("assumed", height_m=_HEIGHT_M),)
+
+    def __init__(self, path: Path, columns: Mapping[str, str], voxels: GridSpec) -> None:
+        self.path, self.location, self.columns = path, str(path), columns
+        self.voxels = self._spec = voxels
+        self.name = f"SYNTHCITY_{path.stem.replace('_', '-')}"
+
+    @cached_property
+    def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
+        """The tiles that have points."""
+        folder, tiles = self._cut
+        grounds = _grounds([_tile_file(folder.name, tile) for tile in tiles], self._centers)
+        return [
+            SynthCityFrame(
+                number,
+                f"{self.path}: tile {tile[0]}, {tile[1]}",
+                _tile_file(folder.name, tile),
+                self._spec,
+                grounds[number] + _HEIGHT_M,
+                folder,
+            )
+            for number, tile in enumerate(tiles)
+        ]
+
+    @cached_property
+    def _cut(self) -> tuple[_Folder, list[tuple[int, int]]]:
+        """The folder with the rows of each tile, and the tiles. One pass over the table makes them."""
+        folder, tiles = _Folder(), set[tuple[int, int]]()
+        for points, labels in _batches(self.path, self.columns):
+            tiles |= _append(folder.name, points, labels, self._step)
+        if not tiles:
+            raise FormatError(self.path, expected="points", found="none")
+        return folder, sorted(tiles)
+
+    @property
+    def _step(self) -> float:
+        return self._spec.upper[0] - self._spec.lower[0]
+
+    @property
+    def _centers(self) -> NDArray[np.float64]:
+        """(F, 2) middle of each tile."""
+        return (np.array(self._cut[1], np.float64) + 0.5) * self._step
+
+    def poses(self, *, force: bool = False) -> Trajectory:
+        """Return where the tiles are in the city: 1.8 m above their ground, x along the x of the city."""
+        heights = [frame.height_m for frame in self.frames if isinstance(frame, SynthCityFrame)]
+        return Trajectory(np.array([translation((x, y, z)) for (x, y), z in zip(self._centers, heights, strict=True)]))
+
+    def notes(self) -> list[str]:
+        """Return what the data lack."""
+        return [
+            f"SynthCity is a static cloud without trajectory: each frame is a tile of {self._step:.1f} m, in the frame of a place"
+            f" {_HEIGHT_M} m above its ground, where no sensor was",
+            "only voxels with points are known; everything else is unknown, because nothing tells where space is free",
+        ]
+
+
+class _Folder:
+    """A temporary folder that is deleted when nothing refers to this object any more, at the latest when the process ends."""
+
+    def __init__(self) -> None:
+        self.name = tempfile.mkdtemp(prefix="carlasc-synthcity-")
+        weakref.finalize(self, shutil.rmtree, self.name, ignore_errors=True)
+
+
+@dataclass(frozen=True, eq=False)
+class SynthCityFrame(FrameHandle):
+    """One tile.
+
+    Attributes:
+        number: its place among the tiles of the area.
+        location: the table, and the tile.
+        rows: the file with its rows.
+        spec: geometry of its grid.
+        height_m: height of its origin, in the coordinates of the table.
+        folder: keeps the temporary folder from being deleted, in the process that made it.
+    """
+
+    number: int
+    location: str
+    rows: str
+    spec: GridSpec
+    height_m: float
+    folder: object = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"folder": None}
+
+    def read(self) -> Sequence[Cloud]:
+        """Read the points of the tile, at all heights."""
+        rows = np.fromfile(self.rows, _ROW)
+        points = np.zeros((len(rows), 4), np.float32)
+        points[:, 0], points[:, 1], points[:, 2] = rows["x"], rows["y"], rows["z"] - self.height_m
+        return (Cloud(points, rows["label"]),)
+
+    def read_voxels(self) -> VoxelContent:
+        """Return the class that most points of each voxel have; the one with the smallest number if there are several."""
+        (cloud,) = self.read()
+        assert cloud.labels is not None
+        cells = self.spec.flat_index(cloud.points[:, :3])
+        inside, kinds = cells >= 0, len(CLASSES.names)
+        votes = np.bincount(cells[inside] * kinds + cloud.labels[inside], minlength=self.spec.num_voxels * kinds)
+        votes = votes.reshape(*self.spec.size, kinds)
+        return VoxelContent(votes.argmax(axis=-1).astype(np.uint8), votes.sum(axis=-1) > 0)
+
+
+def _parse_columns(text: str) -> dict[str, str]:
+    """Return the columns that a text such as "x=X,label=Class" names."""
+    pairs = [part.partition("=") for part in text.split(",")]
+    named = {key.strip(): name.strip() for key, _, name in pairs}
+    if len(named) < len(pairs) or not set(named) <= set(_SYNONYMS) or not all(named.values()):
+        raise ArgumentError("columns", expected=f"{_COLUMNS}, or some of these", found=repr(text))
+    return named
+
+
+def _find_columns(path: Path, named: Mapping[str, str]) -> dict[str, str]:
+    """Return the names of the columns x, y, z and label of a table."""
+    parquet = import_extra("pyarrow.parquet", "parquet")
+    arrow = import_extra("pyarrow", "parquet")
+    try:
+        existing = parquet.read_schema(path).names
+    except (arrow.ArrowException, OSError) as error:
+        raise FormatError(path, expected="a Parquet table", found=f"something else ({error})") from error
+    columns = {}
+    for key, synonyms in _SYNONYMS.items():
+        found = [name for name in existing if "".join(filter(str.isalpha, name.lower())) in synonyms]
+        found = [name for name in existing if name == named[key]] if key in named else found
+        if len(found) != 1:
+            raise FormatError(
+                path,
+                expected=f"one column {named.get(key, key)}",
+                found=", ".join(found or existing),
+                advice=f"name the columns with the option `columns`: {_COLUMNS}",
+            )
+        columns[key] = found[0]
+    return columns
+
+
+def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
+    """Yield (N, 3) points and (N,) labels, counted from 1, of consecutive rows of a table.
+
+    Raises:
+        FormatError: the table is damaged, a coordinate is not finite, or a label is not one of the nine.
+    """
+    parquet = import_extra("pyarrow.parquet", "parquet")
+    arrow = import_extra("pyarrow", "parquet")
+    done = 0
+    try:
+        # Without these two options, whole columns of a row group are in memory, and a table may be one row group.
+        with parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as table:
+            for batch in table.iter_batches(_BATCH, columns=list(dict.fromkeys(columns.values()))):
+                points = np.stack([_numbers(path, batch, columns[key]) for key in "xyz"], axis=1)
+                labels = _numbers(path, batch, columns["label"])
+                if (wrong := ~np.isfinite(points).all(axis=1)).any():
+                    row = done + int(np.argmax(wrong))
+                    raise FormatError(path, expected="finite coordinates", found=f"others in row {row}")
+                if (wrong := ~np.isin(labels, np.arange(len(CLASSES.names) - 1))).any():
+                    value, count = labels[np.argmax(wrong)], int(wrong.sum())
+                    raise FormatError(
+                        path,
+                        expected=f"labels 0 to {len(CLASSES.names) - 2} in the column {columns['label']}",
+                        found=f"{value:g} in row {done + int(np.argmax(wrong))}, and {count - 1} more such rows near it",
+                        advice="another column may hold the labels: name it with the option `columns`",
+                    )
+                yield points, labels.astype(np.uint8) + np.uint8(1)
+                done += len(labels)
+    except (arrow.ArrowException, OSError) as error:
+        found = f"a damaged one ({error})"
+        raise FormatError(path, expected="a Parquet table", found=found, advice="copy it again") from error
+
+
+def _numbers(path: Path, batch: Any, name: str) -> NDArray[np.float64]:
+    """Return a column of a batch as numbers."""
+    column = batch.column(name).to_numpy(zero_copy_only=False)
+    if column.dtype.kind not in "iuf":
+        raise FormatError(path, expected=f"numbers in the column {name}", found=str(batch.schema.field(name).type))
+    return column.astype(np.float64)
+
+
+def _append(folder: str, points: NDArray[np.float64], labels: NDArray[np.uint8], step: float) -> set[tuple[int, int]]:
+    """Append points to the files of their tiles, and return these tiles."""
+    if not len(points):
+        return set()
+    tiles = np.floor(points[:, :2] / step).astype(np.int64)
+    rows = np.empty(len(points), _ROW)
+    rows["x"], rows["y"] = (points[:, :2] - (tiles + 0.5) * step).T
+    rows["z"], rows["label"] = points[:, 2], labels
+    low = tiles.min(axis=0)
+    codes = (tiles[:, 0] - low[0]) * (np.ptp(tiles[:, 1]) + 1) + (tiles[:, 1] - low[1])
+    codes = codes.astype(
+        np.min_scalar_type(codes.max())
+    )  # 16 bits, in nearly all cases, are sorted ten times as fast as 64
+    order = np.argsort(codes, kind="stable")
+    rows, codes = rows[order], codes[order]
+    starts = np.append(0, np.flatnonzero(np.diff(codes)) + 1)
+    found = [(int(x), int(y)) for x, y in tiles[order[starts]]]
+    try:
+        for tile, part in zip(found, np.split(rows, starts[1:]), strict=True):
+            with Path(_tile_file(folder, tile)).open("ab") as file:
+                part.tofile(file)
+    except OSError as error:
+        advice = "set TMPDIR to a folder with 17 bytes of free space per point"
+        raise StorageError(
+            folder, problem=f"the temporary folder cannot be written ({error})", advice=advice
+        ) from error
+    return set(found)
+
+
+def _tile_file(folder: str, tile: tuple[int, int]) -> str:
+    return str(Path(folder) / f"{tile[0]}_{tile[1]}.bin")
+
+
+def _grounds(files: list[str], centers: NDArray[np.float64]) -> list[float]:
+    """Return the height of the ground in each tile: the median of its ground points, those around the middle if there are enough.
+
+    A tile without ground points has the height of the nearest tile that has some; if none has, that of its lowest point.
+    """
+    heights = np.full(len(files), np.nan)
+    lowest = np.empty(len(files))
+    for number, file in enumerate(files):
+        rows = np.memmap(file, _ROW, "r")
+        lowest[number] = rows["z"].min()
+        ground = np.isin(rows["label"], sorted(CLASSES.ground))
+        near = ground & (np.hypot(rows["x"], rows["y"]) < _GROUND_RADIUS_M)
+        chosen = near if near.sum() >= _GROUND_POINTS else ground
+        if chosen.any():
+            heights[number] = np.median(rows["z"][chosen])
+    known = np.flatnonzero(~np.isnan(heights))
+    if not known.size:
+        return lowest.tolist()
+    away = np.linalg.norm(centers[:, None] - centers[known], axis=2)
+    return heights[known[away.argmin(axis=1)]].tolist()
