@@ -14,13 +14,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.benchmarks import (
+    IGNORED,
+    OCC3D,
+    OCC3D_TO_OPENOCCUPANCY,
+    OPENOCCUPANCY,
+    SSCBENCH,
+    TO_OCC3D,
+    TO_SSCBENCH,
+)
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import ConfusionMatrix
-
-IGNORED = -1
-"""Target of the classes that a convention leaves out. Voxels with such a class in the truth do not count; predicted, it counts as free."""
 
 _LEFT_OUT, _UNKNOWN = 254, 255  # values in the look-up tables; the scored ids are smaller
 
@@ -217,43 +223,6 @@ def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
     )  # fmt: skip
 
 
-def _table(name: str, names: str, free: int) -> ClassTable:
-    words = names.split()
-    grey = {i: (110 + 13 * i % 120, 90 + 29 * i % 130, 80 + 47 * i % 140) for i in range(len(words))}
-    return ClassTable(name, dict(enumerate(words)), grey | {free: (255, 255, 255)})
-
-
-SSCBENCH = _table(
-    "sscbench",
-    "empty car bicycle motorcycle truck other-vehicle person road parking sidewalk other-ground building fence vegetation terrain pole"
-    " traffic-sign other-structure other-object",
-    0,
-)
-_NUSCENES = (
-    "barrier bicycle bus car construction-vehicle motorcycle pedestrian traffic-cone trailer truck driveable-surface other-flat sidewalk"
-    " terrain manmade vegetation"
-)
-OCC3D = _table("occ3d", f"others {_NUSCENES} free", 17)
-OPENOCCUPANCY = _table("openoccupancy", f"empty {_NUSCENES}", 0)
-
-# CARLA class -> (Occ3D, SSCBench), as CarlaOcc publishes the map; the 23 old tags have one Vehicle, a car.
-_CARLA = {
-    0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (11, 7), 8: (13, 9), 9: (16, 13), 10: (4, 1),
-    11: (15, 17), 12: (0, 16), 13: (17, 0), 14: (14, 10), 15: (15, 17), 16: (12, 10), 17: (1, 12), 18: (0, 16), 19: (0, 18), 20: (0, 18),
-    21: (12, 10), 22: (14, 14),
-}  # fmt: skip
-# The paper's 11 classes do not tell these apart: Barrier is fence, wall and guard rail; Pole holds signs and lights; Ground is terrain too.
-_CARLASC11 = {
-    0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (14, 14), 8: (13, 9), 9: (16, 13), 10: (4, 1),
-}  # fmt: skip
-_CARLASC11_TO_19 = {0: 0, 1: 13, 2: 14, 3: IGNORED, 4: 6, 5: 18, 6: 9, 7: 17, 8: 11, 9: 15, 10: 1}
-_SEMANTICKITTI_TO_SSCBENCH = {
-    0: 0, 1: IGNORED, 10: 1, 11: 2, 13: 5, 15: 3, 16: 5, 18: 4, 20: 5, 30: 6, 31: IGNORED, 32: IGNORED, 40: 7, 44: 8, 48: 9, 49: 10,
-    50: 11, 51: 12, 52: 17, 60: 7, 70: 13, 71: IGNORED, 72: 14, 80: 15, 81: 16, 99: 18, 252: 1, 253: IGNORED, 254: 6, 255: IGNORED,
-    256: 5, 257: 5, 258: 4, 259: 5,
-}  # fmt: skip
-
-
 def _identity(table: ClassTable) -> dict[int, int]:
     return {i: i for i in table.names}
 
@@ -269,18 +238,7 @@ def _via(first: Mapping[int, int], second: Mapping[int, int]) -> dict[int, int]:
 
 _RAW_TO_19 = _without_zero(REMAPS["semantickitti19"].mapping)
 _CARLA_TO_RAW = REMAPS["carla_to_semantickitti"].mapping
-_SSCBENCH_MAPS = {
-    "carla": {old: new for old, (_, new) in _CARLA.items()},
-    "carlasc11": {old: new for old, (_, new) in _CARLASC11.items()},
-    "semantickitti": _SEMANTICKITTI_TO_SSCBENCH,
-    "sscbench": _identity(SSCBENCH),
-}
-_OCC3D_MAPS = {
-    "carla": {old: new for old, (new, _) in _CARLA.items()},
-    "carlasc11": {old: new for old, (new, _) in _CARLASC11.items()},
-    "occ3d": _identity(OCC3D),
-}
-_TO_OPENOCCUPANCY = {0: IGNORED, 17: 0} | {i: i for i in range(1, 17)}
+_CARLASC11_TO_19 = {0: 0, 1: 13, 2: 14, 3: IGNORED, 4: 6, 5: 18, 6: 9, 7: 17, 8: 11, 9: 15, 10: 1}
 _THINGS_AND_STUFF = tuple(range(17))
 
 CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
@@ -324,7 +282,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 SSCBENCH,
                 0,
                 tuple(range(1, 19)),
-                _SSCBENCH_MAPS,
+                TO_SSCBENCH,
                 SEMANTICKITTI,
                 SEMANTICKITTI,
                 epsilon=1e-5,
@@ -336,7 +294,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OCC3D,
                 17,
                 _THINGS_AND_STUFF,
-                _OCC3D_MAPS,
+                TO_OCC3D,
                 OCC3D,
                 OCC3D,
                 absent="skip",
@@ -348,7 +306,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OCC3D,
                 17,
                 _THINGS_AND_STUFF,
-                _OCC3D_MAPS,
+                TO_OCC3D,
                 OCC3D,
                 OCC3D,
                 absent="skip-truth",
@@ -360,7 +318,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OCC3D,
                 17,
                 _THINGS_AND_STUFF,
-                _OCC3D_MAPS,
+                TO_OCC3D,
                 OCC3D,
                 OCC3D,
                 absent="skip",
@@ -373,7 +331,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OPENOCCUPANCY,
                 0,
                 tuple(range(1, 17)),
-                {name: _via(mapping, _TO_OPENOCCUPANCY) for name, mapping in _OCC3D_MAPS.items()}
+                {name: _via(mapping, OCC3D_TO_OPENOCCUPANCY) for name, mapping in TO_OCC3D.items()}
                 | {"openoccupancy": _identity(OPENOCCUPANCY) | {255: IGNORED}},
                 OPENOCCUPANCY,
                 OPENOCCUPANCY,

@@ -51,8 +51,8 @@ def evaluate(
             SemanticKITTI, SSCBench, Occ3D or OpenOccupancy.
         truth: the ground truth, likewise.
         convention: the benchmark whose rules are used: a Convention or a name in `carlasc.metrics.CONVENTIONS`. It says which voxels
-            count, in which classes, and how the mean is taken. "own" scores the unchanged classes of the data. None takes "carlasc"
-            for class tables that it has a map for, and "own" for others.
+            count, in which classes, and how the mean is taken. "own" scores the unchanged classes of the data. None takes the benchmark
+            whose files the ground truth consists of; otherwise "carlasc" for class tables that it has a map for, and "own" for others.
         grid: the grid that holds the predictions; None takes the name of the true grid, or the only grid of a sequence.
         truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
         source_classes: name of the class table of the predictions, for data that do not name one. None takes the class table of the
@@ -348,7 +348,8 @@ def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Conventi
     tables = [side.classes for pair in pairs for side in (pair.truth, pair.prediction) if side.classes is not None]
     table = tables[0] if tables else CARLA
     if convention is None:
-        convention = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
+        usual = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
+        convention = pairs[0].truth.benchmark or usual
     return own_convention(table) if convention == "own" else convention_named(convention)
 
 

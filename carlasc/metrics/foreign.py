@@ -1,4 +1,4 @@
-"""Grids in the files of other benchmarks: Occ3D's `.npz`, OpenOccupancy's `.npy`, SemanticKITTI's folders."""
+"""Grids in the files of other benchmarks: Occ3D's `.npz`, OpenOccupancy's `.npy`, the folders of SemanticKITTI and SSCBench."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
+from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
+from carlasc.core.tables import SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.metrics.conventions import OCC3D, OPENOCCUPANCY
 from carlasc.metrics.grids import GridFrames, LabelFolder
 
 OCC3D_SPEC = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
 OPENOCCUPANCY_SPEC = GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0))
+KITTI_SPEC = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
 _LABELS = (
     "semantics",
     "pred",
@@ -57,7 +60,7 @@ class TokenFrames(GridFrames):
 class Occ3dScene(TokenFrames):
     """A scene of Occ3D-nuScenes: `{scene}/{token}/labels.npz`."""
 
-    spec, classes = OCC3D_SPEC, OCC3D
+    spec, classes, benchmark = OCC3D_SPEC, OCC3D, "occ3d-lidar"
 
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
         """Return (200, 200, 16) labels."""
@@ -80,7 +83,7 @@ class Occ3dScene(TokenFrames):
 class OpenOccupancyScene(TokenFrames):
     """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy`, rows z, y, x, ..., class of occupied voxels."""
 
-    spec, classes = OPENOCCUPANCY_SPEC, OPENOCCUPANCY
+    spec, classes, benchmark = OPENOCCUPANCY_SPEC, OPENOCCUPANCY, "openoccupancy"
 
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
         """Return (512, 512, 40) labels; a stored 0 is noise, 255 here."""
@@ -107,6 +110,24 @@ class OpenOccupancyScene(TokenFrames):
         return None
 
 
+class KittiFolder(LabelFolder):
+    """A folder of SemanticKITTI or SSCBench: `.label` files of raw ids, uint16, and masks.
+
+    The geometry is known if the files have the size of the benchmarks' grid.
+    """
+
+    classes: ClassTable | None = SEMANTICKITTI
+    _width = 2
+
+    def __init__(self, folder: Path, path: str, benchmark: str) -> None:
+        super().__init__(folder, path)
+        self.benchmark = benchmark
+        if self.voxels is None and len(frames := self.frames()):
+            self.voxels = self._file(int(frames[0]), ".label").stat().st_size // self._width
+        if self.voxels == KITTI_SPEC.num_voxels:
+            self.spec = KITTI_SPEC
+
+
 def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
     """Yield the grids of a folder in the layout of another benchmark; nothing if it has none of these layouts."""
     for scene in sorted(path for path in folder.glob("*") if path.is_dir()):
@@ -116,10 +137,10 @@ def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "t
             yield OpenOccupancyScene(scene, scene.name, files)
     if (folder / "gts").is_dir():
         yield from foreign_grids(folder / "gts", grid, role)
-    if (sequences := folder / "sequences").is_dir():
-        name = grid or {"prediction": "predictions", "truth": "voxels"}[role]
-        for sequence in sorted(sequences.glob(f"*/{name}")):
-            grids = LabelFolder(sequence, sequence.parent.name)
+    name = grid or {"prediction": "predictions", "truth": "voxels"}[role]
+    for pattern, benchmark in ((f"sequences/*/{name}", "semantickitti"), (f"data_2d_raw/*/{name}", "sscbench")):
+        for sequence in sorted(path for path in folder.glob(pattern) if path.is_dir()):
+            grids = KittiFolder(sequence, sequence.parent.name, benchmark)
             if len(grids.frames()):
                 yield grids
 

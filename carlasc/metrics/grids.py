@@ -27,12 +27,14 @@ class GridFrames(ABC):
         location: name of the grid in errors.
         spec: its geometry; None if it is not known.
         classes: the class table of its ids; None if it is not known.
+        benchmark: the convention of the benchmark whose files these are; None for others.
     """
 
     path: str
     location: str
     spec: GridSpec | None
     classes: ClassTable | None
+    benchmark: str | None = None
 
     @abstractmethod
     def frames(self) -> NDArray[np.int64]:
@@ -85,14 +87,16 @@ class LabelFolder(GridFrames):
     """A folder of `000000.label` files without params.json, as other tools write it.
 
     The same folder may hold counts (`000000.bin`, float32), or SemanticKITTI's or SSCBench's masks (`000000.invalid`, one bit or one byte per
-    voxel). Labels are uint32, as in the layout, or uint16, as in these benchmarks: the number of voxels tells.
+    voxel). Labels are uint32, as in the layout, or uint16, as in these benchmarks: the number of voxels tells. The `000000.bin` of these
+    benchmarks holds the occupancy of a scan, in bits: its size tells that it is no file of counts.
 
     Attributes:
         voxels: number of voxels per frame; None if it is not known.
     """
 
-    spec = None
-    classes = None
+    spec: GridSpec | None = None
+    classes: ClassTable | None = None
+    _width = 4  # bytes of a label where the number of voxels is not known
 
     def __init__(self, folder: Path, path: str = "") -> None:
         self.folder, self.path, self.location = folder, path, str(folder)
@@ -100,7 +104,7 @@ class LabelFolder(GridFrames):
 
     def _count_voxels(self, frame: int) -> int | None:
         """Return the number of voxels by the sizes of a frame's files; None if only labels exist."""
-        if (counts := self._file(frame, ".bin")).is_file():
+        if (counts := self._counts(frame)) is not None:
             return counts.stat().st_size // 4
         if (invalid := self._file(frame, ".invalid")).is_file():
             size = invalid.stat().st_size
@@ -108,11 +112,18 @@ class LabelFolder(GridFrames):
             return size * _BITS if packed else size
         return None
 
+    def _counts(self, frame: int) -> Path | None:
+        """Return the file of a frame's counts, which have four bytes per voxel; None if there is none."""
+        counts, labels = self._file(frame, ".bin"), self._file(frame, ".label")
+        if not counts.is_file() or self._file(frame, ".invalid").is_file():
+            return None
+        return counts if counts.stat().st_size >= labels.stat().st_size else None
+
     def follow(self, truth: GridFrames) -> None:
         """Take the number of voxels from the ground truth."""
         if truth.spec is not None:
             self.voxels = truth.spec.num_voxels
-        elif isinstance(truth, LabelFolder):
+        elif isinstance(truth, LabelFolder) and truth.voxels is not None:
             self.voxels = truth.voxels
 
     @cached_property
@@ -133,9 +144,11 @@ class LabelFolder(GridFrames):
         path = self._file(frame, ".label")
         size = path.stat().st_size
         types: dict[float, np.dtype[np.unsignedinteger]] = {2: np.dtype("<u2"), 4: np.dtype("<u4")}
-        width = 4 if self.voxels is None else size / max(self.voxels, 1)
+        width = self._width if self.voxels is None else size / max(self.voxels, 1)
         if width not in types or size % width:
-            expected = "labels of 4 bytes" if self.voxels is None else f"{self.voxels} labels of 2 or 4 bytes"
+            expected = (
+                f"labels of {self._width} bytes" if self.voxels is None else f"{self.voxels} labels of 2 or 4 bytes"
+            )
             raise FormatError(
                 path,
                 expected=expected,
@@ -145,14 +158,25 @@ class LabelFolder(GridFrames):
         return np.fromfile(path, types[width])
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X * Y * Z,) which voxels have votes, or are not invalid; None if there is no such file."""
+        """Return (X * Y * Z,) which voxels have votes, or are not invalid; None if there is no such file.
+
+        Raises:
+            FormatError: the file does not have the size of a grid.
+        """
         if seen_by == "camera":
             return None
-        if (counts := self._file(frame, ".bin")).is_file():
+        if (counts := self._counts(frame)) is not None:
             return np.fromfile(counts, "<f4") > 0
         if (invalid := self._file(frame, ".invalid")).is_file():
             found = np.fromfile(invalid, np.uint8)
-            return (found if found.size == self.voxels else np.unpackbits(found)) == 0
+            if self.voxels is not None and found.size not in (self.voxels, -(-self.voxels // _BITS)):
+                raise FormatError(
+                    invalid,
+                    expected=f"{self.voxels} bytes, or {-(-self.voxels // _BITS)} of packed bits",
+                    found=str(found.size),
+                    advice="the file is truncated, or of another grid",
+                )
+            return (found if found.size == self.voxels else np.unpackbits(found, count=self.voxels)) == 0
         return None
 
     def _file(self, frame: int, suffix: str) -> Path:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.errors import FormatError
-from carlasc.metrics import evaluate
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.metrics import distance_band, evaluate
 
 
 def write_occ3d(root, seed, keep=1.0, name="semantics", masks=True):
@@ -138,4 +138,95 @@ def test_a_truncated_label_file_is_named(tmp_path):
     result = evaluate(tmp_path / "b", tmp_path / "a", convention="semantickitti")
     assert "expected 64 labels of 2 or 4 bytes, found 126 bytes" in result.failures[0][1]
     with pytest.raises(FormatError, match="has a map for"):
-        evaluate(tmp_path / "a", tmp_path / "a", convention="occ3d-lidar", source_classes="semantickitti")
+        evaluate(tmp_path / "a", tmp_path / "a", convention="occ3d-lidar", source_classes="semanticposs")
+
+
+def write_kitti(root, rng, shape=(256, 256, 32), folders=("voxels", "predictions"), parent="sequences/08"):
+    """One frame in the files of SemanticKITTI; returns the true labels, the prediction and the invalid voxels."""
+    truth = rng.choice([0, 10, 40, 50, 52, 99], shape, p=[0.9, 0.02, 0.05, 0.01, 0.01, 0.01]).astype("<u2")
+    prediction = np.where(rng.random(shape) < 0.9, np.where(np.isin(truth, (52, 99)), 50, truth), 40).astype("<u2")
+    invalid = (rng.random(shape) < 0.3) & (truth == 0)
+    for folder, labels in zip(folders, (truth, prediction), strict=True):
+        (root / parent / folder).mkdir(parents=True, exist_ok=True)
+        labels.tofile(root / parent / folder / "000000.label")
+    (root / parent / "voxels" / "000000.invalid").write_bytes(np.packbits(invalid).tobytes())
+    (root / parent / "voxels" / "000000.occluded").write_bytes(np.packbits(truth > 0).tobytes())
+    (root / parent / "voxels" / "000000.bin").write_bytes(np.packbits(truth > 0).tobytes())  # occupancy, no counts
+    return truth, prediction, invalid
+
+
+def official_ious(truth, prediction, invalid):
+    """The scores of the benchmark's script: raw ids by its table, ignored classes and invalid voxels masked, class 0 empty."""
+    learning = {0: 0, 52: 255, 99: 255, 10: 1, 40: 9, 50: 13}
+    table = np.zeros(300, int)
+    table[list(learning)] = list(learning.values())
+    true, pred = table[truth], table[prediction]
+    mask = (true != 255) & ~invalid
+    ious = {}
+    for name, c in (("car", 1), ("road", 9), ("building", 13)):
+        a, b = pred[mask] == c, true[mask] == c
+        ious[name] = (a & b).sum() / (a | b).sum()
+    completion = ((pred[mask] > 0) & (true[mask] > 0)).sum() / ((pred[mask] > 0) | (true[mask] > 0)).sum()
+    return ious, completion
+
+
+def test_files_of_semantickitti_are_read_as_they_are(tmp_path):
+    truth, prediction, invalid = write_kitti(tmp_path, np.random.default_rng(1))
+    result = evaluate(tmp_path, tmp_path)
+    ious, completion = official_ious(truth, prediction, invalid)
+    assert result.convention.name == "semantickitti"
+    assert {name: result.class_iou[name] for name in ious} == pytest.approx(ious)
+    assert result.score.iou == pytest.approx(completion)
+
+
+def test_the_geometry_of_semantickitti_is_known(tmp_path):
+    truth, prediction, invalid = write_kitti(tmp_path, np.random.default_rng(2))
+    near = evaluate(tmp_path, tmp_path, region=lambda spec: distance_band(spec, 0, 10))
+    x, y = np.meshgrid((np.arange(256) + 0.5) * 0.2, (np.arange(256) + 0.5) * 0.2 - 25.6, indexing="ij")
+    beyond = np.broadcast_to((np.hypot(x, y) >= 10)[:, :, None], truth.shape)
+    ious, _ = official_ious(truth, prediction, invalid | beyond)
+    assert {name: near.class_iou[name] for name in ious} == pytest.approx(ious)
+
+
+def test_predictions_and_truth_of_semantickitti_may_be_in_two_places(tmp_path):
+    write_kitti(tmp_path / "all", np.random.default_rng(3))
+    (tmp_path / "ours" / "sequences" / "08").mkdir(parents=True)
+    (tmp_path / "all" / "sequences" / "08" / "predictions").rename(
+        tmp_path / "ours" / "sequences" / "08" / "predictions"
+    )
+    assert evaluate(tmp_path / "ours", tmp_path / "all").frames == 1
+    with pytest.raises(MissingDataError):
+        evaluate(tmp_path / "all", tmp_path / "all")
+
+
+def test_labels_of_semantickitti_without_masks_have_two_bytes(tmp_path):
+    write_kitti(tmp_path, np.random.default_rng(4), shape=(16, 16, 4))
+    for suffix in ("invalid", "occluded", "bin"):
+        (tmp_path / "sequences" / "08" / "voxels" / f"000000.{suffix}").unlink()
+    result = evaluate(tmp_path, tmp_path, voxels="all")
+    truth = np.fromfile(tmp_path / "sequences" / "08" / "voxels" / "000000.label", "<u2")
+    assert result.matrix.total == np.isin(truth, (52, 99), invert=True).sum()
+
+
+def test_a_mask_that_is_cut_short_is_named(tmp_path):
+    write_kitti(tmp_path, np.random.default_rng(5), shape=(16, 16, 4))
+    mask = tmp_path / "sequences" / "08" / "voxels" / "000000.invalid"
+    second = mask.with_name("000001.invalid")
+    for folder in ("voxels", "predictions"):
+        first = tmp_path / "sequences" / "08" / folder / "000000.label"
+        first.with_name("000001.label").write_bytes(first.read_bytes())
+    second.write_bytes(mask.read_bytes()[:-3])
+    failures = dict(evaluate(tmp_path, tmp_path).failures)
+    assert "000001.invalid: expected 1024 bytes, or 128 of packed bits, found 125" in failures["08:1"]
+
+
+def test_drives_of_sscbench_are_found(tmp_path):
+    parent = "data_2d_raw/2013_05_28_drive_0009_sync"
+    write_kitti(tmp_path, np.random.default_rng(6), parent=parent)
+    folder = tmp_path / parent / "voxels"
+    invalid = np.unpackbits(np.fromfile(folder / "000000.invalid", np.uint8))
+    invalid.tofile(folder / "000000.invalid")  # one byte for each voxel
+    result = evaluate(tmp_path, tmp_path)
+    assert result.convention.name == "sscbench"
+    assert list(result.sequences) == ["2013_05_28_drive_0009_sync"]
+    assert result.matrix.total == (invalid == 0).sum()

@@ -1,0 +1,1 @@
+"""Exporters: sequences of the layout as the files of other data sets."""

@@ -1,0 +1,203 @@
+"""Sequences of the layout as SemanticKITTI's files: see the format page, `docs/format.md#semantickitti`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import storage
+from carlasc.converting import VOXEL_FILES, Files, FrameExporter, mirror_grid, mirror_poses, mirror_spec
+from carlasc.core.classes import ClassTable
+from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
+from carlasc.errors import MissingDataError
+from carlasc.storage import layout
+from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
+from carlasc_converters.exporters.grids import choose_grid, read_points, scan_occupancy
+from carlasc_converters.exporters.occlusion import occluded_voxels
+from carlasc_converters.kitti_voxels import MASKS, pack_bits
+
+_NAMES_OF_11 = "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
+TO_RAW: Mapping[str, Mapping[int, int]] = {
+    "carla": REMAPS["carla_to_semantickitti"].mapping,
+    CARLASC11.name: dict(zip(CARLASC11.names, map(SEMANTICKITTI.id_of, _NAMES_OF_11.split()), strict=True)),
+    SEMANTICKITTI.name: {label: label for label in SEMANTICKITTI.names},
+    SEMANTICKITTI19.name: {label: SEMANTICKITTI.id_of(name) for label, name in SEMANTICKITTI19.names.items()},
+}
+"""Name of a class table -> id -> raw id of SemanticKITTI."""
+
+_FENCE, _BUILDING = 51, 50
+UNSCORED: Mapping[int, int] = {1: 0, 52: _BUILDING, 99: _BUILDING}
+"""Raw id that SemanticKITTI's evaluator does not accept in a prediction -> id that is written instead.
+
+Its table maps outlier, other-structure and other-object to no class. What is occupied stays occupied: other structures are nearest in kind
+to buildings, and of the classes, building is among those whose score a few voxels of other objects change least."""
+_WALL = 11  # CarlaSC's: other-structure in ground truth; a fence in predictions, as its paper's class Barrier
+TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
+    name: {label: UNSCORED.get(raw, raw) for label, raw in mapping.items()}
+    | ({_WALL: _FENCE} if name == "carla" else {})
+    for name, mapping in TO_RAW.items()
+}
+"""Name of a class table -> id -> raw id in a prediction: only ids that the evaluator scores, and 0."""
+_CALIBRATION = "".join(
+    f"{name}: {' '.join(f'{value:.12e}' for value in np.eye(4)[:3].ravel())}\n"
+    for name in ("P0", "P1", "P2", "P3", "Tr")
+)
+
+
+class KittiExporter(FrameExporter):
+    """Writes velodyne/, labels/, voxels/ or predictions/, poses.txt, calib.txt and times.txt.
+
+    Args:
+        grid: name of the grid that goes to voxels/ or predictions/; None takes the one of the smallest voxels.
+        predictions: whether grids are the output of a network. They then go to predictions/, where SemanticKITTI's evaluator reads
+            them, and nothing else is written.
+    """
+
+    title = "SemanticKITTI: sequences/NN/velodyne, labels, voxels or predictions"
+
+    def __init__(self, grid: str | None = None, *, predictions: bool = False) -> None:
+        self.grid, self.predictions = grid, predictions
+
+    @property
+    def product(self) -> str:
+        """Predictions lie beside the ground truth."""
+        return "predictions" if self.predictions else "data"
+
+    def folders(self, names: Sequence[str]) -> dict[str, str]:
+        """Return sequences/NN for each name: 08 for KITTI_08, and the next free number for other names."""
+        numbers = {name: match[1] for name in names if (match := re.search(r"KITTI_(\d\d)$", name))}
+        free = (f"{number:02d}" for number in range(10_000) if f"{number:02d}" not in numbers.values())
+        return {name: f"sequences/{numbers.get(name) or next(free)}" for name in names}
+
+    def check(self, sequence: storage.Sequence) -> list[str]:
+        """Check the grid and the classes."""
+        if "labels" in sequence.fields() and not self.predictions:
+            self._mapping(sequence.metadata.classes, sequence.location)
+        if sequence.grids or self.grid or self.predictions:
+            name = self._grid_of(sequence)
+            self._mapping(sequence.classes_of(name), f"{sequence.location}/{name}")
+        return []
+
+    def frames(self, sequence: storage.Sequence) -> list[int]:
+        """Return all frames, or those with a prediction."""
+        if self.predictions:
+            return sequence.frames(f"{self._grid_of(sequence)}/labels").tolist()
+        return super().frames(sequence)
+
+    def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
+        """Return poses, calibration and times. The poses are those of the LiDAR, and Tr is the identity."""
+        if self.predictions:
+            return {}
+        documents = {}
+        if layout.POSES in sequence.documents():
+            documents["poses.txt"] = layout.encode_poses(
+                sequence.poses if _is_right_handed(sequence) else mirror_poses(sequence.poses)
+            )
+            documents["calib.txt"] = _CALIBRATION.encode()
+        if layout.TIMES in sequence.documents():
+            documents["times.txt"] = layout.encode_times(sequence.times)
+        return documents
+
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
+        """Return the files of a frame: its scan, labels and voxels, or its prediction."""
+        if self.predictions:
+            return (f"predictions/{frame:06d}.label",)
+        names = [f"velodyne/{frame:06d}.bin"] if frame in sequence.frames("points") else []
+        names += [f"labels/{frame:06d}.label"] if frame in sequence.frames("labels") else []
+        if sequence.grids and frame in sequence.frames(f"{self._grid_of(sequence)}/labels"):
+            names += [f"voxels/{frame:06d}{suffix}" for suffix in (".label", *MASKS)]
+        return tuple(names)
+
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
+        """Return the frame's files."""
+        made: dict[str, bytes | memoryview] = {}
+        wanted = self.frame_files(sequence, frame)
+        points = np.empty((0, 4), np.float32) if self.predictions else read_points(sequence, frame)
+        if f"velodyne/{frame:06d}.bin" in wanted:
+            made[f"velodyne/{frame:06d}.bin"] = points.astype("<f4").tobytes()
+        if f"labels/{frame:06d}.label" in wanted:
+            where = f"{sequence.location}: labels of frame {frame}"
+            labels = self._raw_ids(sequence.metadata.classes, sequence.read("labels", frame), where)
+            made[f"labels/{frame:06d}.label"] = labels.astype("<u4").tobytes()
+        if f"predictions/{frame:06d}.label" in wanted:
+            made[f"predictions/{frame:06d}.label"] = self._labels(sequence, frame).astype("<u2").tobytes()
+        if f"voxels/{frame:06d}.label" in wanted:
+            made |= self._voxels(sequence, frame, points)
+        return made
+
+    def _voxels(self, sequence: storage.Sequence, frame: int, points: NDArray[np.float32]) -> Mapping[str, bytes]:
+        """Return the original voxel files if they were kept, else files made from the grid."""
+        kept = _kept_files(sequence, frame) if self.grid is None else {}
+        if kept:
+            return {f"voxels/{name}": data for name, data in kept.items()}
+        name = self._grid_of(sequence)
+        labels, counts = self._labels(sequence, frame), self._counts(sequence, frame)
+        spec = sequence.grids[name]
+        spec = spec if _is_right_handed(sequence) else mirror_spec(spec)
+        files = {
+            ".label": labels.astype("<u2").tobytes(),
+            ".invalid": pack_bits(counts == 0),
+            ".occluded": pack_bits(occluded_voxels(labels > 0, spec)),
+            ".bin": pack_bits(scan_occupancy(sequence, points, spec)),
+        }
+        return {f"voxels/{frame:06d}{suffix}": data for suffix, data in files.items()}
+
+    def _labels(self, sequence: storage.Sequence, frame: int) -> NDArray[np.integer]:
+        """Return (X, Y, Z) ids of SemanticKITTI, right-handed."""
+        name = self._grid_of(sequence)
+        where = f"{sequence.location}: {name} of frame {frame}"
+        labels = self._raw_ids(sequence.classes_of(name), sequence.read(f"{name}/labels", frame), where)
+        return labels if _is_right_handed(sequence) else mirror_grid(labels)
+
+    def _counts(self, sequence: storage.Sequence, frame: int) -> NDArray[np.floating]:
+        name = self._grid_of(sequence)
+        if frame not in sequence.frames(f"{name}/counts"):
+            raise MissingDataError(
+                f"{sequence.location}/{name}",
+                expected=f"counts of frame {frame}, which say which voxels are known",
+                found="none",
+                advice="if the grids are predictions, give `predictions=True`",
+            )
+        counts = np.asarray(sequence.read(f"{name}/counts", frame))
+        return counts if _is_right_handed(sequence) else mirror_grid(counts)
+
+    def _grid_of(self, sequence: storage.Sequence) -> str:
+        """Return the grid to export.
+
+        Raises:
+            MissingDataError: the sequence has no Cartesian grid, or none of that name.
+            ArgumentError: the grid of that name is not Cartesian.
+        """
+        return choose_grid(sequence, sequence.grids, self.grid)
+
+    def _mapping(self, classes: ClassTable, where: str) -> dict[int, int]:
+        """Return the map from the ids of a class table to SemanticKITTI's; raise if there is none."""
+        if not self.predictions:
+            return mapping_of(TO_RAW, "raw", classes, where)
+        return {label: UNSCORED.get(raw, raw) for label, raw in mapping_of(TO_PREDICTED, "raw", classes, where).items()}
+
+    def _raw_ids(self, classes: ClassTable, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.int32]:
+        """Map class ids to SemanticKITTI's.
+
+        Raises:
+            FormatError: an id is not in the table, or nothing maps the table to SemanticKITTI's classes.
+        """
+        return classes_of(labels, lookup_of(self._mapping(classes, where)), classes, where)
+
+
+def _kept_files(sequence: storage.Sequence, frame: int) -> dict[str, bytes]:
+    """Return the original voxel files that `convert` kept."""
+    kept = {}
+    for suffix in (".label", *MASKS):
+        try:
+            kept[f"{frame:06d}{suffix}"] = sequence.read_document(f"{VOXEL_FILES}/{frame:06d}{suffix}")
+        except (MissingDataError, FileNotFoundError):
+            continue
+    return kept
+
+
+def _is_right_handed(sequence: storage.Sequence) -> bool:
+    return sequence.metadata.axes == "right"

@@ -1,0 +1,142 @@
+"""Sequences of the layout as the files of Occ3D-nuScenes: `gts/{scene}/{token}/labels.npz` and annotations.json.
+
+The facts are those of the benchmark's own description and loaders. nuScenes has tokens; here they are made from the name of the sequence
+and the number of the frame.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlasc import storage
+from carlasc.converting import Exported, Files, TargetFrame, mirror_poses
+from carlasc.core.benchmarks import TO_OCC3D
+from carlasc.core.geometry import quaternions_of, translation
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError
+from carlasc.storage import layout
+from carlasc_converters.exporters.grids import GridExporter, sensor_height
+
+_ANNOTATIONS = "annotations.json"
+_SPLITS = {"Train": "train_split", "Val": "val_split", "Test": "test_split"}
+
+
+def scene_token(name: str) -> str:
+    """Return a token of 32 hexadecimal digits for a sequence."""
+    return blake2b(name.encode(), digest_size=16).hexdigest()
+
+
+def frame_token(name: str, frame: int) -> str:
+    """Return a token for a frame of a sequence. Tokens of a sequence sort as its frames do."""
+    return f"{blake2b(name.encode(), digest_size=13).hexdigest()}{frame:06d}"
+
+
+class Occ3dExporter(GridExporter):
+    """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle, with the origin on the ground.
+
+    Args:
+        grid: as for every exporter of grids.
+        predictions: as for every exporter of grids.
+        height_m: height of the sensor above the ground, metres. None takes that of carlasc.json, else 1.8, as in CarlaSC.
+    """
+
+    title = "Occ3D-nuScenes: gts/SCENE/TOKEN/labels.npz and annotations.json"
+    target = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
+    maps = TO_OCC3D
+    free = 17
+    slug = "occ3d"
+
+    def __init__(self, grid: str | None = None, *, predictions: bool = False, height_m: float | None = None) -> None:
+        super().__init__(grid, predictions=predictions)
+        self.height_m = height_m
+
+    def frame_of(self, sequence: storage.Sequence) -> TargetFrame:
+        """Return the frame of the vehicle, whose origin is on the ground below the sensor."""
+        return TargetFrame(sensor_height(sequence, self.height_m)[0])
+
+    def check(self, sequence: storage.Sequence) -> list[str]:
+        """Return what resampling loses, and what is assumed."""
+        notes = []
+        height, assumed = sensor_height(sequence, self.height_m)
+        if assumed:
+            notes.append(f"the height of the sensor is not known, and taken to be {height:g} m: `height_m` sets it")
+        if layout.POSES not in sequence.documents():
+            notes.append(f"{sequence.location} has no poses: annotations.json has none either")
+        return notes + super().check(sequence)
+
+    def folders(self, names: Sequence[str]) -> dict[str, str]:
+        """Return gts/NAME for each name."""
+        return {name: f"gts/{name}" for name in names}
+
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
+        """Return the labels of a frame."""
+        return (f"{frame_token(sequence.name, frame)}/labels.npz",)
+
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
+        """Return semantics and masks. There are no cameras: what the LiDAR observed counts as observed by them too."""
+        labels, known = self.read(sequence, frame)
+        semantics, mask = np.where(known, labels, self.free).astype(np.uint8), known.astype(np.uint8)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, semantics=semantics, mask_lidar=mask, mask_camera=mask)
+        return {self.frame_files(sequence, frame)[0]: buffer.getbuffer()}
+
+    def index(self, root: Path, exported: Sequence[Exported]) -> Files:
+        """Return annotations.json, with the scenes that are in it already."""
+        path = root / _ANNOTATIONS
+        annotations = _read_annotations(path) if path.is_file() else {}
+        scenes = annotations.get("scene_infos", {})
+        splits = {key: set(annotations.get(key, ())) for key in _SPLITS.values()}
+        for part in exported:
+            for key, names in splits.items():
+                names.discard(part.sequence.name)
+                if _SPLITS.get(part.sequence.split or "") == key:
+                    names.add(part.sequence.name)
+            scenes[part.sequence.name] = self._scene(part)
+        lists = {key: sorted(names) for key, names in splits.items() if names or key != "test_split"}
+        content = lists | {"scene_infos": {name: scenes[name] for name in sorted(scenes)}}
+        return {_ANNOTATIONS: json.dumps(content, indent=1).encode()}
+
+    def _scene(self, part: Exported) -> dict[str, Any]:
+        sequence, place = part.sequence, self.frame_of(part.sequence)
+        tokens = ["", *(frame_token(sequence.name, frame) for frame in part.frames), ""]
+        documents = sequence.documents()
+        scene = {}
+        for before, frame, token, after in zip(tokens[:-2], part.frames, tokens[1:-1], tokens[2:], strict=True):
+            seconds = sequence.read_time(frame) if layout.TIMES in documents else frame * layout.FRAME_PERIOD_S
+            scene[token] = {
+                "timestamp": str(round(seconds * 1e6)),
+                "camera_sensor": {},
+                "ego_pose": _pose(sequence, frame, place) if layout.POSES in documents else None,
+                "gt_path": f"{part.folder}/{token}/labels.npz",
+                "prev": before,
+                "next": after,
+            }
+        return scene
+
+
+def _pose(sequence: storage.Sequence, frame: int, place: TargetFrame) -> dict[str, list[float]]:
+    """Return the pose of the vehicle in the frame of the vehicle at the first scan, right-handed."""
+    first_T_scan = sequence.read_pose(frame)
+    if sequence.metadata.axes == "left":
+        first_T_scan = mirror_poses(first_T_scan)
+    vehicle_T_scan = translation((0.0, 0.0, place.height_m))
+    scan_T_vehicle = translation((0.0, 0.0, -place.height_m))
+    pose = vehicle_T_scan @ first_T_scan @ scan_T_vehicle
+    return {"translation": pose[:3, 3].tolist(), "rotation": quaternions_of(pose[None, :3, :3])[0].tolist()}
+
+
+def _read_annotations(path: Path) -> dict[str, Any]:
+    try:
+        annotations = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise FormatError(path, expected="JSON", found="something else", advice=str(error)) from error
+    if not isinstance(annotations, dict):
+        raise FormatError(path, expected="a JSON object", found=type(annotations).__name__)
+    return annotations

@@ -1,0 +1,279 @@
+"""Sequences of the layout as the files of OpenSceneFlow: one HDF5 file per log, with a group per scan, and `index_total.pkl`.
+
+The pickled index is written, because the loader of the other project needs it. No pickle is ever read here.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import storage
+from carlasc.converting import (
+    Exported,
+    Files,
+    SequenceExporter,
+    SequenceFile,
+    mirror_boxes,
+    mirror_points,
+    mirror_poses,
+)
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.tables import SEMANTICKITTI
+from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.motion import ground_points
+from carlasc.storage import layout
+from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
+
+_INDEX = "index_total.pkl"
+_PROTOCOL = 4  # of the pickle: fixed, so that the bytes do not depend on the version of Python
+
+# Argoverse 2's categories in alphabetical order, from 1; 0 is none.
+_BICYCLE, _BICYCLIST, _BUS, _LARGE_VEHICLE, _MOTORCYCLE, _MOTORCYCLIST = 3, 4, 7, 11, 14, 15
+_PEDESTRIAN, _RAILED_VEHICLE, _REGULAR_VEHICLE, _TRUCK = 17, 18, 19, 25
+_KITTI = {
+    10: _REGULAR_VEHICLE, 11: _BICYCLE, 13: _BUS, 15: _MOTORCYCLE, 16: _RAILED_VEHICLE, 18: _TRUCK, 20: _LARGE_VEHICLE, 30: _PEDESTRIAN,
+    31: _BICYCLIST, 32: _MOTORCYCLIST, 252: _REGULAR_VEHICLE, 253: _BICYCLIST, 254: _PEDESTRIAN, 255: _MOTORCYCLIST, 256: _RAILED_VEHICLE,
+    257: _BUS, 258: _TRUCK, 259: _LARGE_VEHICLE,
+}  # fmt: skip
+_CARLA = {4: _PEDESTRIAN, 10: _REGULAR_VEHICLE}
+CATEGORIES: Mapping[str, Mapping[int, int]] = {
+    "carla": {label: _CARLA.get(label, 0) for label in range(25)},
+    "carlasc11": {label: _CARLA.get(label, 0) for label in range(11)},
+    SEMANTICKITTI.name: {label: _KITTI.get(label, 0) for label in SEMANTICKITTI.names},
+    "argoverse2": {label: label if label <= 30 else 0 for label in range(33)},  # its converter numbers them so
+}
+"""Name of a class table -> id -> category of Argoverse 2."""
+
+
+class OpenSceneFlowExporter(SequenceExporter):
+    """Writes scans, poses and scene flow. Points have right-handed axes and their origin at the sensor."""
+
+    title = "OpenSceneFlow: SPLIT/LOG.h5 and SPLIT/index_total.pkl"
+
+    def folders(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the root for each name: the split is in the name of the file."""
+        return dict.fromkeys(names, ".")
+
+    def file(self, sequence: storage.Sequence) -> str:
+        """Return SPLIT/LOG.h5. The loader takes the name up to the first dot for that of the log."""
+        split = "" if sequence.split is None else f"{sequence.split.lower()}/"
+        return f"{split}{sequence.name.replace('.', '_') or 'log'}.h5"
+
+    def check(self, sequence: storage.Sequence) -> list[str]:
+        """Check that there are scans, poses, and something that tells of motion."""
+        import_extra("h5py", "hdf5")
+        fields = sequence.fields()
+        wanted = {
+            "scans": "points" in fields,
+            layout.POSES: layout.POSES in sequence.documents(),
+            "flow or boxes, which say how objects move": bool(fields & {"flow", "boxes"}),
+        }
+        for expected, found in wanted.items():
+            if not found:
+                raise MissingDataError(sequence.location, expected=expected, found="none")
+        notes = []
+        if "labels" not in fields:
+            notes.append(f"{sequence.location} has no labels: the ground is found by the shape of each scan")
+        else:
+            mapping_of(CATEGORIES, "category", sequence.metadata.classes, sequence.location)
+        if layout.TIMES not in sequence.documents():
+            notes.append(f"{sequence.location} has no times: {layout.FRAME_PERIOD_S} s a frame are assumed")
+        self._timestamps(sequence)
+        return notes
+
+    def open(self, path: Path, sequence: storage.Sequence) -> SequenceFile:
+        """Open a new HDF5 file."""
+        return _LogFile(path, self._timestamps(sequence))
+
+    def frames_in(self, path: Path, sequence: storage.Sequence) -> list[int]:
+        """Return the frames that a file has a group for."""
+        groups = set(_timestamps_in(path))
+        return [frame for frame, timestamp in self._timestamps(sequence).items() if timestamp in groups]
+
+    def index(self, root: Path, exported: Sequence[Exported]) -> Files:
+        """Return the index of each folder that was written to, with the logs that were in it already."""
+        folders = {(root / self.file(part.sequence)).parent for part in exported}
+        made: dict[str, bytes] = {}
+        for folder in sorted(folders):
+            entries = [[path.stem, time] for path in sorted(folder.glob("*.h5")) for time in _timestamps_in(path)]
+            made[(folder / _INDEX).relative_to(root).as_posix()] = pickle.dumps(entries, _PROTOCOL)
+        return made
+
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a scan; those of flow only if another scan follows."""
+        left = sequence.metadata.axes == "left"
+        fields = [name for name in ("labels", "instances", "flow", "seconds", "sensor") if _has(sequence, name, frame)]
+        read = {name: sequence.read(name, frame) for name in fields}
+        points = np.asarray(sequence.read("points", frame)[:, :3], np.float32)
+        for name, array in read.items():
+            if len(array) != len(points):
+                where = f"{sequence.location}: {name} of frame {frame}"
+                raise FormatError(where, expected=f"{len(points)} rows, as points", found=str(len(array)))
+        points = mirror_points(points) if left else points
+        pose = _pose(sequence, frame)
+        made: dict[str, NDArray[Any]] = {
+            "lidar": points,
+            "lidar_id": read["sensor"].astype(np.uint8) if "sensor" in read else np.zeros(len(points), np.uint8),
+            "pose": pose,
+        }
+        if "seconds" in read:
+            made["lidar_dt"] = read["seconds"].astype(np.float32)
+        table = sequence.metadata.classes
+        if "labels" in read:
+            where = f"{sequence.location}: labels of frame {frame}"
+            lookup = lookup_of(mapping_of(CATEGORIES, "category", table, where))
+            made["flow_category_indices"] = classes_of(read["labels"], lookup, table, where).astype(np.uint8)
+            made["ground_mask"] = np.isin(read["labels"], sorted(table.ground))
+        else:
+            made["ground_mask"] = ground_points(points)
+        if "instances" in read:
+            made["flow_instance_id"] = read["instances"]
+        following = _next(sequence, frame)
+        if following is not None:
+            flow = read.get("flow")
+            velocity = None if flow is None else mirror_points(flow) if left else flow
+            now, later = (_boxes(sequence, number) for number in (frame, following))
+            step = _Step(
+                invert(_pose(sequence, following)) @ pose, _seconds(sequence, following) - _seconds(sequence, frame)
+            )
+            made |= step.flow(points, velocity, read.get("instances"), now, later)
+        return made
+
+    def _timestamps(self, sequence: storage.Sequence) -> dict[int, str]:
+        """Return the name of each frame's group: nanoseconds since the first scan.
+
+        Raises:
+            FormatError: times do not increase.
+        """
+        frames = self.frames(sequence)
+        times = [round(_seconds(sequence, frame) * 1e9) for frame in frames]
+        for before, after, frame in zip(times, times[1:], frames[1:], strict=False):
+            if after <= before:
+                where = f"{sequence.location}/{layout.TIMES}"
+                raise FormatError(where, expected="times that increase", found=f"{after / 1e9:g} s at frame {frame}")
+        return dict(zip(frames, map(str, times), strict=True))
+
+
+class _Step:
+    """From a scan to the next one."""
+
+    def __init__(self, next_T_now: Transform, seconds: float) -> None:
+        self.next_T_now, self.seconds = next_T_now, seconds
+
+    def flow(
+        self,
+        points: NDArray[np.float32],
+        velocity: NDArray[np.float32] | None,
+        instances: NDArray[np.unsignedinteger] | None,
+        now: Boxes | None,
+        later: Boxes | None,
+    ) -> dict[str, NDArray[Any]]:
+        """Return where points are in the next scan's frame, less where they are now, and for which of them this is known.
+
+        An object that has boxes in both scans moves as its box does; its points are not valid where its box vanishes. Other points move
+        by their velocity. Without velocities, points outside boxes stand, and nothing is known of scans that were not annotated.
+        """
+        moved = points.astype(np.float64) if velocity is None else points + velocity.astype(np.float64) * self.seconds
+        there = transform_points(self.next_T_now, moved)
+        valid = np.full(len(points), velocity is not None or (now is not None and later is not None))
+        if now is not None and later is not None:
+            owners = _owners(now, points) if instances is None else instances
+            rows = {int(track): row for row, track in enumerate(later.tracks)}
+            for track, now_T_box in zip(now.tracks.tolist(), now.sensor_T_box, strict=True):
+                of_it = owners == track
+                if track not in rows:
+                    valid[of_it] = False
+                elif of_it.any():
+                    next_T_box = later.sensor_T_box[rows[track]]
+                    there[of_it] = transform_points(next_T_box @ invert(now_T_box), points[of_it])
+        return {
+            "flow": (there - points).astype(np.float32),
+            "flow_is_valid": valid,
+            "ego_motion": self.next_T_now,
+        }
+
+
+class _LogFile(SequenceFile):
+    """An HDF5 file that is being written. Objects are numbered from 1 in the order in which they appear, because numbers have 16 bits."""
+
+    def __init__(self, path: Path, timestamps: Mapping[int, str]) -> None:
+        self._file = import_extra("h5py", "hdf5").File(path, "w")
+        self._path, self._timestamps, self._numbers = path, timestamps, {0: 0}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def add(self, frame: int, content: Mapping[str, NDArray[Any]]) -> None:
+        """Write the group of a scan."""
+        arrays = dict(content)
+        if "flow_instance_id" in arrays:
+            arrays["flow_instance_id"] = self._number(arrays["flow_instance_id"])
+        group = self._file.create_group(self._timestamps[frame])
+        for name, array in arrays.items():
+            group.create_dataset(name, data=array)
+
+    def _number(self, instances: NDArray[np.unsignedinteger]) -> NDArray[np.int16]:
+        found = np.unique(instances)
+        for instance in found.tolist():
+            self._numbers.setdefault(instance, len(self._numbers))
+        if len(self._numbers) > np.iinfo(np.int16).max + 1:
+            raise FormatError(self._path, expected="at most 32767 objects", found=str(len(self._numbers) - 1))
+        return np.array([self._numbers[instance] for instance in found.tolist()], np.int16)[
+            np.searchsorted(found, instances)
+        ]
+
+
+def _owners(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Return (N,) the track of the box that each point is in, 0 for none."""
+    rows = boxes.owners(points)
+    return np.append(boxes.tracks, np.uint32(0))[rows]
+
+
+def _timestamps_in(path: Path) -> list[str]:
+    try:
+        with import_extra("h5py", "hdf5").File(path, "r") as file:
+            return sorted(file, key=int)
+    except (OSError, ValueError) as error:
+        advice = "remove the file, or export again with `overwrite=True`"
+        raise FormatError(path, expected="an HDF5 file of scans", found="something else", advice=advice) from error
+
+
+def _has(sequence: storage.Sequence, field: str, frame: int) -> bool:
+    return field in sequence.fields() and bool(np.isin(frame, sequence.frames(field)))
+
+
+def _next(sequence: storage.Sequence, frame: int) -> int | None:
+    frames = sequence.frames("points")
+    place = int(np.searchsorted(frames, frame, "right"))
+    return int(frames[place]) if place < len(frames) else None
+
+
+def _pose(sequence: storage.Sequence, frame: int) -> Transform:
+    """Return first_T_scan of a frame, right-handed."""
+    pose = sequence.read_pose(frame)
+    return pose if sequence.metadata.axes == "right" else mirror_poses(pose)
+
+
+def _seconds(sequence: storage.Sequence, frame: int) -> float:
+    return sequence.read_time(frame) if layout.TIMES in sequence.documents() else frame * layout.FRAME_PERIOD_S
+
+
+def _boxes(sequence: storage.Sequence, frame: int) -> Boxes | None:
+    """Return a frame's boxes, right-handed; None if it was not annotated."""
+    if "boxes" not in sequence.fields():
+        return None
+    boxes = sequence.boxes(frame)
+    return boxes if boxes is None or sequence.metadata.axes == "right" else mirror_boxes(boxes)
