@@ -16,12 +16,15 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
+from carlasc_converters.exporters.kitti import TO_PREDICTED, TO_RAW
+from carlasc_converters.exporters.opensceneflow import CATEGORIES
 from typer.models import ArgumentInfo, ParameterInfo
 
 from carlasc import cli
+from carlasc.core.benchmarks import IGNORED, OCC3D, SSCBENCH, TO_OCC3D, TO_SSCBENCH
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA, REMAPS
+from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI
 from carlasc.metrics import CONVENTIONS
 from carlasc.storage import layout
 
@@ -185,6 +188,26 @@ def _conventions() -> str:
     return "\n".join(rows)
 
 
+def _exported_classes(table: ClassTable) -> str:
+    """Return what each class of a table becomes in the files of other data sets."""
+    columns = ("`kitti`", "`kitti --predictions`", "`occ3d`, `openoccupancy`", "`sscbench`", "`opensceneflow`")
+    rows = [f"| {table.name} | {' | '.join(columns)} |", f"|{'---|' * (len(columns) + 1)}"]
+    for index, name in table.names.items():
+        occ3d, sscbench = TO_OCC3D[table.name][index], TO_SSCBENCH[table.name][index]
+        cells = (
+            f"{index} {name}",
+            *(
+                f"{raw} {SEMANTICKITTI.names[raw]}"
+                for raw in (maps[table.name][index] for maps in (TO_RAW, TO_PREDICTED))
+            ),
+            "unknown" if occ3d == IGNORED else f"{occ3d} {OCC3D.names[occ3d]}",
+            "ignored" if sscbench == IGNORED else f"{sscbench} {SSCBENCH.names[sscbench]}",
+            CATEGORIES[table.name][index] or "",
+        )
+        rows.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(rows)
+
+
 def _swatch(table: ClassTable, index: int) -> str:
     color = "#{:02x}{:02x}{:02x}".format(*table.colors[index])
     return f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span>'
@@ -196,6 +219,8 @@ _TABLES: dict[str, Callable[[], str]] = {
     "classes": _classes,
     "remaps": _remaps,
     "conventions": _conventions,
+    "exported-classes": lambda: _exported_classes(CARLA),
+    "exported-classes-of-semantickitti": lambda: _exported_classes(SEMANTICKITTI),
 }
 
 
