@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,30 +14,47 @@ _CHUNK = 1 << 20  # characters read at a time
 _LONGEST_ROW = 4 * _CHUNK
 _GAP = re.compile(r"[\s,]*")
 _EXPECTED = "a JSON list of objects"
+_OTHER = "the file is damaged, or belongs to another version of the data set"
 _UNPACK = "the file may be cut short: unpack the archive of the tables again"
 
 
-def read_rows(path: Path, keys: tuple[str, ...]) -> Iterator[tuple[Any, ...]]:
+def read_rows(
+    path: Path, keys: tuple[str, ...], kinds: Mapping[str, type | int] | None = None
+) -> Iterator[tuple[Any, ...]]:
     """Yield the values of some keys of each row of a table: a JSON list of objects.
 
     Args:
         path: the file, in UTF-8.
         keys: keys that each object must have. Others are ignored.
+        kinds: the type of the value of a key, or a number for a list of so many numbers; text if a key is not in it.
 
     Yields:
         The values in the order of `keys`.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is not a list of objects, breaks off, or an object lacks a key.
+        FormatError: it is not a list of objects, breaks off, or an object lacks a key or has another value than it must.
     """
+    wanted = [(kinds or {}).get(key, str) for key in keys]
     for number, row in enumerate(_objects(path)):
         try:
-            yield tuple(row[key] for key in keys)
+            values = tuple(row[key] for key in keys)
+            for key, value, kind in zip(keys, values, wanted, strict=True):
+                if not _is_of(value, kind):
+                    name = f"a list of {kind} numbers" if isinstance(kind, int) else f"a value of type {kind.__name__}"
+                    found = f"{str(value)[:40]!r} in row {number}"
+                    raise FormatError(path, expected=f"{name} under {key!r}", found=found, advice=_OTHER)
+            yield values
         except KeyError as error:
             found = f"{', '.join(row)} in row {number}"
-            advice = "the file belongs to another version of the data set"
-            raise FormatError(path, expected=f"the key {error} in each row", found=found, advice=advice) from error
+            raise FormatError(path, expected=f"the key {error} in each row", found=found, advice=_OTHER) from error
+
+
+def _is_of(value: object, kind: type | int) -> bool:
+    """Return whether a value is of a type, or a list of so many numbers."""
+    if isinstance(kind, type):
+        return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    return isinstance(value, list) and len(value) == kind and all(type(number) in (int, float) for number in value)
 
 
 def _objects(path: Path) -> Iterator[dict[str, Any]]:

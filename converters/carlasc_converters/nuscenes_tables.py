@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,21 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
-from carlasc_converters.json_rows import read_rows
+from carlasc_converters import json_rows
 from carlasc_converters.nuscenes_classes import CLASS_IDS
 from carlasc_converters.rigid import poses_of
 
 CHANNEL = "LIDAR_TOP"
 _POSE = ("translation", "rotation")
+_KINDS: dict[str, type | int] = {
+    "translation": 3,
+    "rotation": 4,
+    "size": 3,
+    "timestamp": int,
+    "index": int,
+    "is_key_frame": bool,
+}
+read_rows = partial(json_rows.read_rows, kinds=_KINDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,9 +139,6 @@ class Tables:
         }
         path = self.path("calibrated_sensor")
         rows = [row for row in read_rows(path, ("token", "sensor_token", *_POSE)) if row[1] in sensors]
-        if wrong := [row for row in rows if (len(row[2]), len(row[3])) != (3, 4)]:
-            found = f"{len(wrong[0][2])} + {len(wrong[0][3])} for {wrong[0][0]}"
-            raise FormatError(path, expected="3 + 4 numbers of a pose", found=found)
         poses = poses_of(_columns(rows, 3, 4), _columns(rows, 2, 3), str(path))
         return {row[0]: pose for row, pose in zip(rows, poses, strict=True)}
 
@@ -178,9 +184,6 @@ class Tables:
         timestamps, numbers = np.zeros(len(wanted), np.int64), np.full((len(wanted), 7), np.nan)
         for token, timestamp, position, rotation in read_rows(self.path("ego_pose"), ("token", "timestamp", *_POSE)):
             if (row := wanted.get(token)) is not None:
-                if (len(position), len(rotation)) != (3, 4):
-                    found = f"{len(position)} + {len(rotation)} for {token}"
-                    raise FormatError(self.path("ego_pose"), expected="3 + 4 numbers of a pose", found=found)
                 timestamps[row], numbers[row] = timestamp, (*position, *rotation)
         if np.isnan(numbers).any():
             lacking = list(wanted)[int(np.argmax(np.isnan(numbers).any(axis=1)))]
@@ -205,14 +208,13 @@ class Tables:
         path = self.path("sample_annotation")
         keys = ("sample_token", "instance_token", "translation", "size", "rotation")
         for sample, instance, position, size, rotation in read_rows(path, keys):
-            row = (*position, *size, *rotation)
-            if sample not in self._samples or instance not in objects or len(row) != 10:
-                found = f"{sample}, {instance} and {len(row)} numbers in row {len(samples)}"
-                raise FormatError(path, expected="a known sample and instance, and 3 + 3 + 4 numbers", found=found)
+            if sample not in self._samples or instance not in objects:
+                found = f"{sample} and {instance} in row {len(samples)}"
+                raise FormatError(path, expected="a known sample and instance", found=found)
             samples.append(self._samples[sample][0])
             instances.append(objects[instance][0])
             labels.append(objects[instance][1])
-            numbers.extend(row)
+            numbers.extend((*position, *size, *rotation))
         if not samples:
             return None
         rows = np.frombuffer(samples, np.int32)

@@ -351,12 +351,14 @@ def test_a_box_of_an_unknown_object_and_one_without_a_rotation_are_named(tables)
     text = path.read_text()
     change_table(path, instance_token="nobody")
     with pytest.raises(
-        FormatError, match=r"sample_annotation.json: expected a known sample and instance.*nobody and 10"
+        FormatError, match=r"sample_annotation.json: expected a known sample and instance.*nobody in row 0"
     ):
         recording(tables).boxes()
     path.write_text(text)
     change_table(path, size=[1.0, 2.0])
-    with pytest.raises(FormatError, match=r"sample_annotation.json: .*and 9 numbers in row 0"):
+    with pytest.raises(
+        FormatError, match=r"sample_annotation.json: expected a list of 3 numbers under .size., found .* in row 0"
+    ):
         recording(tables).boxes()
     path.write_text(text)
     change_table(path, rotation=[0, 0, 0, 0])
@@ -369,9 +371,28 @@ def test_a_pose_of_too_few_numbers_is_named(tables, table):
     rows = json.loads((tables / f"{table}.json").read_text())
     write_table(tables / f"{table}.json", [row | {"rotation": [1.0, 0.0]} for row in rows])
     with pytest.raises(
-        FormatError, match=rf"{table}.json: expected 3 \+ 4 numbers of a pose, found 3 \+ 2 for scene-0103-"
+        FormatError, match=rf"{table}.json: expected a list of 4 numbers under 'rotation', found .* in row 0"
     ):
         recording(tables).poses()
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value", "expected"),
+    [
+        ("sample_data", "timestamp", "soon", "a value of type int"),
+        ("sample_data", "is_key_frame", 1, "a value of type bool"),
+        ("sample_annotation", "translation", None, "a list of 3 numbers"),
+        ("sample_annotation", "size", [1.0, "wide", 2.0], "a list of 3 numbers"),
+        ("instance", "token", 7, "a value of type str"),
+    ],
+)
+def test_a_value_of_another_type_is_named(tables, table, key, value, expected):
+    rows = json.loads((tables / f"{table}.json").read_text())
+    write_table(tables / f"{table}.json", [*rows[:-1], rows[-1] | {key: value}])
+    with pytest.raises(
+        FormatError, match=rf"{table}.json: expected {expected} under '{key}', found .* in row {len(rows) - 1}"
+    ):
+        recording(tables).boxes()
 
 
 def test_poses_whose_times_stand_still_are_named(tables):
@@ -460,9 +481,9 @@ def test_a_folder_without_tables_and_tables_without_files_are_refused(tmp_path):
     [
         ("", "found ''"),
         ('{"token": 1}', "expected a JSON list of objects, found '{\"token\": 1}'"),
-        ('[{"token": 1}, 5]', "found int in row 1"),
-        ('[{"token": 1}, {"token": tru}]', "damaged after 1 rows"),
-        ('[{"token": 1}', "damaged after 1 rows"),
+        ('[{"token": "1"}, 5]', "found int in row 1"),
+        ('[{"token": "1"}, {"token": tru}]', "damaged after 1 rows"),
+        ('[{"token": "1"}', "damaged after 1 rows"),
     ],
 )
 def test_text_that_is_no_table_is_named(tmp_path, text, message):
