@@ -17,6 +17,9 @@ MOVABLE = ("car", "van", "pedestrian", "cyclist")
 """Kinds of things that have boxes and numbers."""
 
 
+_KEPT = 16  # scans that a drive keeps
+
+
 @dataclass(frozen=True)
 class Thing:
     """A cuboid in the world, upright.
@@ -116,6 +119,8 @@ class SimulatedDrive:
     channels: int = 20
     columns: int = 180
 
+    _kept: dict[tuple[int, int], DriveScan] = field(default_factory=dict, init=False, repr=False, compare=False)
+
     @property
     def times(self) -> NDArray[np.float64]:
         """(F,) seconds."""
@@ -155,7 +160,19 @@ class SimulatedDrive:
         )
 
     def scan(self, frame: int, sensor: int = 0) -> DriveScan:
-        """Return what a sensor saw for a frame."""
+        """Return what a sensor saw for a frame. The last scans are kept; do not write to them."""
+        key = (frame, sensor)
+        if key not in self._kept:
+            while len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = self._look(frame, sensor)
+        return self._kept[key]
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out the scans that are kept: they are seen again."""
+        return {**vars(self), "_kept": {}}
+
+    def _look(self, frame: int, sensor: int) -> DriveScan:
         mount = self.sensors[sensor].vehicle_T_sensor
         elevation = np.deg2rad(np.linspace(-24.0, 8.0, self.channels))
         azimuth = np.arange(self.columns) * (2 * np.pi / self.columns) - np.pi
