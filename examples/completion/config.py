@@ -12,7 +12,16 @@ from typing import Any, Literal
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 
-NETWORKS = ("motionsc", "lmscnet_ss", "lmscnet", "sscnet", "sscnet_full")
+NETWORKS = (
+    "motionsc",
+    "lmscnet_ss",
+    "lmscnet",
+    "sscnet",
+    "sscnet_full",
+    "js3cnet",
+    "js3cnet_exact",
+    "js3cnet_kitti",
+)
 
 
 @dataclass(frozen=True)
@@ -37,7 +46,9 @@ class Config:
         epochs: passes over the training split.
         batch_size: samples per step, over all processes together.
         learning_rate: learning rate of Adam in the first epoch.
-        decay: factor on the learning rate after each epoch.
+        decay: factor on the learning rate after every `decay_every` epochs.
+        decay_every: number of epochs between two decays.
+        weight_decay: of Adam.
         patience: stop after this number of epochs without a better mIoU; None never stops early.
         precision: "float32", or "bf16" for mixed precision.
         compile: compile the network with torch.compile.
@@ -45,7 +56,9 @@ class Config:
         seed: of weights, order, flips and draws.
     """
 
-    network: Literal["motionsc", "lmscnet_ss", "lmscnet", "sscnet", "sscnet_full"]
+    network: Literal[
+        "motionsc", "lmscnet_ss", "lmscnet", "sscnet", "sscnet_full", "js3cnet", "js3cnet_exact", "js3cnet_kitti"
+    ]
     history: int = 1
     align: bool = True
     shuffle_history: bool = False
@@ -62,6 +75,8 @@ class Config:
     batch_size: int = 16
     learning_rate: float = 1e-3
     decay: float = 0.96
+    decay_every: int = 1
+    weight_decay: float = 0.0
     patience: int | None = None
     precision: Literal["float32", "bf16"] = "float32"
     compile: bool = False
@@ -75,7 +90,7 @@ class Config:
                 object.__setattr__(self, name, float(value))
             elif not _fits(value, kind):
                 raise ArgumentError(name, expected=_describe(kind), found=repr(value))
-        for name in ("history", "epochs", "batch_size"):
+        for name in ("history", "epochs", "batch_size", "decay_every"):
             if getattr(self, name) < 1:
                 raise ArgumentError(name, expected="1 or more", found=str(getattr(self, name)))
         if self.history > 1 and self.network != "motionsc":

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler, Subset
 
-from carlasc import Dataset, Flip
-from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS
-from carlasc.core import class_weights as weights_of
+from carlasc import Dataset, Flip, collate
+from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS, Remap
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics import CONVENTIONS
 from completion.config import Config
-from completion.losses import IGNORE
+from completion.losses import FREE, IGNORE
+from completion.networks import KINDS
 
 Sample = dict[str, Any]
 
@@ -38,16 +38,22 @@ class ShuffleHistory:
 
 
 class SemanticKittiRule:
-    """Maps SemanticKITTI's ids to the classes of the benchmark, and marks voxels of ignored classes as unknown."""
+    """Maps SemanticKITTI's ids to the classes of the benchmark. Voxels of ignored classes become unknown, points of them class 0."""
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample in the benchmark's classes."""
-        raw = sample["labels"], SEMANTICKITTI
-        _, labels, counted = CONVENTIONS["semantickitti"].prepare(raw, raw, None)
-        return sample | {
-            "labels": labels,
-            "known": sample["known"] & counted,
-        }
+        labels, counted = _benchmark_classes(sample["labels"])
+        mapped = {"labels": labels, "known": sample["known"] & counted}
+        if "point_labels" in sample:
+            labels, counted = _benchmark_classes(sample["point_labels"])
+            mapped["point_labels"] = np.where(counted, labels, FREE).astype(np.uint8)
+        return sample | mapped
+
+
+def _benchmark_classes(raw: NDArray[np.unsignedinteger]) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+    """Return SemanticKITTI's labels as those of the benchmark, and which are not ignored."""
+    labelled = raw, SEMANTICKITTI
+    return CONVENTIONS["semantickitti"].prepare(labelled, labelled, None)[1:]
 
 
 class Compose:
@@ -78,7 +84,10 @@ def open_split(source: str | Path, split: str | list[str], config: Config, *, tr
     """
     kitti = config.remap == "semantickitti19"
     remap = None if kitti else config.remap
-    fields = ("occupancy", "labels", "known", *(("posterior",) if training and config.soft_labels else ()))
+    task = KINDS[config.network].task
+    fields = (*task.fields, "labels", "known")
+    if training:
+        fields += task.training_fields + (("posterior",) if config.soft_labels else ())
     try:
         data = Dataset(
             source, split, history=config.history, grid=config.grid, fields=fields, remap=remap, align=config.align
@@ -93,7 +102,7 @@ def open_split(source: str | Path, split: str | list[str], config: Config, *, tr
             expected=f"at most the {frames[longest]} frames of {longest} (the longest sequence)",
             found=str(config.history),
         )
-    transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history else []
+    transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history and config.history > 1 else []
     if kitti:
         if data.classes is not SEMANTICKITTI:
             raise ArgumentError(
@@ -156,16 +165,16 @@ def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataL
         batch_size,
         num_workers=config.workers,
         persistent_workers=config.workers > 0,
+        collate_fn=collate,
         pin_memory=torch.cuda.is_available(),
         **options,
     )
 
 
-def to_device(batch: Sample, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return a batch's input (B, T, X, Y, Z) float32 and target (B, X, Y, Z) int64, `IGNORE` where unknown."""
-    occupancy = batch["occupancy"].to(device, non_blocking=True).float()
+def target_of(batch: Sample, device: torch.device) -> Tensor:
+    """Return a batch's target (B, X, Y, Z) int64, `IGNORE` where unknown."""
     labels = batch["labels"].to(device, non_blocking=True).long()
-    return occupancy, labels.masked_fill(~batch["known"].to(device, non_blocking=True), IGNORE)
+    return labels.masked_fill(~batch["known"].to(device, non_blocking=True), IGNORE)
 
 
 def soft_target(batch: Sample, target: Tensor) -> Tensor:
@@ -182,7 +191,7 @@ def class_weights(source: str | Path, data: Dataset, config: Config) -> NDArray[
         FormatError: the file of `carlasc stats` does not hold counts.
     """
     num_classes = max(data.classes.names) + 1
-    remap = REMAPS.get(config.remap or "")
+    weights_of = KINDS[config.network].task.class_weights
     if config.class_weights == "none":
         return np.ones(num_classes, np.float32)
     if config.class_weights == "train":
@@ -194,12 +203,22 @@ def class_weights(source: str | Path, data: Dataset, config: Config) -> NDArray[
                 expected=f"train for data with the classes {found}",
                 found="table, which is for CarlaSC's",
             )
-        weights = weights_of(TRAIN_VOXEL_COUNTS, remap)
+        weights = weights_of(_merge(TRAIN_VOXEL_COUNTS, REMAPS.get(config.remap or ""), num_classes))
     else:
         weights = _read_weights(Path(config.class_weights), data)
     if len(weights) != num_classes:
         raise FormatError("class weights", expected=str(num_classes), found=str(len(weights)))
     return weights.astype(np.float32)
+
+
+def _merge(counts: NDArray[np.integer], remap: Remap | None, num_classes: int) -> NDArray[np.float64]:
+    """Return the counts of a remap's target classes."""
+    if remap is None:
+        return counts.astype(np.float64)
+    merged = np.zeros(num_classes)
+    for old, new in remap.mapping.items():
+        merged[new] += counts[old] if old < len(counts) else 0
+    return merged
 
 
 def _count_voxels(source: str | Path, config: Config, num_classes: int) -> NDArray[np.int64]:

@@ -13,12 +13,13 @@ import torch._inductor.config as inductor
 from torch import Tensor, nn
 
 from carlasc.errors import ArgumentError, DependencyError
+from completion.tasks import task_of
 
 Mode = Literal["eager", "compile"]
 
 
 class Completer(nn.Module):
-    """A network from occupancy as bytes to classes as bytes.
+    """A network from its inputs, occupancy as bytes, to classes as bytes.
 
     Args:
         network: in eval mode.
@@ -30,10 +31,10 @@ class Completer(nn.Module):
         self.network = network
         self.dtype = dtype
 
-    def forward(self, occupancy: Tensor) -> Tensor:
-        """Take (B, T, X, Y, Z) occupancy, uint8 or float, to (B, X, Y, Z) uint8 labels."""
-        logits: Tensor = self.network(occupancy.to(self.dtype))
-        return logits.argmax(-1).to(torch.uint8)
+    def forward(self, *inputs: Any) -> Tensor:
+        """Take (B, T, X, Y, Z) occupancy, uint8 or float, or what else the network takes, to (B, X, Y, Z) uint8 labels."""
+        outputs = self.network(*(given.to(self.dtype) if isinstance(given, Tensor) else given for given in inputs))
+        return task_of(self.network).labels(outputs).to(torch.uint8)
 
 
 class Compiled:
@@ -60,18 +61,20 @@ class Compiled:
 
 def prepare(
     network: nn.Module, device: torch.device, mode: Mode = "compile", *, bf16: bool | None = None
-) -> Callable[[Tensor], Tensor]:
+) -> Callable[..., Tensor]:
     """Prepare a network for inference.
 
     Args:
         network: the network. It is put into eval mode, moved to the device and, for bf16, converted, all in place.
         device: the device that computes.
         mode: "eager" runs the network without compiling; "compile" compiles it at the first call, which takes about a minute, and is
-            several times faster afterwards. On CUDA the program is replayed as a CUDA graph, with channels last.
+            several times faster afterwards. On CUDA the program is replayed as a CUDA graph, with channels last. Networks whose inputs
+            have no fixed shapes are never compiled.
         bf16: compute in bfloat16; None does so on CUDA with "compile".
 
     Returns:
-        A function from (B, T, X, Y, Z) occupancy, uint8 or float, on the device, to (B, X, Y, Z) uint8 labels.
+        A function from (B, T, X, Y, Z) occupancy, uint8 or float, on the device, or from the other arguments of the network, to
+        (B, X, Y, Z) uint8 labels.
 
     Raises:
         DependencyError: torch.compile needs a C++ compiler, and none is installed.
@@ -79,6 +82,8 @@ def prepare(
     """
     if mode not in ("eager", "compile"):
         raise ArgumentError("mode", expected="eager or compile", found=repr(mode))
+    if not task_of(network).fixed_shapes:
+        mode = "eager"
     if bf16 is None:
         bf16 = mode == "compile" and device.type == "cuda"
     dtype = torch.bfloat16 if bf16 else torch.float32

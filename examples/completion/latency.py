@@ -7,14 +7,15 @@ import resource
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
-from carlasc import GridSpec
+from carlasc import GridSpec, collate
 from completion.inference import Mode, prepare
-from completion.networks import build_network
+from completion.networks import KINDS, build_network
 
 _STACKS = 8  # together a million voxels of the published grid
 
@@ -56,11 +57,14 @@ def measure_network(
 ) -> list[Latency]:
     """Measure a network in several modes. Speed and labels are compared with those of the first mode.
 
-    Weights are random, because they do not change the time. Occupancy is as dense as that of a scan: 1 voxel in 20. Labels are
-    compared on `_STACKS` stacks.
+    Weights are random, because they do not change the time. The inputs are `_STACKS` examples of the network's task: occupancy as dense
+    as that of a scan, or a scan of 120,000 points. Networks whose inputs have no fixed shapes are measured in the first mode only.
     """
     rng = np.random.default_rng(0)
-    stacks = torch.from_numpy((rng.random((_STACKS, 1, history, *spec.size)) < 0.05).astype(np.uint8)).to(device)
+    task = KINDS[name].task
+    samples = [task.example(spec, history, rng) for _ in range(_STACKS)]
+    inputs = [task.arguments(task.prepare(collate([sample]), device), torch.uint8) for sample in samples]
+    modes = modes if task.fixed_shapes else modes[:1]
     results: list[Latency] = []
     reference: torch.Tensor | None = None
     for mode in modes:
@@ -68,9 +72,9 @@ def measure_network(
         run = prepare(randomise(build_network(name, num_classes, spec, history)), device, mode)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
-        labels = torch.cat([run(stack).clone() for stack in stacks])
+        labels = torch.cat([run(*given).clone() for given in inputs])
         reference = labels if reference is None else reference
-        times_ms = np.array([_time_ms(run, stacks[0], device) for _ in range(repetitions)])
+        times_ms = np.array([_time_ms(run, inputs[0], device) for _ in range(repetitions)])
         baseline = results[0].fastest_ms if results else times_ms.min()
         results.append(
             Latency(
@@ -99,13 +103,13 @@ def randomise(network: nn.Module) -> nn.Module:
     return network
 
 
-def _time_ms(run: Callable[[torch.Tensor], torch.Tensor], occupancy: torch.Tensor, device: torch.device) -> float:
+def _time_ms(run: Callable[..., torch.Tensor], inputs: tuple[Any, ...], device: torch.device) -> float:
     """Return the time of a call. With one thread on a CPU it is processor time, which other work on the machine does not change."""
     clock = time.process_time if device.type == "cpu" and torch.get_num_threads() == 1 else time.perf_counter
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     start = clock()
-    run(occupancy)
+    run(*inputs)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return 1000 * (clock() - start)

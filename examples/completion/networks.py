@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from js3cnet.model import JS3CNet
+from js3cnet.task import PointsAndVoxels
 from lmscnet.model import LMSCNet
 from motionsc.model import MotionSC
 from sscnet.model import SSCNet
@@ -12,18 +15,41 @@ from torch import nn
 
 from carlasc import GridSpec
 from carlasc.errors import ArgumentError
+from completion.tasks import VOXELS, Task
 
-_BUILDERS: Mapping[str, Callable[[int, int, int], nn.Module]] = {  # (classes, Z, T)
-    "motionsc": MotionSC,
-    "lmscnet_ss": lambda classes, height, _: LMSCNet(classes, height),
-    "lmscnet": lambda classes, height, _: LMSCNet(classes, height, multiscale=True),
-    "sscnet": lambda classes, _height, _frames: SSCNet(classes),
-    "sscnet_full": lambda classes, _height, _frames: SSCNet(classes, full=True),
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of network.
+
+    Attributes:
+        build: makes one for K classes, a grid and T scans.
+        task: what it takes, how its loss is measured, what it predicts.
+        history: whether T may be more than 1.
+    """
+
+    build: Callable[[int, GridSpec, int], nn.Module]
+    task: Task = VOXELS
+    history: bool = False
+
+
+KINDS: Mapping[str, Kind] = {
+    "motionsc": Kind(lambda classes, spec, frames: MotionSC(classes, spec.size[2], frames), history=True),
+    "lmscnet_ss": Kind(lambda classes, spec, _: LMSCNet(classes, spec.size[2])),
+    "lmscnet": Kind(lambda classes, spec, _: LMSCNet(classes, spec.size[2], multiscale=True)),
+    "sscnet": Kind(lambda classes, _spec, _frames: SSCNet(classes)),
+    "sscnet_full": Kind(lambda classes, _spec, _frames: SSCNet(classes, full=True)),
+    "js3cnet": Kind(lambda classes, spec, _: JS3CNet(classes, spec), PointsAndVoxels()),
+    "js3cnet_exact": Kind(lambda classes, spec, _: JS3CNet(classes, spec, exact=True), PointsAndVoxels()),
+    "js3cnet_kitti": Kind(
+        lambda classes, spec, _: JS3CNet(classes, spec, channels=(3,), residual=True),
+        PointsAndVoxels(voxel_m=0.05, extent=4096),
+    ),
 }
 
 
 def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1) -> nn.Module:
-    """Build a network for a grid.
+    """Build a network for a grid. Its task is noted in its attribute `task`.
 
     Args:
         name: one of `completion.config.NETWORKS`.
@@ -34,12 +60,14 @@ def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1)
     Raises:
         ArgumentError: no network has that name, or the size of the grid is not a multiple of what it needs.
     """
-    if name not in _BUILDERS:
-        raise ArgumentError("network", expected=f"one of {', '.join(_BUILDERS)}", found=repr(name))
-    if history > 1 and name != "motionsc":
+    if name not in KINDS:
+        raise ArgumentError("network", expected=f"one of {', '.join(KINDS)}", found=repr(name))
+    kind = KINDS[name]
+    if history > 1 and not kind.history:
         raise ArgumentError("history", expected=f"1 for {name}", found=str(history), advice="only motionsc takes more")
-    network = _BUILDERS[name](num_classes, spec.size[2], history)
+    network = kind.build(num_classes, spec, history)
     check_size(network, name, spec.size)
+    network.task = kind.task  # type: ignore[assignment]
     return network
 
 

@@ -11,17 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from carlasc import ClassTable, Dataset, GridSpec
+from carlasc import ClassTable, Dataset, GridSpec, collate
 from carlasc.core import CARLASC11, SEMANTICKITTI19, FrameRange, Frames
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Metadata, layout
 from carlasc.storage.folders.folder import FolderWriter
 from completion.config import Config
 from completion.inference import Mode, prepare
-from completion.networks import build_network
+from completion.networks import KINDS, build_network
+from completion.tasks import Batch, Task
 from completion.weights import identify, load_weights, read_weights
 
-Complete = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
+Complete = Callable[[Batch], NDArray[np.uint8]]
 Progress = Callable[[int, int], None]
 
 _TABLES = {len(table.names): table for table in (CARLASC11, SEMANTICKITTI19)}
@@ -45,28 +46,35 @@ class Model:
     state: dict[str, torch.Tensor]
     where: str
 
+    @property
+    def task(self) -> Task:
+        """What the network takes and predicts."""
+        return KINDS[self.network].task
+
     @classmethod
     def read(cls, path: Path, history: int | None = None) -> Model:
         """Read weights, and find out which network they belong to.
 
-        `history` is read from a config.yaml beside the weights if it is None.
+        `history` is read from a config.yaml beside the weights if it is None. The file also decides between networks that have the same
+        weights.
 
         Raises:
             FormatError: they belong to none of our networks, or to an unknown number of classes.
         """
         state = read_weights(path)
-        name, num_classes = identify(state, str(path))
+        settings = path.parent / "config.yaml"
+        config = Config.read(settings) if settings.is_file() else None
+        name, num_classes = identify(state, str(path), config.network if config else None)
         if num_classes not in _TABLES:
             raise FormatError(
                 path, expected="weights for 11 classes (CarlaSC) or 20 (SemanticKITTI)", found=str(num_classes)
             )
         if history is None:
-            settings = path.parent / "config.yaml"
-            history = Config.read(settings).history if settings.is_file() else 1
+            history = config.history if config else 1
         return cls(name, history, _TABLES[num_classes], state, str(path))
 
     def complete_on(self, spec: GridSpec, device: torch.device, mode: Mode) -> Complete:
-        """Return a function from a (T, X, Y, Z) stack to (X, Y, Z) labels.
+        """Return a function from the fields of a sample that the network takes to (X, Y, Z) labels.
 
         Raises:
             FormatError: the weights are for another grid, number of classes or history; names the layer and both shapes.
@@ -75,8 +83,8 @@ class Model:
         load_weights(network, self.state, self.where)
         run = prepare(network, device, mode)
 
-        def complete(occupancy: NDArray[np.uint8]) -> NDArray[np.uint8]:
-            labels = run(torch.from_numpy(occupancy)[None].to(device))
+        def complete(sample: Batch) -> NDArray[np.uint8]:
+            labels = run(*self.task.arguments(self.task.prepare(collate([sample]), device), torch.uint8))
             return labels[0].cpu().numpy().astype(np.uint8)
 
         return complete
@@ -116,7 +124,8 @@ def predict_dataset(
         ArgumentError: `out` is None and the data are not a folder.
         ConflictError: the grid exists, and was made by another network or on another grid.
     """
-    data = Dataset(source, split, history=model.history, grid=grid, fields=("occupancy",), remap=None)
+    fields = dict.fromkeys(("occupancy", *model.task.fields))  # occupancy needs the grid, whose geometry is predicted
+    data = Dataset(source, split, history=model.history, grid=grid, fields=fields, remap=None)
     if out is None and not Path(source).is_dir():
         raise ArgumentError("out", expected=f"a folder to write to, because {source} is not one", found="none")
     chosen = FrameRange.of(frames)
@@ -134,8 +143,8 @@ def predict_dataset(
             )
         writer = writers[sequence.path]
         if not writer.has(f"{folder}/labels", frame):
-            occupancy = data[data.index_of(sequence.name, frame)]["occupancy"]
-            writer.write(f"{folder}/labels", frame, complete(occupancy))
+            sample = data[data.index_of(sequence.name, frame)]
+            writer.write(f"{folder}/labels", frame, complete(sample))
             made += 1
         if progress:
             progress(done, len(jobs))
@@ -186,14 +195,11 @@ def predict_scans(
     complete = model.complete_on(spec, device, mode)
     writer = _open_writer(out, "cartesian", layout.EVALUATION, spec, model, beside=False)
     for done, (file, number) in enumerate(zip(files, numbers, strict=True), 1):
-        points = layout.field_named("points").decode(file.read_bytes(), str(file))[:, :3]
+        points = layout.field_named("points").decode(file.read_bytes(), str(file))
         if right_handed:
-            points = points * np.array([1, -1, 1], np.float32)
-        occupancy = np.zeros(spec.size, np.uint8)
-        voxels = spec.flat_index(points)
-        occupancy.reshape(-1)[voxels[voxels >= 0]] = 1
+            points = points * np.array([1, -1, 1, 1], np.float32)
         frame = done - 1 if None in numbers or number is None else number
-        writer.write(f"{layout.EVALUATION}/labels", frame, complete(occupancy[None]))
+        writer.write(f"{layout.EVALUATION}/labels", frame, complete(model.task.from_scan(points, spec)))
         if progress:
             progress(done, len(files))
     return len(files)

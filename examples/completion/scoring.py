@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from carlasc.metrics import ConfusionMatrix
-from completion.data import to_device
+from completion.data import target_of
 from completion.losses import IGNORE
 from completion.processes import Processes
+from completion.tasks import Batch, task_of
 
 
 @torch.no_grad()
@@ -23,13 +24,15 @@ def score(
     network.eval()
     matrix = ConfusionMatrix(num_classes)
     for batch in loader:
-        occupancy, target = to_device(batch, processes.device)
-        matrix.update(predict(network, occupancy, bf16), target, target != IGNORE)
+        target = target_of(batch, processes.device)
+        matrix.update(predict(network, batch, processes.device, bf16), target, target != IGNORE)
     counts = processes.sum(torch.from_numpy(matrix.counts).to(processes.device))
     return ConfusionMatrix(num_classes, counts=counts.cpu().numpy().astype(np.int64))
 
 
-def predict(network: nn.Module, occupancy: Tensor, bf16: bool = False) -> Tensor:
-    """Return (B, X, Y, Z) class ids for (B, T, X, Y, Z) float32 occupancy."""
-    with torch.autocast(occupancy.device.type, torch.bfloat16, enabled=bf16):
-        return network(occupancy).argmax(-1)
+def predict(network: nn.Module, batch: Batch, device: torch.device, bf16: bool = False) -> Tensor:
+    """Return (B, X, Y, Z) class ids for a batch of samples."""
+    task = task_of(network)
+    inputs = task.arguments(task.prepare(batch, device))
+    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+        return task.labels(network(*inputs))

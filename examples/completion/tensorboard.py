@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from carlasc import ClassTable, Dataset
+from carlasc import ClassTable, Dataset, collate
 from carlasc.errors import import_extra
 from carlasc.metrics import ConfusionMatrix
 from completion.scoring import predict
+from completion.tasks import task_of
 
 _PICTURES = 3  # number of frames, spread over the split
 
@@ -52,10 +53,9 @@ class Board:
         for place in np.unique(np.linspace(0, len(data) - 1, _PICTURES).astype(int)).tolist():
             sample = data[place]
             with torch.no_grad():
-                occupancy = torch.from_numpy(sample["occupancy"]).to(device).float()[None]
-                labels = predict(network, occupancy)[0].cpu().numpy()
+                labels = predict(network, collate([sample]), device)[0].cpu().numpy()
             shown = [
-                _black_on_white((sample["occupancy"][-1] > 0).any(-1)),
+                _black_on_white((task_of(network).seen(sample, data.spec) > 0).any(-1)),
                 view_from_above(np.where(sample["known"], labels, 0), self.classes),
                 view_from_above(sample["labels"], self.classes),
             ]
@@ -74,5 +74,5 @@ def view_from_above(labels: NDArray[Any], classes: ClassTable) -> NDArray[np.uin
     return picture[::-1].astype(np.uint8)
 
 
-def _black_on_white(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _black_on_white(mask: Any) -> NDArray[np.uint8]:
     return np.where(mask, np.uint8(0), np.uint8(255))[::-1, :, None].repeat(3, -1)

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 
 from completion.config import Config
-from completion.data import TrainLoader, open_split, to_device
-from completion.losses import completion_loss
+from completion.data import TrainLoader, open_split, target_of
 from completion.networks import build_network
+from completion.tasks import task_of
 
 
 @dataclass(frozen=True)
@@ -42,20 +42,22 @@ def measure_throughput(source: str | Path, config: Config, device: torch.device,
     num_classes = max(data.classes.names) + 1
     network = build_network(config.network, num_classes, data.spec, config.history).to(device).train()
     optimizer = torch.optim.Adam(network.parameters())
-    occupancy, target = to_device(batch, device)
+    task, target = task_of(network), target_of(batch, device)
     weights = torch.ones(num_classes, device=device)
     for step in range(batches + 2):
         if step == 2:
             _wait(device)
             start = time.perf_counter()
         with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
-            outputs = network(occupancy)
-        sums, totals = completion_loss(outputs, target, weights)
+            prepared = task.prepare(batch, device, torch.Generator().manual_seed(step))
+            outputs = network(*task.arguments(prepared))
+        sums, totals = task.loss(outputs, prepared, target, weights)
+        factors, offset = task.balance(network, sums)
         optimizer.zero_grad(set_to_none=True)
-        torch.autograd.backward((sums / totals).mean())
+        torch.autograd.backward((factors * sums / totals).sum() + offset)
         optimizer.step()
     _wait(device)
-    return Throughput(loader_rate, batches * len(occupancy) / (time.perf_counter() - start))
+    return Throughput(loader_rate, batches * len(target) / (time.perf_counter() - start))
 
 
 def _wait(device: torch.device) -> None:

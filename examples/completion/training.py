@@ -14,15 +14,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from carlasc.errors import CarlascError, ConflictError
+from carlasc.errors import ArgumentError, CarlascError, ConflictError
 from carlasc.metrics import ConfusionMatrix
 from completion.config import Config
-from completion.data import TrainLoader, class_weights, eval_loader, open_split, soft_target, to_device
+from completion.data import TrainLoader, class_weights, eval_loader, open_split, soft_target, target_of
 from completion.inference import check_compiler
-from completion.losses import balance_free, completion_loss
+from completion.losses import balance_free
 from completion.networks import build_network
 from completion.processes import Processes
 from completion.scoring import score
+from completion.tasks import task_of
 from completion.tensorboard import Board
 from completion.weights import load_weights, read_checkpoint, read_weights, write_checkpoint, write_weights
 
@@ -79,8 +80,8 @@ def train(source: str | Path, config: Config, out: Path, processes: Processes, *
 
     torch.manual_seed(config.seed)
     network = build_network(config.network, num_classes, data.spec, config.history).to(processes.device)
-    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=(0.9, 0.999))
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, config.decay)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    schedule = torch.optim.lr_scheduler.StepLR(optimizer, config.decay_every, config.decay)
     parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
     progress = _resume(out, config, parts) if resume else _begin(out, config, processes)
     stepped = _prepare(network, config, processes)
@@ -88,7 +89,8 @@ def train(source: str | Path, config: Config, out: Path, processes: Processes, *
     with Board(out / "tensorboard", data.classes, enabled=processes.first) as board:
         while not progress.is_over(config):
             start = time.perf_counter()
-            loss = _train_epoch(stepped, optimizer, loader, weights, progress.epoch, config, processes)
+            task_of(network).set_epoch(network, progress.epoch)
+            loss = _train_epoch((network, stepped), optimizer, loader, weights, progress.epoch, config, processes)
             elapsed_s = time.perf_counter() - start
             learning_rate = optimizer.param_groups[0]["lr"]
             schedule.step()
@@ -147,9 +149,14 @@ def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
 
 def _prepare(network: nn.Module, config: Config, processes: Processes) -> nn.Module:
     """Wrap the network for several processes and for torch.compile; both share its weights."""
+    fixed_shapes = task_of(network).fixed_shapes
     if processes.world > 1:
         ids = [processes.device.index] if processes.device.type == "cuda" else None
         network = DistributedDataParallel(network, device_ids=ids)
+    if config.compile and not fixed_shapes:
+        raise ArgumentError(
+            "compile", expected=f"False for {config.network}, whose inputs have no fixed shapes", found="True"
+        )
     if config.compile:
         check_compiler(processes.device)
         network = torch.compile(network)  # type: ignore[assignment]
@@ -157,7 +164,7 @@ def _prepare(network: nn.Module, config: Config, processes: Processes) -> nn.Mod
 
 
 def _train_epoch(
-    network: nn.Module,
+    networks: tuple[nn.Module, nn.Module],
     optimizer: torch.optim.Optimizer,
     loader: TrainLoader,
     class_weights: Tensor,
@@ -165,12 +172,12 @@ def _train_epoch(
     config: Config,
     processes: Processes,
 ) -> float:
-    """Make the steps of an epoch; return the mean loss."""
-    network.train()
+    """Make the steps of an epoch; return the mean loss. `networks` are the network itself, and as it is wrapped."""
+    networks[1].train()
     total = 0.0
     for step, batch in enumerate(loader.epoch(epoch)):
         try:
-            loss = _train_step(network, optimizer, batch, class_weights, (epoch, step), config, processes)
+            loss = _train_step(networks, optimizer, batch, class_weights, (epoch, step), config, processes)
         except (torch.OutOfMemoryError, RuntimeError) as error:
             if not _is_out_of_memory(error):
                 raise
@@ -199,7 +206,7 @@ def _train_epoch(
 
 
 def _train_step(
-    network: nn.Module,
+    networks: tuple[nn.Module, nn.Module],
     optimizer: torch.optim.Optimizer,
     batch: dict[str, Any],
     class_weights: Tensor,
@@ -208,21 +215,25 @@ def _train_step(
     processes: Processes,
 ) -> float:
     """Make one step on the loss of the whole batch, summed over the processes; return this loss."""
-    occupancy, target = to_device(batch, processes.device)
+    network, wrapped = networks
+    task, seed = task_of(network), _mix(config.seed, *place, processes.rank)
+    target = target_of(batch, processes.device)
     if config.free_ratio:
-        draw = torch.Generator(processes.device).manual_seed(_mix(config.seed, *place, processes.rank))
+        draw = torch.Generator(processes.device).manual_seed(seed)
         target = balance_free(target, config.free_ratio, draw)
     if config.soft_labels:
         target = soft_target(batch, target)
+    prepared = task.prepare(batch, processes.device, torch.Generator().manual_seed(seed))
     with torch.autocast(processes.device.type, torch.bfloat16, enabled=config.precision == "bf16"):
-        outputs = network(occupancy)
-    sums, weights = completion_loss(outputs, target, class_weights)
+        outputs = wrapped(*task.arguments(prepared))
+    sums, weights = task.loss(outputs, prepared, target, class_weights)
     weights = processes.sum(weights.detach())
-    loss = (sums / weights.clamp_min(1e-12)).mean() * processes.world  # gradients are averaged over the processes
+    factors, offset = task.balance(network, sums)
+    own = (factors * sums / weights.clamp_min(1e-12)).sum()  # this process's share of the loss
     optimizer.zero_grad(set_to_none=True)
-    torch.autograd.backward(loss)
+    torch.autograd.backward(own * processes.world + offset)  # gradients are averaged over the processes
     optimizer.step()
-    return float(processes.sum(loss.detach()) / processes.world)
+    return float(processes.sum(own.detach()) + offset.detach())
 
 
 def _mix(*numbers: int) -> int:

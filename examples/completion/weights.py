@@ -21,7 +21,10 @@ _MARKS = {  # a name that only one network's state dict has; looked for in this 
     "lmscnet_ss": "seg_head_1_1.conv0.weight",
     "sscnet_full": "deconv_classes.weight",
     "sscnet": "conv_classes.weight",
+    "js3cnet": "seg_head.sparseModel.2.0.1.weight",
+    "js3cnet_kitti": "seg_head.sparseModel.2.0.1.0.weight",
 }
+_VARIANTS = {"js3cnet_exact": "js3cnet"}  # networks whose weights cannot be told from those of another
 
 
 def read_weights(path: Path) -> StateDict:
@@ -115,8 +118,10 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
     network.load_state_dict(dict(state), strict=True)
 
 
-def identify(state: Mapping[str, Tensor], where: str) -> tuple[str, int]:
+def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None) -> tuple[str, int]:
     """Return the name of the network that a state dict belongs to, and the number of classes.
+
+    `trained` is the name of the network that the run's settings give: it decides between networks that have the same weights.
 
     Raises:
         FormatError: it belongs to none of our networks.
@@ -126,18 +131,22 @@ def identify(state: Mapping[str, Tensor], where: str) -> tuple[str, int]:
         raise FormatError(
             where, expected=f"weights of {', '.join(_MARKS)}", found=f"a first layer named {next(iter(state))}"
         )
+    if trained in _VARIANTS and _VARIANTS[trained] == name:
+        name = trained
     last = {
         "motionsc": "segmentation_head.conv_classes.bias",
         "sscnet_full": "deconv_classes.bias",
         "sscnet": "conv_classes.bias",
+        "js3cnet": "complet_head.Decoder.pre_conv2.0.bias",
+        "js3cnet_kitti": "complet_head.Decoder.pre_conv2.0.bias",
     }
-    return name, len(state[last.get(name, "seg_head_1_1.conv_classes.bias")])
+    return name, len(state[last.get(_VARIANTS.get(name, name), "seg_head_1_1.conv_classes.bias")])
 
 
 def _advice(layer: str) -> str:
     if "conv3d_" in layer:
         return "the weights are for another history (T)"
-    if "classes" in layer:
+    if "classes" in layer or layer.startswith("seg_head.linear"):
         return "the weights are for another number of classes"
     return "the weights are for another grid (cells along z) or network"
 

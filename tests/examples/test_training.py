@@ -52,7 +52,7 @@ def test_a_run_writes_weights_checkpoint_settings_and_curves(data, tmp_path, cap
     assert len(events.Tags()["images"]) == 3
 
 
-@pytest.mark.parametrize("network", ["lmscnet_ss", "sscnet"])
+@pytest.mark.parametrize("network", ["lmscnet_ss", "sscnet", "js3cnet"])
 def test_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data, tmp_path, network):
     config = replace(QUICK, network=network, free_ratio=2.0)
     whole = train(data, config, tmp_path / "whole", ALONE)
@@ -80,7 +80,13 @@ def test_training_stops_early_when_nothing_gets_better(data, tmp_path):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"network": "motionsc", "history": 3, "shuffle_history": True}, {"network": "lmscnet"}, {"precision": "bf16"}],
+    [
+        {"network": "motionsc", "history": 3, "shuffle_history": True},
+        {"network": "lmscnet"},
+        {"precision": "bf16"},
+        {"network": "js3cnet_exact", "precision": "bf16"},
+        {"network": "js3cnet_kitti"},
+    ],
 )
 def test_every_network_and_precision_trains(data, tmp_path, changes):
     progress = train(data, replace(QUICK, epochs=1, **changes), tmp_path, ALONE)
@@ -98,7 +104,7 @@ def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monk
     def no_memory(*_):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr(training, "completion_loss", no_memory)
+    monkeypatch.setattr(training, "target_of", no_memory)
     with pytest.raises(
         CarlascError, match="batch size 2: out of memory: try --set batch_size=1 or --set precision=bf16"
     ):
@@ -111,6 +117,8 @@ def test_data_that_cannot_be_trained_on_is_named(data, tmp_path):
         train(tmp_path / "only_train", QUICK, tmp_path / "a", ALONE)
     with pytest.raises(ArgumentError, match="history: expected at most the 3 frames"):
         train(data, replace(QUICK, network="motionsc", history=4), tmp_path / "b", ALONE)
+    with pytest.raises(ArgumentError, match="compile: expected False for js3cnet"):
+        train(data, replace(QUICK, network="js3cnet", compile=True), tmp_path / "d", ALONE)
     with pytest.raises(ArgumentError, match="only motionsc"):
         replace(QUICK, history=2)
     with pytest.raises(FormatError, match="carlasc stats --json"):
@@ -150,7 +158,7 @@ def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_
 
 def test_settings_files_of_every_network_are_read(examples):
     files = sorted(examples.glob("*/*.yaml"))
-    assert len(files) == 6
+    assert len(files) == 7
     for file in files:
         assert Config.read(file, ["epochs=3"]).epochs == 3
     with pytest.raises(ArgumentError, match="found speed"):

@@ -42,6 +42,7 @@ def write_split(
             writer.write("points", frame, np.pad(points, ((0, 0), (0, 1))))
             labels = np.where(occupied, quarter[..., None], 0).astype(np.uint32)
             writer.write("evaluation/labels", frame, labels)
+            writer.write("labels", frame, labels.reshape(-1)[SPEC.flat_index(points)])
             writer.write("evaluation/counts", frame, (rng.random(SPEC.size) < 0.8).astype(np.float32))
             if certainty is not None:
                 shares = np.zeros(occupied.size, layout.VOTES_DTYPE)

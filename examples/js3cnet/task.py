@@ -1,0 +1,133 @@
+"""How JS3C-Net is trained and used: points and voxels are both predicted, and the two losses weigh each other by learned numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from completion.losses import completion_loss
+from completion.tasks import VOXELS, Batch, Task
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy, pad
+
+from carlasc import GridSpec
+from carlasc.errors import ArgumentError
+from js3cnet.model import Prediction
+
+
+class PointsAndVoxels(Task):
+    """The task of JS3C-Net.
+
+    Args:
+        voxel_m: width of the cells of the U-Net.
+        extent: number of its cells per axis. Points beyond are left out.
+    """
+
+    fields = ("points",)
+    training_fields = ("point_labels",)
+    fixed_shapes = False
+
+    def __init__(self, voxel_m: float = 0.1, extent: int = 2048) -> None:
+        self.voxel_m = voxel_m
+        self.extent = extent
+
+    def from_scan(self, points: NDArray[np.float32], spec: GridSpec) -> Batch:
+        """Return the scan."""
+        return {"points": np.ascontiguousarray(points)}
+
+    def example(self, spec: GridSpec, history: int, rng: np.random.Generator) -> Batch:
+        """Return a scan of 120,000 points: 64 beams in a street with houses on both sides, with noise of 2 cm."""
+        azimuth = np.tile(np.linspace(-np.pi, np.pi, 1875, endpoint=False), 64)
+        elevation = np.repeat(np.radians(np.linspace(-24.8, 2.0, 64)), 1875)
+        rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], 1)
+        side_m = 9 + 3 * (np.floor(8 * azimuth / np.pi) % 3)  # of the houses' fronts from the sensor
+        with np.errstate(divide="ignore"):
+            reach = np.minimum(side_m / np.abs(rays[:, 1]), 45)
+            ground = np.where(rays[:, 2] < 0, -1.8 / rays[:, 2], np.inf)
+        points = rays * np.minimum(reach, ground)[:, None] + rng.normal(0, 0.02, rays.shape)
+        return {"points": points.astype(np.float32)}
+
+    def seen(self, sample: Batch, spec: GridSpec) -> NDArray[np.uint8]:
+        """Return (X, Y, Z) occupancy of a sample's scan, for pictures."""
+        return VOXELS.from_scan(sample["points"], spec)["occupancy"][0]
+
+    def prepare(self, batch: Batch, device: torch.device, draw: torch.Generator | None = None) -> Batch:
+        """Add the U-Net's `cells`, and leave points beyond them out.
+
+        Raises:
+            ArgumentError: a scan has no points, or coordinates that are not finite; names the frame.
+        """
+        prepared = batch | {"points": [], "cells": [], "point_labels": []}
+        for i, scan in enumerate(batch["points"]):
+            check_scan(
+                scan, f"{batch['sequence'][i]} {int(batch['frame'][i])}: points" if "frame" in batch else "points"
+            )
+            cells, within = site_cells(scan[:, :3], self.voxel_m, self.extent, draw)
+            prepared["points"].append(pad(scan[within], (0, 4 - scan.shape[1])).to(device))
+            prepared["cells"].append(cells[within].to(device))
+            if "point_labels" in batch:
+                prepared["point_labels"].append(batch["point_labels"][i][within].to(device))
+        return prepared
+
+    def arguments(self, batch: Batch, dtype: torch.dtype = torch.float32) -> tuple[Any, ...]:
+        """Return points and cells."""
+        return batch["points"], batch["cells"]
+
+    def loss(self, outputs: Prediction, batch: Batch, target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the parts for the points and for the voxels. Points of class 0, which voxels have when they are free, are left out."""
+        labels, weights = torch.cat(batch["point_labels"]).long() - 1, class_weights[1:]
+        points = cross_entropy(outputs.points.float(), labels, weights, ignore_index=-1, reduction="sum")
+        voxels, counted = completion_loss(outputs.voxels, target, class_weights)
+        return torch.cat([points[None], voxels]), torch.cat([weights[labels[labels >= 0]].sum()[None], counted])
+
+    def balance(self, network: nn.Module, parts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return 1 / s^2 of both parts, and the sum of 2 ln s: the more uncertain a part is found to be, the less it weighs."""
+        variances = torch.cat([network.get_parameter("seg_sigma"), network.get_parameter("complet_sigma")]) ** 2
+        return 1 / variances, variances.log().sum()
+
+    def labels(self, outputs: Prediction) -> Tensor:
+        """Return the classes of the voxels."""
+        return outputs.voxels.argmax(-1)
+
+    def class_weights(self, counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+        """Return the cube root of how many times rarer each class is than the most frequent one; 0 for classes that never occur."""
+        counts = np.asarray(counts, np.float64)
+        return np.where(counts > 0, np.cbrt(counts.max() / np.maximum(counts, 1)), 0)
+
+    def set_epoch(self, network: nn.Module, epoch: int) -> None:
+        """Set the momentum of the norms of points and of neighbours, which falls every ten epochs."""
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm1d):  # the U-Net and the decoder have other classes, and keep theirs
+                module.momentum = max(0.5 * 0.5 ** (epoch // 10), 0.01)
+
+
+def check_scan(points: Tensor, where: str) -> None:
+    """Raise ArgumentError unless a scan has points, and finite ones."""
+    if not len(points):
+        raise ArgumentError(where, expected="one point or more", found="none", advice="leave the frame out")
+    if not torch.isfinite(points).all():
+        wrong = int((~torch.isfinite(points).all(1)).sum())
+        raise ArgumentError(where, expected="finite coordinates", found=f"{wrong} points without")
+
+
+def site_cells(xyz: Tensor, voxel_m: float, extent: int, draw: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    """Return the U-Net's (N, 3) int64 cell of each of (N, 3) points, and (N,) which of them are within its extent.
+
+    With a generator the scan is sheared, mirrored, turned and moved at random, as the authors do for training. Without one it is only
+    moved to the corner of the grid.
+    """
+    if draw is None:
+        moved, room = xyz / voxel_m, torch.zeros(3)
+    else:
+        matrix = torch.eye(3) + 0.1 * torch.randn(3, 3, generator=draw)
+        matrix[0, 0] *= 2 * torch.randint(2, (), generator=draw) - 1
+        angle = 2 * torch.pi * torch.rand((), generator=draw)
+        turn = torch.eye(3)
+        turn[0, 0] = turn[1, 1] = angle.cos()
+        turn[0, 1], turn[1, 0] = angle.sin(), -angle.sin()
+        moved = (xyz - xyz.mean(0)) @ (matrix / voxel_m @ turn)
+        room = (extent - 1 - (moved.amax(0) - moved.amin(0))).clamp_min(0) * torch.rand(3, generator=draw)
+    cells = (moved - moved.amin(0) + room).long()
+    return cells, (cells < extent).all(1)
