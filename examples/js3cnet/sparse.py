@@ -2,6 +2,7 @@
 
 Features exist only at sites: the voxels that hold a point. Sites are sorted by one integer key each, so that neighbours are found by
 binary search, and a convolution is one gather, one matrix product and one `index_add` per kernel offset. There is no dense volume.
+Rows are gathered by `index_select`, which on a CPU is several times faster than indexing with brackets.
 Names, order and layout of the weights are those of SparseConvNet (B. Graham et al., CVPR 2018), whose checkpoints load unchanged.
 """
 
@@ -94,7 +95,7 @@ class ToPoints(nn.Module):
 
     def forward(self, sites: Sites) -> Tensor:
         """Return (N, C)."""
-        return sites.features[sites.levels[-1].site_of]
+        return sites.features.index_select(0, sites.levels[-1].site_of)
 
 
 class NormReLU(nn.Module):
@@ -138,8 +139,8 @@ class SameSites(Convolution):
         kernels, x = self.kernels, sites.features
         out = x @ kernels[13]
         for k, (near, here) in enumerate(sites.levels[-1].neighbours):
-            out.index_add_(0, here, x[near] @ kernels[k])
-            out.index_add_(0, near, x[here] @ kernels[26 - k])
+            out.index_add_(0, here, x.index_select(0, near) @ kernels[k])
+            out.index_add_(0, near, x.index_select(0, here) @ kernels[26 - k])
         return sites._replace(features=out)
 
 
@@ -153,7 +154,8 @@ class Down(Convolution):
         level = sites.levels[-1]
         out = sites.features.new_zeros(len(level.coarser.cells), self.weight.shape[-1])
         for kernel, rows in zip(self.kernels, level.children, strict=True):
-            out.index_add_(0, level.coarser.site_of[rows], (sites.features[rows] @ kernel).to(out.dtype))
+            terms = sites.features.index_select(0, rows) @ kernel
+            out.index_add_(0, level.coarser.site_of[rows], terms.to(out.dtype))
         return Sites(out, (*sites.levels, level.coarser))
 
 
@@ -167,7 +169,8 @@ class Up(Convolution):
         level = sites.levels[-2]
         out = sites.features.new_zeros(len(level.cells), self.weight.shape[-1])
         for kernel, rows in zip(self.kernels, level.children, strict=True):
-            out.index_add_(0, rows, (sites.features[level.coarser.site_of[rows]] @ kernel).to(out.dtype))
+            terms = sites.features.index_select(0, level.coarser.site_of[rows]) @ kernel
+            out.index_add_(0, rows, terms.to(out.dtype))
         return Sites(out, sites.levels[:-1])
 
 

@@ -82,11 +82,18 @@ def test_sizes_are_those_of_the_papers():
     assert size(MotionSC(11, 8, 1)) == pytest.approx(7.86e6, rel=1e-3)
 
 
-def test_the_published_weights_load_strictly_and_give_the_published_outputs(real, golden):
-    network = LMSCNet(11, 8).eval()
-    network.load_state_dict(torch.load(real / "LMSC_11_T1B.pt", map_location="cpu", weights_only=True), strict=True)
+@pytest.mark.parametrize(
+    ("name", "weights", "outputs"),
+    [
+        ("LMSCNet_SS", "LMSC_11_T1B.pt", "published_lmsc.npz"),
+        ("SSCNet_full", "SSC_Full_11_T1B.pt", "published_ssc_full.npz"),
+    ],
+)
+def test_the_published_weights_load_strictly_and_give_the_published_outputs(real, golden, name, weights, outputs):
+    network = NETWORKS[name]().eval()
+    network.load_state_dict(torch.load(real / weights, map_location="cpu", weights_only=True), strict=True)
     occupancy = (np.random.default_rng(7).random((1, 1, 128, 128, 8)) < 0.05).astype(np.float32)
-    with torch.no_grad(), np.load(golden / "published_lmsc.npz") as expected:
+    with torch.no_grad(), np.load(golden / outputs) as expected:
         logits = network(torch.from_numpy(occupancy)).numpy()
         np.testing.assert_allclose(logits[:, :24, :24], expected["logits_corner"], rtol=0, atol=1e-4)
         np.testing.assert_array_equal(logits.argmax(-1), expected["labels"])
