@@ -33,14 +33,19 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, import_
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.metadata import Axes
 
-FIELDS = ("occupancy", "density", "labels", "known", "counts", "points", "point_labels", "flow", "poses")
+FIELDS = ("occupancy", "density", "labels", "known", "counts", "points", "point_labels", "flow", "remission", "poses")
 """Fields that samples of published data may have."""
 EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
 """Fields of grids that say how certain each voxel is, which published grids do not."""
 ALWAYS = ("valid", "sequence", "frame")
-RAGGED = ("points", "point_labels", "flow")  # one row per point of the scan
+RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
 _STACKS = frozenset({"occupancy", "density"})
-_OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow"}  # field of a sample -> field of the scan
+_OF_SCAN = {
+    "points": "points",
+    "point_labels": "labels",
+    "flow": "flow",
+    "remission": "points",
+}  # field of a sample -> field of the scan
 
 if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
     from torch.utils.data import Dataset as TorchDataset
@@ -68,6 +73,7 @@ class Dataset(_MapStyle):
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
+        remission     (N,) float32, fourth column of the scan: remission in KITTI, zero in CarlaSC
         poses         (T, 4, 4) float64 current_T_past; the identity where not valid
         valid         (T,) bool, whether the scan exists; in every sample
         sequence      str, name of the sequence; in every sample
@@ -298,6 +304,8 @@ class Dataset(_MapStyle):
             sample["point_labels"] = self._label_map(labels, f"{part.scans.location}: labels of frame {frame}")
         if "flow" in self.fields:
             sample["flow"] = np.array(part.scans.read("flow", frame), np.float32, order="C")
+        if "remission" in self.fields:
+            sample["remission"] = np.array(part.scans.read("points", frame)[:, 3], np.float32)
         lengths = {name: len(array) for name, array in sample.items()}
         if len(set(lengths.values())) > 1:
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
@@ -308,7 +316,7 @@ class Dataset(_MapStyle):
 def collate(samples: list[Sample]) -> dict[str, Any]:
     """Return a batch of samples that may hold fields with one row per point. Give it to a DataLoader as `collate_fn`.
 
-    `points`, `point_labels` and `flow` become lists of B tensors, one per sample. All other fields are stacked as torch's
+    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, one per sample. All other fields are stacked as torch's
     default_collate does.
 
     Raises:

@@ -43,7 +43,7 @@ KINDS: Mapping[str, Kind] = {
     "js3cnet_exact": Kind(lambda classes, spec, _: JS3CNet(classes, spec, exact=True), PointsAndVoxels()),
     "js3cnet_kitti": Kind(
         lambda classes, spec, _: JS3CNet(classes, spec, channels=(3,), residual=True),
-        PointsAndVoxels(voxel_m=0.05, extent=4096),
+        PointsAndVoxels(voxel_m=0.05, extent=4096, remission=True),
     ),
 }
 

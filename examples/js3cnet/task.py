@@ -23,19 +23,21 @@ class PointsAndVoxels(Task):
     Args:
         voxel_m: width of the cells of the U-Net.
         extent: number of its cells per axis. Points beyond are left out.
+        remission: whether the network needs the remission of each point.
     """
 
-    fields = ("points",)
     training_fields = ("point_labels",)
     fixed_shapes = False
 
-    def __init__(self, voxel_m: float = 0.1, extent: int = 2048) -> None:
+    def __init__(self, voxel_m: float = 0.1, extent: int = 2048, *, remission: bool = False) -> None:
+        self.fields = ("points", "remission") if remission else ("points",)
         self.voxel_m = voxel_m
         self.extent = extent
 
     def from_scan(self, points: NDArray[np.float32], spec: GridSpec) -> Batch:
         """Return the scan."""
-        return {"points": np.ascontiguousarray(points)}
+        columns = {"points": points[:, :3], "remission": points[:, 3]}
+        return {name: np.array(columns[name], np.float32, order="C") for name in self.fields}
 
     def example(self, spec: GridSpec, history: int, rng: np.random.Generator) -> Batch:
         """Return a scan of 120,000 points: 64 beams in a street with houses on both sides, with noise of 2 cm."""
@@ -47,7 +49,8 @@ class PointsAndVoxels(Task):
             reach = np.minimum(side_m / np.abs(rays[:, 1]), 45)
             ground = np.where(rays[:, 2] < 0, -1.8 / rays[:, 2], np.inf)
         points = rays * np.minimum(reach, ground)[:, None] + rng.normal(0, 0.02, rays.shape)
-        return {"points": points.astype(np.float32)}
+        remission = rng.random((len(points), 1))
+        return self.from_scan(np.concatenate([points, remission], 1).astype(np.float32), spec)
 
     def seen(self, sample: Batch, spec: GridSpec) -> NDArray[np.uint8]:
         """Return (X, Y, Z) occupancy of a sample's scan, for pictures."""
@@ -57,19 +60,32 @@ class PointsAndVoxels(Task):
         """Add the U-Net's `cells`, and leave points beyond them out.
 
         Raises:
-            ArgumentError: a scan has no points, or coordinates that are not finite; names the frame.
+            ArgumentError: a scan has no points, or values that are not finite, or no remission if it needs one; names the frame.
         """
         prepared = batch | {"points": [], "cells": [], "point_labels": []}
-        for i, scan in enumerate(batch["points"]):
-            check_scan(
+        for i, xyz in enumerate(batch["points"]):
+            scan = pad(xyz, (0, 1))
+            if "remission" in self.fields:
+                scan[:, 3] = batch["remission"][i]
+            self._check(
                 scan, f"{batch['sequence'][i]} {int(batch['frame'][i])}: points" if "frame" in batch else "points"
             )
-            cells, within = site_cells(scan[:, :3], self.voxel_m, self.extent, draw)
-            prepared["points"].append(pad(scan[within], (0, 4 - scan.shape[1])).to(device))
+            cells, within = site_cells(xyz, self.voxel_m, self.extent, draw)
+            prepared["points"].append(scan[within].to(device))
             prepared["cells"].append(cells[within].to(device))
             if "point_labels" in batch:
                 prepared["point_labels"].append(batch["point_labels"][i][within].to(device))
         return prepared
+
+    def _check(self, scan: Tensor, where: str) -> None:
+        if not len(scan):
+            raise ArgumentError(where, expected="one point or more", found="none", advice="leave the frame out")
+        if wrong := int((~torch.isfinite(scan)).any(1).sum()):
+            raise ArgumentError(where, expected="finite values", found=f"{wrong} points with others")
+        if "remission" in self.fields and not scan[:, 3].any():
+            raise ArgumentError(
+                where, expected="their remission in the fourth column, as in KITTI", found="zeros", advice="use js3cnet"
+            )
 
     def arguments(self, batch: Batch, dtype: torch.dtype = torch.float32) -> tuple[Any, ...]:
         """Return points and cells."""
@@ -101,15 +117,6 @@ class PointsAndVoxels(Task):
         for module in network.modules():
             if isinstance(module, nn.BatchNorm1d):  # the U-Net and the decoder have other classes, and keep theirs
                 module.momentum = max(0.5 * 0.5 ** (epoch // 10), 0.01)
-
-
-def check_scan(points: Tensor, where: str) -> None:
-    """Raise ArgumentError unless a scan has points, and finite ones."""
-    if not len(points):
-        raise ArgumentError(where, expected="one point or more", found="none", advice="leave the frame out")
-    if not torch.isfinite(points).all():
-        wrong = int((~torch.isfinite(points).all(1)).sum())
-        raise ArgumentError(where, expected="finite coordinates", found=f"{wrong} points without")
 
 
 def site_cells(xyz: Tensor, voxel_m: float, extent: int, draw: torch.Generator | None = None) -> tuple[Tensor, Tensor]:

@@ -64,6 +64,7 @@ def test_every_field_has_the_documented_shape_and_type(world):
         "points": ("float32", (300, 3)),
         "point_labels": ("uint8", (300,)),
         "flow": ("float32", (300, 3)),
+        "remission": ("float32", (300,)),
         "poses": ("float64", (3, 4, 4)),
         "valid": ("bool", (3,)),
     }
@@ -82,6 +83,7 @@ def test_values_are_those_of_the_files(world):
         np.testing.assert_array_equal(sample["points"], sequence.read("points", frame)[:, :3])
         np.testing.assert_array_equal(sample["point_labels"], remap(sequence.read("labels", frame)))
         np.testing.assert_array_equal(sample["flow"], sequence.read("flow", frame))
+        np.testing.assert_array_equal(sample["remission"], sequence.read("points", frame)[:, 3])
         np.testing.assert_array_equal(sample["labels"], remap(sequence.read("evaluation/labels", frame)))
         np.testing.assert_array_equal(sample["counts"], sequence.read("evaluation/counts", frame))
         np.testing.assert_array_equal(sample["known"], sample["counts"] > 0)
@@ -481,7 +483,8 @@ def test_an_empty_scan_is_an_empty_grid(tmp_path):
         (folder / name).write_bytes(b"")
     sample = Dataset(tmp_path, history=2, fields=FIELDS)[1]
     assert sample["valid"].all() and sample["occupancy"][0].any() and not sample["occupancy"][1].any()
-    assert sample["points"].shape == sample["flow"].shape == (0, 3) and sample["point_labels"].shape == (0,)
+    assert sample["points"].shape == sample["flow"].shape == (0, 3)
+    assert sample["point_labels"].shape == sample["remission"].shape == (0,)
 
 
 def test_open_source_objects_and_paths_give_the_same(world):

@@ -12,7 +12,7 @@ pytest.importorskip("torch", reason="needs carlasc[torch]")
 import torch
 from torch.utils.data import DataLoader, DistributedSampler
 
-RAGGED = ("points", "point_labels", "flow")
+RAGGED = ("points", "point_labels", "flow", "remission")
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 DENSE = tuple(field for field in FIELDS if field not in RAGGED)

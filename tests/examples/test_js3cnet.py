@@ -305,8 +305,19 @@ def test_a_scan_without_points_or_with_wrong_ones_is_named():
     }
     with pytest.raises(ArgumentError, match="Town01_Light 7: points: expected one point or more, found none"):
         task.prepare(batch, cpu)
-    with pytest.raises(ArgumentError, match="points: expected finite coordinates, found 1 points without"):
+    with pytest.raises(ArgumentError, match="points: expected finite values, found 1 points with others"):
         task.prepare({"points": [torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]])]}, cpu)
+
+
+def test_remission_is_the_fourth_column_where_a_network_takes_it_and_must_be_there():
+    task, cpu = PointsAndVoxels(remission=True), torch.device("cpu")
+    points, remission = torch.rand(5, 3), torch.rand(5)
+    (scan,) = task.prepare({"points": [points], "remission": [remission]}, cpu)["points"]
+    assert torch.equal(scan, torch.cat([points, remission[:, None]], 1))
+    with pytest.raises(ArgumentError, match="expected their remission .* found zeros: use js3cnet"):
+        task.prepare({"points": [points], "remission": [torch.zeros(5)]}, cpu)
+    (plain,) = PointsAndVoxels().prepare({"points": [points]}, cpu)["points"]
+    assert torch.equal(plain[:, :3], points) and not plain[:, 3].any()
 
 
 def test_class_weights_are_cube_roots_of_the_rarity():

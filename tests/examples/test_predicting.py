@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from helpers.completion import SPEC, write_split
 
 from carlasc import Dataset, GridSpec
 from carlasc import open as open_source
+from carlasc.core import CARLASC11
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.metrics import evaluate
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
 import torch
+from completion.config import Config
 from completion.networks import build_network
 from completion.predicting import Model, predict_dataset, predict_scans
 from completion.weights import read_weights, write_weights
@@ -45,7 +48,17 @@ def run(model, sample):
         return network(torch.from_numpy(sample["occupancy"]).float()[None]).argmax(-1)[0].numpy()
 
 
-@pytest.mark.parametrize(("name", "history"), [("motionsc", 3), ("lmscnet", 1), ("sscnet", 1), ("sscnet_full", 1)])
+@pytest.mark.parametrize(
+    ("name", "history"),
+    [
+        ("motionsc", 3),
+        ("lmscnet", 1),
+        ("sscnet", 1),
+        ("sscnet_full", 1),
+        ("js3cnet", 1),
+        ("js3cnet_kitti", 1),
+    ],
+)
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
 def test_weights_say_what_they_are_of(tmp_path, name, history, suffix):
     model = Model.read(save(tmp_path / f"weights{suffix}", name, history=history), history)
@@ -92,6 +105,41 @@ def test_a_folder_of_raw_scans_is_completed_and_mirrored_if_right_handed(data, t
     predict_scans(model, tmp_path / "mirrored", tmp_path / "right", CPU, "eager", spec=SPEC, right_handed=True)
     mirrored = open_source(tmp_path / "right").sequences()["cartesian"].grid("evaluation", 0).labels
     np.testing.assert_array_equal(mirrored, labels)
+
+
+def test_networks_of_points_complete_data_sets_and_raw_scans_alike(data, tmp_path):
+    model = Model.read(save(tmp_path / "net.pt", "js3cnet"))
+    assert predict_dataset(model, str(data), tmp_path / "out", CPU, "compile") == 3
+    scans = data / "Test/Town10_Light/cartesian/velodyne"
+    assert predict_scans(model, scans, tmp_path / "raw", CPU, "eager", spec=SPEC) == 3
+    (one,), (other,) = (open_source(tmp_path / name).sequences().values() for name in ("out", "raw"))
+    for frame in range(3):
+        np.testing.assert_array_equal(one.grid("evaluation", frame).labels, other.grid("evaluation", frame).labels)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "000000.bin").write_bytes(b"")
+    with pytest.raises(ArgumentError, match="points: expected one point or more, found none"):
+        predict_scans(model, tmp_path / "empty", tmp_path / "none", CPU, "eager", spec=SPEC)
+    with pytest.raises(ArgumentError, match="expected their remission"):
+        predict_scans(
+            Model.read(save(tmp_path / "kitti.pt", "js3cnet_kitti")), scans, tmp_path / "k", CPU, "eager", spec=SPEC
+        )
+
+
+def test_the_settings_of_a_run_tell_networks_with_the_same_weights_apart(tmp_path):
+    path = save(tmp_path / "best.pt", "js3cnet_exact")
+    assert Model.read(path).network == "js3cnet"
+    Config("js3cnet_exact").write(tmp_path / "config.yaml")
+    assert Model.read(path).network == "js3cnet_exact"
+    assert Model.read(save(tmp_path / "other.pt", "sscnet")).network == "sscnet"
+
+
+def test_points_of_another_class_table_are_refused(tmp_path):
+    model = Model.read(save(tmp_path / "kitti.pt", "js3cnet", classes=20))
+    assert model.classes.name == "semantickitti19"
+    with pytest.raises(
+        FormatError, match=r"seg_head.linear.weight: expected 10 x 16, found 19 x 16: .* number of classes"
+    ):
+        replace(model, classes=CARLASC11).complete_on(SPEC, CPU, "eager")
 
 
 def test_weights_that_do_not_fit_name_the_layer_and_both_shapes(tmp_path):

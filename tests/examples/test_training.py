@@ -85,11 +85,17 @@ def test_training_stops_early_when_nothing_gets_better(data, tmp_path):
         {"network": "lmscnet"},
         {"precision": "bf16"},
         {"network": "js3cnet_exact", "precision": "bf16"},
-        {"network": "js3cnet_kitti"},
     ],
 )
 def test_every_network_and_precision_trains(data, tmp_path, changes):
     progress = train(data, replace(QUICK, epochs=1, **changes), tmp_path, ALONE)
+    assert np.isfinite(progress.losses[0])
+
+
+def test_points_with_remission_train_the_network_that_takes_it(tmp_path):
+    for split in ("Train", "Val"):
+        write_split(tmp_path, split, [f"Town01_{split}"], frames=2, remission=0.5)
+    progress = train(tmp_path, replace(QUICK, network="js3cnet_kitti", epochs=1), tmp_path / "run", ALONE)
     assert np.isfinite(progress.losses[0])
 
 

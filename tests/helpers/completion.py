@@ -23,6 +23,7 @@ def write_split(
     classes=CLASSES,
     table="carla",
     certainty: float | None = None,
+    remission: float = 0.0,
 ) -> None:
     """Write sequences. A voxel with a point has the class of its quarter of the grid; all others are free.
 
@@ -39,7 +40,7 @@ def write_split(
             points = rng.uniform(SPEC.lower, SPEC.upper, (400, 3)).astype(np.float32)
             occupied = np.zeros(SPEC.size, bool)
             occupied.reshape(-1)[SPEC.flat_index(points)] = True
-            writer.write("points", frame, np.pad(points, ((0, 0), (0, 1))))
+            writer.write("points", frame, np.column_stack([points, np.full(len(points), remission, np.float32)]))
             labels = np.where(occupied, quarter[..., None], 0).astype(np.uint32)
             writer.write("evaluation/labels", frame, labels)
             writer.write("labels", frame, labels.reshape(-1)[SPEC.flat_index(points)])
