@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import leaky_relu, linear
+from torch.nn.functional import leaky_relu, linear, pad
 
 from carlasc import GridSpec
 from carlasc.errors import ArgumentError, import_extra
@@ -39,11 +39,11 @@ class Unit(nn.Module):
         self.add_module(name, layer)
         nn.init.kaiming_normal_(layer.weight)
         self.bn = nn.ModuleDict({"bn": nn.BatchNorm1d(len(layer.weight))})
-        self._name = name
+        self._weight = f"{name}.weight"
 
     def forward(self, rows: Tensor) -> Tensor:
         """Take (N, C) to (N, D)."""
-        return leaky_relu(self.bn["bn"](linear(rows, self.get_parameter(f"{self._name}.weight").flatten(1))), 0.2)
+        return leaky_relu(self.bn["bn"](linear(rows, self.get_parameter(self._weight).flatten(1))), 0.2)
 
 
 class SegmentationHead(nn.Module):
@@ -252,20 +252,25 @@ class JS3CNet(nn.Module):
             points: (N_i, 4) float32 of each scan, sensor frame, metres; the fourth column is used by some configurations.
             cells: (N_i, 3) int64, the U-Net's cell of each point, 0 or more (see `js3cnet.task.site_cells`).
         """
-        items = torch.arange(len(points), device=points[0].device)
-        items = items.repeat_interleave(torch.tensor([len(scan) for scan in points], device=items.device))
-        together = torch.cat(list(points))
-        logits, shape = self.seg_head(
-            together[:, self.channels], torch.cat([items.unsqueeze(1), torch.cat(list(cells)).long()], 1)
-        )
-        lower, voxel = _geometry(self.spec)
-        size = self.spec.size
-        grid = ((together[:, :3].double() - lower.to(together.device)) / voxel.to(together.device)).floor().long()
-        inside = ((grid >= 0) & (grid < torch.tensor(size, device=grid.device))).all(1)
-        x, y, z = grid.unbind(1)
-        flat = ((items * size[0] + x) * size[1] + y) * size[2] + z
-        volume = pool(torch.cat([logits, shape], 1)[inside], flat[inside], (len(points), *size))
+        logits, shape = self.segment(points, cells)
+        places = [self._places(scan[:, :3]) for scan in points]
+        flat = torch.cat([place + item * self.spec.num_voxels * (place >= 0) for item, place in enumerate(places)])
+        inside = flat >= 0
+        volume = pool(torch.cat([logits, shape], 1)[inside], flat[inside], (len(points), *self.spec.size))
         return Prediction(logits, self.complet_head(volume))
+
+    def segment(self, points: Sequence[Tensor], cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return (N, K - 1) logits and (N, 16) shape features of the points alone, scan after scan."""
+        keyed = [pad(scan, (1, 0), value=item) for item, scan in enumerate(cells)]
+        return self.seg_head(torch.cat(list(points))[:, self.channels], torch.cat(keyed))
+
+    def _places(self, xyz: Tensor) -> Tensor:
+        """Return the flat index of each point's voxel, -1 outside. The reference divides in float64, by bounds in float32."""
+        lower, voxel = (value.to(xyz.device) for value in _geometry(self.spec))
+        size = torch.tensor(self.spec.size, device=xyz.device)
+        grid = ((xyz.double() - lower) / voxel).floor().long()
+        x, y, z = grid.unbind(1)
+        return torch.where(((grid >= 0) & (grid < size)).all(1), (x * size[1] + y) * size[2] + z, -1)
 
 
 def _geometry(spec: GridSpec) -> tuple[Tensor, Tensor]:

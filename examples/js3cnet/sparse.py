@@ -30,7 +30,7 @@ class Level:
             int(cells[:, 1:].max()) + 3 if len(cells) else 3
         )  # a neighbour beyond the border has a key of its own
         self._keys, self.site_of = torch.unique(self._pack(cells), return_inverse=True)
-        self.cells = self._unpack(self._keys)
+        self.cells = cells.new_empty(len(self._keys), 4).index_copy_(0, self.site_of, cells)
 
     @cached_property
     def neighbours(self) -> list[tuple[Tensor, Tensor]]:
@@ -65,11 +65,6 @@ class Level:
         item, x, y, z = cells.unbind(1)
         return ((item * self._side + x + 1) * self._side + y + 1) * self._side + z + 1
 
-    def _unpack(self, keys: Tensor) -> Tensor:
-        side = self._side
-        item_x, y, z = keys // side**2, keys // side % side, keys % side
-        return torch.stack([item_x // side, item_x % side - 1, y - 1, z - 1], 1)
-
 
 class Sites(NamedTuple):
     """Features (S, C) at the sites of the last of `levels`, which are those that led here, the finest first."""
@@ -101,6 +96,9 @@ class ToPoints(nn.Module):
 class NormReLU(nn.Module):
     """Batch norm over the sites, then ReLU."""
 
+    running_mean: Tensor
+    running_var: Tensor
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.weight, self.bias = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
@@ -109,9 +107,9 @@ class NormReLU(nn.Module):
 
     def forward(self, sites: Sites) -> Sites:
         """Return sites of the same level. A single site has no variance: the running statistics are used for it."""
-        statistics = self.get_buffer("running_mean"), self.get_buffer("running_var")
         training = self.training and len(sites.features) > 1
-        normed = batch_norm(sites.features, *statistics, self.weight, self.bias, training, momentum=0.1, eps=1e-4)
+        own = self.running_mean, self.running_var, self.weight, self.bias
+        normed = batch_norm(sites.features, *own, training, momentum=0.1, eps=1e-4)
         return sites._replace(features=normed.relu_())
 
 

@@ -65,9 +65,9 @@ def test_default_collate_takes_every_dense_field_as_it_is(world):
 def test_collate_keeps_ragged_fields_as_lists(tmp_path):
     for seed, name in enumerate(("A", "B")):
         write_drive(tmp_path / name / "cartesian", [0], spec=SPEC, points=200 + 50 * seed)
-    dataset = Dataset(tmp_path, fields=("points", "labels", "point_labels", "flow"))
+    dataset = Dataset(tmp_path, fields=("points", "labels", "point_labels", "flow", "remission"))
     (batch,) = loader(dataset, workers=0, collate_fn=collate)
-    assert list(batch) == ["points", "labels", "point_labels", "flow", "valid", "sequence", "frame"]
+    assert list(batch) == ["points", "labels", "point_labels", "flow", "remission", "valid", "sequence", "frame"]
     assert [tuple(points.shape) for points in batch["points"]] == [(200, 3), (250, 3)]
     assert batch["labels"].shape == (2, *SPEC.size)
     for name in RAGGED:

@@ -333,3 +333,12 @@ def test_the_momentum_of_the_norms_of_points_falls_and_the_others_stay():
         found.append(norm.momentum)
     assert found == [0.5, 0.5, 0.25, 0.01]
     assert network.complet_head.upsample[1].momentum == 0.1
+
+
+def test_points_can_be_labelled_alone(golden, expected):
+    network = filled(golden, "A")
+    points = [torch.from_numpy(expected["A_points"])]
+    with torch.no_grad():
+        logits, shape = network.segment(points, [torch.from_numpy(expected["A_seg_coords"]).long()])
+    close(logits, expected["A_seg_logits"])
+    close(shape, expected["A_shape_feat"])

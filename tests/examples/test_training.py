@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.completion import write_split
 
+from carlasc.core import REMAPS
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
@@ -143,6 +144,31 @@ def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(
     np.testing.assert_allclose(found, np.arange(11) / 10)
 
 
+def test_the_mistakes_of_the_fork_of_js3cnet_are_not_made(data):
+    """Ground stays ground in the labels of points, and class weights are those of the voxel counts."""
+    from completion.data import class_weights, open_split
+
+    split = open_split(data, "train", replace(QUICK, network="js3cnet"), training=True)
+    sequence = split.sequences[0]
+    raw, found = sequence.read("labels", 0), split[0]["point_labels"]
+    np.testing.assert_array_equal(found, REMAPS["carlasc11"](raw))
+    weights = class_weights(data, split, replace(QUICK, network="js3cnet", class_weights="table"))
+    counts = [
+        4166593275,
+        42309744,
+        33332681,
+        8179519,
+        905663,
+        3083923,
+        235769663,
+        87601245,
+        112863867,
+        29816894,
+        13839655,
+    ]
+    np.testing.assert_allclose(weights, np.cbrt(counts[0] / np.array(counts)), rtol=1e-5)
+
+
 def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_path):
     from completion.data import open_split
 
@@ -155,6 +181,8 @@ def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_
     assert not sample["known"][8:][sample["occupancy"][-1][8:] > 0].any()
     assert np.isfinite(train(tmp_path, config, tmp_path / "run", ALONE).losses[0])
     assert read_weights(tmp_path / "run" / BEST)["seg_head_1_1.conv_classes.bias"].shape == (20,)
+    points = open_split(tmp_path, "train", replace(config, network="js3cnet"), training=True)[0]
+    assert set(np.unique(points["point_labels"])) == {0, 1, 9}
     write_split(tmp_path / "carla", "Train", ["Town01_Light"], frames=2)
     with pytest.raises(
         ArgumentError, match="remap: expected one for data with the classes carla, found semantickitti19"
