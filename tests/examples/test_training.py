@@ -192,7 +192,7 @@ def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_
 
 def test_settings_files_of_every_network_are_read(examples):
     files = sorted(examples.glob("*/*.yaml"))
-    assert len(files) == 7
+    assert len(files) == 8
     for file in files:
         assert Config.read(file, ["epochs=3"]).epochs == 3
     with pytest.raises(ArgumentError, match="found speed"):
