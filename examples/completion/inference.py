@@ -69,7 +69,7 @@ def prepare(
         device: the device that computes.
         mode: "eager" runs the network without compiling; "compile" compiles it at the first call, which takes about a minute, and is
             several times faster afterwards. On CUDA the program is replayed as a CUDA graph, with channels last. Networks whose inputs
-            have no fixed shapes are never compiled.
+            have no fixed shapes are always run eagerly in float32.
         bf16: compute in bfloat16; None does so on CUDA with "compile".
 
     Returns:
@@ -83,7 +83,7 @@ def prepare(
     if mode not in ("eager", "compile"):
         raise ArgumentError("mode", expected="eager or compile", found=repr(mode))
     if not task_of(network).fixed_shapes:
-        mode = "eager"
+        mode, bf16 = "eager", False
     if bf16 is None:
         bf16 = mode == "compile" and device.type == "cuda"
     dtype = torch.bfloat16 if bf16 else torch.float32

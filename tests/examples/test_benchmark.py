@@ -61,9 +61,10 @@ def test_seeds_are_averaged_and_their_spread_is_told():
 
 
 @pytest.mark.slow
-def test_the_published_weights_see_a_simulated_town(real, tmp_path):
+@pytest.mark.parametrize("weights", ["LMSC_11_T1B.pt", "SSC_Full_11_T1B.pt"])
+def test_the_published_weights_see_a_simulated_town(real, tmp_path, weights):
     """3 of the 30 frames of docs/networks.md: free space, poles and buildings are where the town has them."""
-    result = published.score_towns(real / "LMSC_11_T1B.pt", tmp_path, every=10, workers=1)
+    result = published.score_towns(real / weights, tmp_path, every=10, workers=1)
     iou = {name: 100 * value for name, value in result.class_iou.items()}
     assert iou["Free"] >= 90
     assert iou["Road"] >= 40

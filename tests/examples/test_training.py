@@ -229,7 +229,9 @@ def certain(tmp_path_factory):
     return root
 
 
-@pytest.mark.parametrize("network, free_ratio", [("lmscnet_ss", 0.0), ("lmscnet", 0.0), ("sscnet", 2.0)])
+@pytest.mark.parametrize(
+    "network, free_ratio", [("lmscnet_ss", 0.0), ("lmscnet", 0.0), ("sscnet", 2.0), ("js3cnet", 0.0)]
+)
 def test_training_on_certain_probabilities_is_training_on_labels(certain, tmp_path, network, free_ratio):
     config = replace(QUICK, network=network, free_ratio=free_ratio, epochs=1)
     hard = train(certain, config, tmp_path / "hard", ALONE)
