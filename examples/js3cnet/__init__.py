@@ -1,1 +1,1 @@
-"""JS3C-Net: what each point is, and from that what each voxel is."""
+"""JS3C-Net: joint segmentation of points and completion of scenes (Yan et al., AAAI 2021)."""

@@ -1,4 +1,4 @@
-"""JS3C-Net: a sparse U-Net labels the points, a dense network completes what they say, and both meet where points and voxels are near.
+"""JS3C-Net: a sparse U-Net labels the points, a dense network completes the scene from their logits, and near points refine each voxel.
 
 X. Yan et al.: Sparse Single Sweep LiDAR Point Cloud Segmentation via Learning Contextual Shape Priors from Scene Completion, AAAI 2021.
 """
@@ -25,7 +25,7 @@ NEIGHBOURS = 8
 
 
 class Prediction(NamedTuple):
-    """What the network says: (N, K - 1) logits of all points, scan after scan, and (B, X, Y, Z, K) logits of the voxels."""
+    """The output: (N, K - 1) logits of all points, scan after scan, and (B, X, Y, Z, K) logits of the voxels."""
 
     points: Tensor
     voxels: Tensor
@@ -148,7 +148,7 @@ def nearest(supports: Tensor, queries: Tensor, search: Search) -> Tensor:
 
 
 class Interaction(nn.Module):
-    """Adds to each coarse voxel what the points near it say of the shape."""
+    """Refines the logits of each coarse voxel with the shape features of the occupied voxels nearest to it."""
 
     lower: Tensor  # (3,) float32, the corner of the grid
     voxel: Tensor  # (3,) float32, the widths of a voxel

@@ -1,4 +1,4 @@
-"""How JS3C-Net is trained and used: points and voxels are both predicted, and the two losses weigh each other by learned numbers."""
+"""How JS3C-Net is trained and used: points and voxels are both predicted, with learned weights of the two losses."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class PointsAndVoxels(Task):
         return torch.cat([points[None], voxels]), torch.cat([weights[labels[labels >= 0]].sum()[None], counted])
 
     def balance(self, network: nn.Module, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return 1 / s^2 of both parts, and the sum of 2 ln s: the more uncertain a part is found to be, the less it weighs."""
+        """Return 1 / s^2 of both parts, and the sum of 2 ln s: the larger s is, the less its part weighs."""
         variances = torch.cat([network.get_parameter("seg_sigma"), network.get_parameter("complet_sigma")]) ** 2
         return 1 / variances, variances.log().sum()
 
@@ -115,7 +115,9 @@ class PointsAndVoxels(Task):
     def set_epoch(self, network: nn.Module, epoch: int) -> None:
         """Set the momentum of the norms of points and of neighbours, which falls every ten epochs."""
         for module in network.modules():
-            if isinstance(module, nn.BatchNorm1d):  # the U-Net and the decoder have other classes, and keep theirs
+            if isinstance(
+                module, nn.BatchNorm1d
+            ):  # those of the U-Net and of the decoder are of other types, and do not change
                 module.momentum = max(0.5 * 0.5 ** (epoch // 10), 0.01)
 
 
