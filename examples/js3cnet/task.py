@@ -115,9 +115,8 @@ class PointsAndVoxels(Task):
     def set_epoch(self, network: nn.Module, epoch: int) -> None:
         """Set the momentum of the norms of points and of neighbours, which falls every ten epochs."""
         for module in network.modules():
-            if isinstance(
-                module, nn.BatchNorm1d
-            ):  # those of the U-Net and of the decoder are of other types, and do not change
+            # The norms of the U-Net and of the decoder are of other types, and keep their momentum.
+            if isinstance(module, nn.BatchNorm1d):
                 module.momentum = max(0.5 * 0.5 ** (epoch // 10), 0.01)
 
 
