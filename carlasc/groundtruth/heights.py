@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,16 +30,29 @@ class Ground:
     below_m: float
 
 
+def ground_of(
+    points: NDArray[np.float32], labels: NDArray[np.unsignedinteger] | None, ground: Collection[int]
+) -> NDArray[np.float32]:
+    """Return the points on the ground: by their labels, or by their heights if they have none.
+
+    Args:
+        points: (N, 3) metres, in the frame of the sensor.
+        labels: (N,) class ids, or None.
+        ground: ids of the ground classes; if there are none, labels do not tell.
+    """
+    found = ground_points(points) if labels is None or not ground else np.isin(labels, sorted(ground))
+    return points[found]
+
+
 def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float) -> Ground | None:
     """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the sensor; None if there is none."""
     heights: list[NDArray[np.float32]] = []
     near: list[float] = []
     for points in scans:
-        usable = points[np.isfinite(points[:, :3]).all(axis=1), :3]
-        ground = usable[ground_points(usable)]
+        ground = points[ground_points(points), :3]
         distance = np.hypot(ground[:, 0], ground[:, 1])
         heights.append(ground[distance < reach_m, 2])
-        below = ground_height(usable)
+        below = ground_height(points)
         near += [below] if np.isfinite(below) else []
     if not near or not sum(map(len, heights)):
         return None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
+from carlasc.groundtruth.heights import ground_of
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.bounds import GroundBelow
@@ -22,7 +23,6 @@ from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
-from carlasc.motion.ground import ground_points
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
@@ -160,7 +160,7 @@ def _measure_grids(
         points, labels = _points(sequence, frame)
     except CarlascError:
         return
-    ground = _ground(sequence, points, labels)
+    ground = ground_of(points, labels, sequence.metadata.classes.ground)
     for name in sequence.grids:
         if sequence.predicted_by(name) is not None:  # a network makes mistakes, and may have other classes
             continue
@@ -180,14 +180,6 @@ def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArra
     keep &= distance <= (sequence.metadata.max_range_m or np.inf)
     labels = None if scan.labels is None or not scan.labels.any() else scan.labels[keep]
     return scan.points[keep], labels
-
-
-def _ground(
-    sequence: Sequence, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger] | None
-) -> NDArray[np.float32]:
-    """Return the points on the ground: by their labels, or by their heights if they have none."""
-    classes = sorted(sequence.metadata.classes.ground)
-    return points[ground_points(points) if labels is None or not classes else np.isin(labels, classes)]
 
 
 def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:

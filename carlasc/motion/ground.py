@@ -32,16 +32,21 @@ _MIN_CELLS, _MIN_SHARE = 20, 0.2  # a plane has so many cells, and this share of
 def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return which points of a scan lie on the ground.
 
-    Points more than half a metre below the ground, which are returns of mirror images, are not among them. If no plane is found below the
-    sensor, as in a scan of few points, no point is.
+    Points more than half a metre below the ground, which are returns of mirror images, are not among them, nor are points that are not
+    finite. If no plane is found below the sensor, as in a scan of few points, no point is.
 
     Args:
-        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first; finite.
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first.
 
     Returns:
         (N,) bool.
     """
     own = np.ascontiguousarray(points[:, :3], np.float32)
+    finite = np.isfinite(own).all(axis=1)
+    if not finite.all():
+        ground = np.zeros(len(own), np.bool_)
+        ground[finite] = ground_points(own[finite])
+        return ground
     sector, ring, lowest = _lowest(own)
     plane = _plane(own, lowest)
     if plane is None:
@@ -56,12 +61,13 @@ def ground_height(points: NDArray[np.floating]) -> float:
     ground do not change it. On a curved road it is off by the curve within some 10 m.
 
     Args:
-        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first; finite.
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first. Those that are
+            not finite do not count.
 
     Returns:
         Metres; NaN if no plane is found.
     """
-    own = np.ascontiguousarray(points[:, :3], np.float32)
+    own = np.ascontiguousarray(points[np.isfinite(points[:, :3]).all(axis=1), :3], np.float32)
     plane = _plane(own, _lowest(own)[2])
     return float("nan") if plane is None else float(plane[2])
 

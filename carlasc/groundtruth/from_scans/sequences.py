@@ -21,7 +21,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
 from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
-from carlasc.groundtruth.heights import find_ground, share_below
+from carlasc.groundtruth.heights import ground_of
 from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
@@ -213,12 +213,19 @@ class ScanSequence(StoredSequence):
         return notes
 
     def _share_below(self) -> float:
-        """Return the share of the ground points of some scans that are below the grid."""
-        frames = self.feed.frames
-        chosen = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int))]
-        scans = (self.feed.sequence.read("points", int(frame)) for frame in chosen)
-        ground = find_ground(scans, float(abs(self.plan.spec.upper[0])))
-        return 0.0 if ground is None else share_below(ground, self.plan.spec)
+        """Return the share of the ground points of some scans that are below the grid. Scans that cannot be read fail elsewhere."""
+        feed, spec = self.feed, self.plan.spec
+        chosen = feed.frames[np.unique(np.linspace(0, len(feed.frames) - 1, _LOOKED_AT).astype(int))]
+        heights = [np.empty(0, np.float32)]
+        for frame in chosen.tolist():
+            try:
+                scan = feed.sequence.scan(frame, () if feed.finds_ground else ("labels",))
+            except CarlascError:
+                continue
+            ground = ground_of(scan.points, scan.labels, feed.classes.ground)
+            heights.append(ground[np.hypot(ground[:, 0], ground[:, 1]) < abs(spec.upper[0]), 2])
+        below = np.concatenate(heights) < spec.lower[2]
+        return float(below.mean()) if len(below) else 0.0
 
 
 def _read_actors(writer: SequenceWriter, key: str) -> Actors | None:
