@@ -21,7 +21,7 @@ from carlasc.converting.trajectory import (
     PoseSource,
     at_frames,
     check_poses,
-    read_times,
+    frame_times,
     read_trajectory,
     scan_poses,
 )
@@ -47,6 +47,7 @@ class RecordingPlan:
         recording: what is read.
         writer: where it is written.
         times: (F,) seconds by frame number, by the recording's clock.
+        timed: whether the recording has times; if not, they are assumed.
         trajectory: poses of the vehicle by the same clock; None until they are estimated.
         poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
         pose_source: where poses come from.
@@ -61,6 +62,7 @@ class RecordingPlan:
     recording: Recording
     writer: SequenceWriter
     times: NDArray[np.float64]
+    timed: bool
     trajectory: Trajectory | None
     poses: NDArray[np.float64] | None
     pose_source: str
@@ -153,7 +155,8 @@ def plan_recording(
 ) -> RecordingPlan:
     """Read a recording's poses, times and boxes, check them, and find out which frames are missing. Nothing is written."""
     writer = sink.sequence(f"{recording.split}/{recording.name}/cartesian")
-    times = read_times(recording)
+    own_times = recording.times()
+    times = frame_times(recording, own_times)
     trajectory = read_trajectory(recording, times, pose_source, force=force)
     poses = None if trajectory is None else scan_poses(trajectory, recording, times)
     note = None
@@ -162,7 +165,8 @@ def plan_recording(
     boxes = _read_boxes(recording)
     flow = flow and (boxes is not None or (recording.has_labels and recording.has_instances))
     source = KISS_ICP if trajectory is None else FILE
-    plan = RecordingPlan(recording, writer, times, trajectory, poses, source, boxes, flow, note)
+    timed = own_times is not None
+    plan = RecordingPlan(recording, writer, times, timed, trajectory, poses, source, boxes, flow, note)
     for handle in recording.frames:
         if not writer.has("points", handle.number):
             plan.missing.add(handle.number)

@@ -33,6 +33,7 @@ from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.protocol import Sink
 
 if TYPE_CHECKING:
+    from carlasc.groundtruth import RegridResult
     from carlasc.groundtruth.options import FromScans, Voting
 
 Grids = Literal["scans", "voxels", "none"]
@@ -131,29 +132,29 @@ def convert(
         check_voxel_grid(plan, target)
     steps = Steps(progress, sum(len(plan.recording.frames) for plan in plans))
     done: list[Conversion] = []
-    with one_pool(workers, executor) as pool, ExitStack() as writers:
-        for plan in plans:
-            writers.enter_context(plan.writer)
-            done.append(Conversion(plan, converter, target, workers, pool, steps))
-            done[-1].run(metadata)
-    failures = [failure for conversion in done for failure in conversion.failures]
-    notes = [note for conversion in done for note in conversion.notes]
-    grid_paths: list[str] = []
-    if grids == "scans":
-        regridding = Regridding(spec, observe, voting, follow_ground, force, workers, executor, steps)
-        fitted, remarks = regridding.fit(done, sink.location)
-        notes += remarks
-        for conversion in done:
-            result = regridding.run(conversion, fitted)
-            grid_paths += result.grids
-            notes += result.notes
-            failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
+    made: list[RegridResult] = []
+    with one_pool(workers, executor) as pool:
+        with ExitStack() as writers:
+            for plan in plans:
+                writers.enter_context(plan.writer)
+                done.append(Conversion(plan, converter, target, workers, pool, steps))
+                done[-1].run(metadata)
+        failures = [failure for conversion in done for failure in conversion.failures]
+        notes = [note for conversion in done for note in conversion.notes]
+        if grids == "scans":
+            regridding = Regridding(spec, observe, voting, follow_ground, force, workers, pool, steps)
+            fitted, remarks = regridding.fit(done, sink.location)
+            notes += remarks
+            made = [regridding.run(conversion, fitted) for conversion in done]
+    for result in made:
+        notes += result.notes
+        failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
     return ConvertResult(
         tuple(plan.writer.location for plan in plans),
         sum(conversion.made for conversion in done),
         sum(len(plan.recording.frames) - len(plan.unfinished) for plan in plans),
         tuple(failures),
-        tuple(grid_paths),
+        tuple(path for result in made for path in result.grids),
         tuple(notes),
         time.perf_counter() - start,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
@@ -28,14 +27,13 @@ _SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences: what no v
 _JITTER_M = 0.05
 
 
-def read_times(recording: Recording) -> NDArray[np.float64]:
-    """Return (F,) seconds by frame number, by the recording's own clock; 10 Hz from 0 if the recording has no times.
+def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return (F,) seconds by frame number, by the recording's own clock, from the times that it gives; 10 Hz from 0 if it gives none.
 
     Raises:
         FormatError: a frame has no time.
     """
     frames = recording.frames[-1].number + 1
-    times = recording.times()
     if times is None:
         return np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S
     if len(times) < frames:
@@ -130,30 +128,26 @@ def estimate_poses(
 
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
     found: list[int] = []
-    seconds: deque[NDArray[np.floating]] = deque()
+    read_at: list[float] = []  # times of the frames that were read
 
-    def scans() -> Iterator[NDArray[np.float32]]:
+    def scans() -> Iterator[odometry.UsableScan]:
         for handle in recording.frames:
             step()
             try:
                 scan = assemble(handle.read(), rig, None, handle.location)
             except (CarlascError, OSError):
                 continue
-            if len(scan.points) < odometry.MIN_POINTS:
+            used = odometry.usable_points(scan.points)
+            if np.count_nonzero(used) < odometry.MIN_POINTS:
                 continue
             found.append(handle.number)
-            seconds.append(scan.fields.get("seconds", np.zeros(len(scan.points), np.float32)))
-            yield scan.points[:, :3]
+            read_at.append(float(times[handle.number]))
+            seconds = scan.fields.get("seconds")
+            yield scan.points[used, :3], None if seconds is None else seconds[used]
 
     nearest, farthest = odometry_range(converter)
-    poses = odometry.estimate_poses(
-        scans(),
-        seconds=(seconds.popleft() for _ in recording.frames),  # read beside the points
-        times=times[[handle.number for handle in recording.frames]],
-        min_range_m=nearest,
-        max_range_m=farthest,
-    )
-    return fill_gaps(found, poses, recording)
+    poses = list(odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest))
+    return fill_gaps(found, np.array(poses), recording)
 
 
 def odometry_range(converter: type[Converter]) -> tuple[float, float]:

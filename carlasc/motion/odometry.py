@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, islice
 from typing import Any
 
@@ -18,29 +18,30 @@ _NEAR_M = 8.0  # ground farther away is left out
 _START = 10  # scans from which the motion at the start is found
 _PERIOD_S = 0.1  # between scans whose times are not known
 
-_Scan = tuple[NDArray[np.float64], NDArray[np.float64] | None]  # points, and their seconds
+UsableScan = tuple[NDArray[np.floating], NDArray[np.floating] | None]
+"""(N, 3) points that `usable_points` chose, metres, and the (N,) time of each after the time of its frame, or None."""
 
 
 def estimate_poses(
     scans: Iterable[NDArray[np.floating]],
     *,
     seconds: Iterable[NDArray[np.floating]] | None = None,
-    times: NDArray[np.floating] | None = None,
+    times: Sequence[float] | NDArray[np.floating] | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
     voxel_size_m: float | None = None,
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Estimate the pose of every scan of a drive: see `follow_scans`.
+    """Estimate the pose of every scan of a drive from its usable points: see `follow_scans`.
 
     Args:
         scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
         seconds: (N,) time of each point of each scan, after the time of its frame.
-        times: (F,) seconds, increasing: the time of each frame, needed with `seconds`; None for frames at 10 Hz.
-        max_range_m: farther points are not used.
-        min_range_m: nearer points are not used.
-        voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
+        times: as in `follow_scans`, and so are the other arguments but these:
+        max_range_m: see there.
+        min_range_m: see there.
+        voxel_size_m: see there.
         total: number of scans, for `progress`.
         progress: called with the number of finished scans and the number of all scans.
 
@@ -53,7 +54,7 @@ def estimate_poses(
     """
     poses: list[Transform] = []
     limits = {"max_range_m": max_range_m, "min_range_m": min_range_m}
-    for pose in follow_scans(scans, seconds=seconds, times=times, voxel_size_m=voxel_size_m, **limits):
+    for pose in follow_scans(_usable(scans, seconds), times=times, voxel_size_m=voxel_size_m, **limits):
         poses.append(pose)
         if progress:
             progress(len(poses), total or len(poses))
@@ -61,10 +62,9 @@ def estimate_poses(
 
 
 def follow_scans(
-    scans: Iterable[NDArray[np.floating]],
+    scans: Iterable[UsableScan],
     *,
-    seconds: Iterable[NDArray[np.floating]] | None = None,
-    times: NDArray[np.floating] | None = None,
+    times: Sequence[float] | NDArray[np.floating] | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
     voxel_size_m: float | None = None,
@@ -82,9 +82,9 @@ def follow_scans(
     On a straight street without structure the distance driven is not determined, and the estimate is too short.
 
     Args:
-        scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
-        seconds: (N,) time of each point of each scan, after the time of its frame.
-        times: (F,) seconds, increasing: the time of each frame, needed with `seconds`; None for frames at 10 Hz.
+        scans: the usable points of each scan, sensor frame, right-handed or left-handed; the poses are in the same frame.
+        times: (F,) seconds, increasing: the time of each frame, needed with the times of points; None for frames at 10 Hz. A list may
+            grow while scans are taken, if it has the time of each scan by then.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
         voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
@@ -94,15 +94,14 @@ def follow_scans(
 
     Raises:
         DependencyError: kiss-icp is not installed.
-        ArgumentError: one of several scans has fewer than `MIN_POINTS` points, or not one time for each of its points.
     """
     pipeline: Any = import_extra("kiss_icp.kiss_icp", "kitti")
     config: Any = import_extra("kiss_icp.config", "kitti").KISSConfig()
     config.data.deskew = False
     config.data.max_range, config.data.min_range = max_range_m, min_range_m
     config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
-    checked = _checked(scans, seconds)
-    start = list(islice(checked, _START))
+    scans = iter(scans)
+    start = list(islice(scans, _START))
     motion = np.eye(4)
     for back in (False, True):  # the motion at the start is found when the scans were followed to the end and back
         odometry = pipeline.KissICP(config)
@@ -111,7 +110,7 @@ def follow_scans(
         motion = invert(motion)
     odometry = pipeline.KissICP(config)
     first_T_map: Transform | None = None
-    for number, scan in enumerate(chain(start, checked)):
+    for number, scan in enumerate(chain(start, scans)):
         motion = _register(odometry, scan, motion, _elapsed(times, number))
         pose = np.array(odometry.last_pose)
         first_T_map = invert(pose) if first_T_map is None else first_T_map
@@ -125,7 +124,9 @@ def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
         return used & np.isfinite(points[:, :3]).all(axis=1)
 
 
-def _checked(scans: Iterable[NDArray[np.floating]], seconds: Iterable[NDArray[np.floating]] | None) -> Iterator[_Scan]:
+def _usable(
+    scans: Iterable[NDArray[np.floating]], seconds: Iterable[NDArray[np.floating]] | None
+) -> Iterator[UsableScan]:
     """Yield the points of each scan that are used, and their seconds."""
     per_point = None if seconds is None else iter(seconds)
     sizes: list[int] = []
@@ -144,10 +145,10 @@ def _checked(scans: Iterable[NDArray[np.floating]], seconds: Iterable[NDArray[np
                 "seconds", expected=f"{len(points)} of scan {number}, one per point", found=str(len(own))
             )
         used = usable_points(points)
-        yield np.asarray(points[used, :3], np.float64), None if own is None else np.asarray(own, np.float64)[used]
+        yield points[used, :3], None if own is None else np.asarray(own)[used]
 
 
-def _register(odometry: Any, scan: _Scan, motion: Transform, elapsed_s: float, *, back: bool = False) -> Transform:
+def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: float, *, back: bool = False) -> Transform:
     """Register a scan, with the motion since the scan before as its prediction.
 
     Args:
@@ -162,17 +163,17 @@ def _register(odometry: Any, scan: _Scan, motion: Transform, elapsed_s: float, *
     """
     points, seconds = scan
     if seconds is not None:
-        at = -seconds if back else seconds
+        at = np.asarray(-seconds if back else seconds, np.float64)
         moved = slerp(np.stack([invert(motion), np.eye(4), motion]), np.array([-1.0, 0.0, 1.0]) * elapsed_s, at)
         points = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
     if not len(odometry.local_map.point_cloud()):
         odometry.last_pose = invert(motion)  # so that the first scan is at the origin
     odometry.last_delta = motion
-    odometry.register_frame(np.ascontiguousarray(points), np.zeros(0))
+    odometry.register_frame(np.ascontiguousarray(points, np.float64), np.zeros(0))
     return np.array(odometry.last_delta)
 
 
-def _elapsed(times: NDArray[np.floating] | None, number: int) -> float:
+def _elapsed(times: Sequence[float] | NDArray[np.floating] | None, number: int) -> float:
     """Return the seconds between a frame and the one before it; of the first frame, to the one after it."""
     if times is None or len(times) < 2:
         return _PERIOD_S
