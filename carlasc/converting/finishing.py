@@ -5,7 +5,7 @@ Scans are read from where they were written, not from the data set again, if the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,14 +16,14 @@ from carlasc.converting.actors import Velocity
 from carlasc.converting.assembling import Motion, Rig, assemble
 from carlasc.converting.axes import mirror_boxes, mirror_points
 from carlasc.converting.nearby import labels_nearby
+from carlasc.converting.outcomes import Fields, Outcome
 from carlasc.converting.protocol import FrameHandle
-from carlasc.converting.scans import make_fields, write_fields
+from carlasc.converting.scans import make_fields
 from carlasc.converting.target import Target
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
-from carlasc.errors import CarlascError, StorageError
 from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
 from carlasc.storage.protocol import SequenceWriter
 
@@ -74,44 +74,19 @@ class FinishBlock:
     flow: bool = True
 
 
-@dataclass
-class FinishResult:
-    """What was added to a frame.
-
-    Attributes:
-        number: frame number.
-        outputs: its fields, where the writer cannot be used in workers.
-        failure: error message, if it failed.
-    """
-
-    number: int
-    outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    failure: str | None = None
-
-
-def finish_block(block: FinishBlock) -> list[FinishResult]:
+def finish_block(block: FinishBlock) -> list[Outcome]:
     """Finish several frames, and write them if the writer can be used in workers."""
     return [_finish(job, block) for job in block.jobs]
 
 
-def _finish(job: FinishJob, block: FinishBlock) -> FinishResult:
-    result = FinishResult(job.handle.number)
-    try:
-        written = _read_back(job, block)
-        outputs = (_by_instances if job.tracks is None else _by_boxes)(written, job, block)
-    except StorageError:
-        raise  # every other frame would fail in the same way
-    except (CarlascError, OSError) as error:
-        result.failure = str(error)
-        return result
-    if block.writer.concurrent:
-        write_fields(block.writer, result.number, outputs)
-    else:
-        result.outputs = outputs
-    return result
+def _finish(job: FinishJob, block: FinishBlock) -> Outcome:
+    outcome = Outcome(job.handle.number)
+    add = _by_instances if job.tracks is None else _by_boxes
+    outcome.take(lambda: add(_read_back(job, block), job, block), block.writer)
+    return outcome
 
 
-def _read_back(job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
+def _read_back(job: FinishJob, block: FinishBlock) -> Fields:
     """Return points, instances, and labels of the data set, of a frame as they were written; only those that exist."""
     number, writer = job.handle.number, block.writer
     kept = ("points", "labels", "instances") if job.labelled else ("points", "instances")
@@ -123,7 +98,7 @@ def _read_back(job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
     return make_fields(scan, block.target, job.handle.location)
 
 
-def _by_instances(written: Mapping[str, NDArray[Any]], job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
+def _by_instances(written: Fields, job: FinishJob, block: FinishBlock) -> Fields:
     """Return the flow of a scan whose points have numbers: the velocity of each point's actor, zero for all other points."""
     if "instances" not in written or not block.flow:
         return {}
@@ -135,15 +110,14 @@ def _by_instances(written: Mapping[str, NDArray[Any]], job: FinishJob, block: Fi
     return {"flow": mirror_points(flow) if block.target.mirrored else flow}
 
 
-def _by_boxes(written: Mapping[str, NDArray[Any]], job: FinishJob, block: FinishBlock) -> dict[str, NDArray[Any]]:
+def _by_boxes(written: Fields, job: FinishJob, block: FinishBlock) -> Fields:
     """Return labels, instances, boxes and flow of a scan whose objects have boxes. Labels and instances of the data set are kept."""
     assert job.tracks is not None
     classes, mirrored = block.target.classes, block.target.mirrored
     points = mirror_points(written["points"]) if mirrored else written["points"]
     labels = written.get("labels")
     scan = Scan(np.ascontiguousarray(points[:, :3]), labels)
-    tracks = [track for track in job.tracks if track.pose(job.handle.number) is not None]
-    segments = segment_by_boxes(job.handle.number, scan, job.first_T_scan, tracks, ground=classes.ground)
+    segments = segment_by_boxes(job.handle.number, scan, job.first_T_scan, job.tracks, ground=classes.ground)
     fields: dict[str, NDArray[Any]] = {}
     if labels is None:
         fields["labels"] = _labels_of(scan.points, segments, classes, _labelled_nearby(job, block))
@@ -152,7 +126,7 @@ def _by_boxes(written: Mapping[str, NDArray[Any]], job: FinishJob, block: Finish
         for segment in segments:
             instances[segment.members] = segment.instance
         fields["instances"] = instances
-    boxes = _boxes_of(job, tracks)
+    boxes = _boxes_of(job, job.tracks)
     fields["boxes"] = (mirror_boxes(boxes) if mirrored else boxes).to_table()
     if block.flow:
         flow = np.zeros((len(scan), 3), np.float32)
@@ -195,7 +169,7 @@ def _labelled_nearby(
     return found
 
 
-def _boxes_of(job: FinishJob, tracks: list[Track]) -> Boxes:
+def _boxes_of(job: FinishJob, tracks: Sequence[Track]) -> Boxes:
     """Return the annotated boxes of a frame, and those of tracks that extend to it although nobody annotated them there."""
     number = job.handle.number
     there = set() if job.boxes is None else set(job.boxes.tracks.tolist())

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
+from carlasc.core.grids import most_frequent
 
 _CELLS_M = (0.25, 0.5, 1.0)  # how near labelled points must be: the smallest cell that has any decides
 _GROUND_CELLS_M = (0.5, 1.0, 2.0)  # in the plane: on the ground, the rings of two scans may be metres apart
@@ -56,10 +57,7 @@ def _by_cells(
     points: NDArray[np.floating], places: NDArray[np.floating], labels: NDArray[np.int64], size: float
 ) -> NDArray[np.uint32]:
     """Return the most frequent label in the cell of each point, the lowest of several; 0 where the cell is empty."""
-    pairs, counts = np.unique(_cells(places, size) * (1 << 16) + labels, return_counts=True)
-    cells, best = pairs >> 16, np.lexsort((pairs, -counts, pairs >> 16))
-    first = best[np.r_[True, np.diff(cells[best]) > 0]]
-    keys, winners = cells[first], pairs[first] & 0xFFFF
+    keys, winners = most_frequent(_cells(places, size), labels)
     wanted = _cells(points, size)
     rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     return np.where(keys[rows] == wanted, winners[rows], 0).astype(np.uint32)

@@ -32,9 +32,7 @@ def load_converter(name: str) -> type[Converter]:
         ArgumentError: no converter has that name.
         DependencyError: it cannot be loaded, or is not a converter.
     """
-    found = _load(GROUP, "converter", name)
-    if not (isinstance(found, type) and issubclass(found, Converter)):
-        raise _wrong_class(GROUP, "converter", name, found)
+    found: type[Converter] = _load(GROUP, Converter, name)
     return found
 
 
@@ -45,9 +43,7 @@ def load_exporter(name: str) -> type[Exporter]:
         ArgumentError: no exporter has that name.
         DependencyError: it cannot be loaded, or is not an exporter.
     """
-    found = _load(EXPORTERS, "exporter", name)
-    if not (isinstance(found, type) and issubclass(found, Exporter)):
-        raise _wrong_class(EXPORTERS, "exporter", name, found)
+    found: type[Exporter] = _load(EXPORTERS, Exporter, name)
     return found
 
 
@@ -71,23 +67,22 @@ def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
     return None
 
 
-def _load(group: str, kind: str, name: str) -> Any:
+def _load(group: str, base: type, name: str) -> Any:
+    """Return the class of an entry point, which inherits `base`."""
     entries = _entries(group)
     if name not in entries:
         raise ArgumentError(
             "name", expected=f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}", found=repr(name)
         )
+    where = f"{base.__name__.lower()} {name} ({entries[name].value})"
     try:
-        return entries[name].load()
+        found = entries[name].load()
     except Exception as error:  # code of another distribution may fail in any way
-        where = f"{kind} {name} ({entries[name].value})"
         raise DependencyError(where, problem=f"cannot be loaded: {error}") from error
-
-
-def _wrong_class(group: str, kind: str, name: str, found: object) -> DependencyError:
-    where = f"{kind} {name} ({_entries(group)[name].value})"
-    expected = f"a class that inherits carlasc.converting.{kind.capitalize()}"
-    return DependencyError(where, expected=expected, found=repr(found))
+    if not (isinstance(found, type) and issubclass(found, base)):
+        expected = f"a class that inherits carlasc.converting.{base.__name__}"
+        raise DependencyError(where, expected=expected, found=repr(found))
+    return found
 
 
 def _entries(group: str) -> dict[str, EntryPoint]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.axes import mirror_grid, mirror_spec
-from carlasc.core.grids import GridSpec
+from carlasc.core.grids import GridSpec, most_frequent
 from carlasc.storage.metadata import Axes
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -94,7 +94,9 @@ def resample_to(
         kept, place = _targets_of(cells[axis][rows], pair, source.size[axis])
         rows, places = rows[kept], [earlier[kept] for earlier in places] + [place]
     found = labels[tuple(cell[rows] for cell in cells)]
-    resampled = _majority(np.ravel_multi_index(tuple(places), target.size), found, target.num_voxels)
+    resampled = np.zeros(target.num_voxels, labels.dtype)
+    voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), found)
+    resampled[voxels] = winners.astype(labels.dtype)
     seen = known
     for axis in sorted(
         range(3), key=lambda axis: target.size[axis] / source.size[axis]
@@ -141,18 +143,6 @@ def _targets_of(
 def _cell_of(positions: NDArray[np.float64], spec: GridSpec, axis: int) -> NDArray[np.int64]:
     cells = (positions - spec.lower[axis]) / spec.voxel_size[axis]
     return np.floor(cells + _SNAP).astype(np.int64)
-
-
-def _majority(
-    voxel: NDArray[np.int64], labels: NDArray[np.unsignedinteger], num_voxels: int
-) -> NDArray[np.unsignedinteger]:
-    """Return (num_voxels,) the label that occurs most often in each voxel, the lowest of several, 0 where there is none."""
-    result = np.zeros(num_voxels, labels.dtype)
-    channels = int(labels.max(initial=0)) + 1
-    pairs, counts = np.unique(voxel * channels + labels, return_counts=True)
-    order = np.lexsort((-(pairs % channels), counts))  # the last one written wins
-    result[pairs[order] // channels] = (pairs[order] % channels).astype(labels.dtype)
-    return result
 
 
 def _any_by_target(

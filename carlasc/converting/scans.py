@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,11 @@ from numpy.typing import NDArray
 from carlasc.converting.actors import ActorSighting, find_actors
 from carlasc.converting.assembling import Assembled, Motion, Rig, assemble
 from carlasc.converting.axes import mirror_grid, mirror_points
+from carlasc.converting.outcomes import Fields, Outcome
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.target import Target
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
-from carlasc.errors import CarlascError, StorageError
 from carlasc.motion.odometry import usable_points
 from carlasc.storage import layout
 from carlasc.storage.protocol import SequenceWriter
@@ -64,21 +63,15 @@ class Block:
 
 
 @dataclass
-class FrameResult:
+class FrameResult(Outcome):
     """What was read of a frame.
 
     Attributes:
-        number: frame number.
-        outputs: its fields, where the writer cannot be used in workers.
-        failure: error message, if it failed.
         points: (N, 3) float32 that poses are estimated from, right-handed.
         actors: its numbered actors.
         unnumbered: number of its moving points that belong to no numbered actor.
     """
 
-    number: int
-    outputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    failure: str | None = None
     points: NDArray[np.float32] | None = None
     actors: tuple[ActorSighting, ...] = ()
     unnumbered: int = 0
@@ -90,36 +83,26 @@ def convert_block(block: Block) -> list[FrameResult]:
 
 
 def _convert(job: FrameJob, block: Block) -> FrameResult:
-    number, outputs = job.handle.number, dict[str, NDArray[Any]]()
-    result = FrameResult(number)
-    try:
-        if job.write or block.for_odometry or block.for_actors:
-            scan = assemble(job.handle.read(), block.rig, job.motion, job.handle.location)
-            if block.for_odometry:
-                result.points = scan.points[usable_points(scan.points), :3]
-            if block.for_actors:
-                result.actors = find_actors(scan.points, scan.labels, scan.instances, block.target.source)
-                result.unnumbered = _unnumbered(scan, block.target.source)
-            if job.write:
-                outputs = make_fields(scan, block.target, job.handle.location)
-        if block.voxels is not None:
-            outputs |= _voxel_fields(job.handle, block.voxels, block.target, block.writer)
-    except StorageError:
-        raise  # every other frame would fail in the same way
-    except (CarlascError, OSError) as error:
-        result.failure = str(error)
-        return result
-    if block.writer.concurrent:
-        write_fields(block.writer, number, outputs)
-    else:
-        result.outputs = outputs
+    result = FrameResult(job.handle.number)
+    result.take(lambda: _read(job, block, result), block.writer)
     return result
 
 
-def write_fields(writer: SequenceWriter, frame: int, fields: Mapping[str, NDArray[Any]]) -> None:
-    """Write a frame's fields in their order."""
-    for name, array in fields.items():
-        writer.write(name, frame, array)
+def _read(job: FrameJob, block: Block, result: FrameResult) -> Fields:
+    """Return the fields of a frame that are to be written, and note what else was asked for in the result."""
+    fields: dict[str, NDArray[Any]] = {}
+    if job.write or block.for_odometry or block.for_actors:
+        scan = assemble(job.handle.read(), block.rig, job.motion, job.handle.location)
+        if block.for_odometry:
+            result.points = scan.points[usable_points(scan.points), :3]
+        if block.for_actors:
+            result.actors = find_actors(scan.points, scan.labels, scan.instances, block.target.source)
+            result.unnumbered = _unnumbered(scan, block.target.source)
+        if job.write:
+            fields = make_fields(scan, block.target, job.handle.location)
+    if block.voxels is not None:
+        fields |= _voxel_fields(job.handle, block.voxels, block.target, block.writer)
+    return fields
 
 
 def make_fields(scan: Assembled, target: Target, where: str) -> dict[str, NDArray[Any]]:

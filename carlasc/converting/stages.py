@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from bisect import bisect
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.actors import ActorMotion, Velocity
 from carlasc.converting.finishing import FinishBlock, FinishJob, finish_block
+from carlasc.converting.outcomes import Outcome, write_fields
 from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
 from carlasc.converting.protocol import Converter, FrameHandle
 from carlasc.converting.results import Failure, Steps
-from carlasc.converting.scans import Block, FrameJob, FrameResult, convert_block, write_fields
+from carlasc.converting.scans import Block, FrameJob, FrameResult, convert_block
 from carlasc.converting.target import Target
 from carlasc.converting.trajectory import estimate_poses, fill_gaps, jitter_note, odometry_range
 from carlasc.core.boxes import Boxes
@@ -32,6 +34,9 @@ _BLOCK = 8  # frames that a worker converts in one task
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
 _GROUND_REACH_M = 25.0
 _NEAR_M = 250.0  # boxes farther away from the sensor hold no points
+
+Item = TypeVar("Item")
+Result = TypeVar("Result", bound=Outcome)
 
 
 @dataclass
@@ -110,7 +115,7 @@ class Conversion:
         ]
         actors = ActorMotion(converter.classes, self.workers, self.pool)
         found: dict[int, NDArray[np.float64]] = {}
-        for result, pose in self._placed(self._results(blocks)):
+        for result, pose in self._placed(self._work(convert_block, blocks)):
             if estimate:
                 found[result.number] = pose
             if follow:
@@ -131,19 +136,20 @@ class Conversion:
 
         waiting: deque[FrameResult] = deque()
 
-        def scans() -> Iterator[NDArray[np.float32]]:
+        def scans() -> Iterator[tuple[NDArray[np.float32], None]]:
             for result in usable:
                 if result.points is not None and len(result.points) >= MIN_POINTS:
                     points, result.points = result.points, None
                     waiting.append(result)
-                    yield points
+                    yield points, None
 
         nearest, farthest = odometry_range(self.converter)
         for pose in follow_scans(scans(), min_range_m=nearest, max_range_m=farthest):
             yield waiting.popleft(), pose
 
-    def _results(self, blocks: list[Block]) -> Iterator[FrameResult]:
-        with closing(run_all(convert_block, blocks, workers=self.workers, executor=self.pool)) as results:
+    def _work(self, function: Callable[[Item], list[Result]], blocks: list[Item]) -> Iterator[Result]:
+        """Yield what a function that works on blocks of frames returns for each frame; what workers cannot write is written here."""
+        with closing(run_all(function, blocks, workers=self.workers, executor=self.pool)) as results:
             for frames in results:
                 for result in frames:
                     write_fields(self.plan.writer, result.number, result.outputs)
@@ -182,13 +188,7 @@ class Conversion:
                 for handle in part
             ]
             blocks.append(FinishBlock(tuple(jobs), self.target, plan.writer, plan.rig, plan.flow))
-        with closing(run_all(finish_block, blocks, workers=self.workers, executor=self.pool)) as results:
-            for frames in results:
-                for result in frames:
-                    write_fields(plan.writer, result.number, result.outputs)
-                    if result.failure is not None:
-                        self._fail(result.number, result.failure)
-                self.steps(len(frames))
+        deque(self._work(finish_block, blocks), maxlen=0)  # frames are written; nothing is kept
 
     def _labelled_around(self, handle: FrameHandle) -> tuple[FinishJob, ...]:
         """Return the labelled frames before and after one that has no labels although others have."""
@@ -246,7 +246,7 @@ class Conversion:
             notes.append("there are no poses: they were estimated from the scans with KISS-ICP")
         elif plan.poses is not None:
             notes += [note for note in (plan.note, jitter_note(plan.poses)) if note]
-        if plan.recording.times() is None and plan.recording.rays:
+        if not plan.timed and plan.recording.rays:
             notes.append("there are no times: frames are taken to be 0.1 s apart")
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import (
     Transform,
     invert,
+    poses_from,
     quaternions_of,
-    rotations_of,
     transform_points,
 )
 from carlasc.errors import FormatError
@@ -146,10 +146,7 @@ class Boxes:
     @property
     def sensor_T_box(self) -> NDArray[np.float64]:
         """(N, 4, 4) float64 pose of each box."""
-        poses = np.tile(np.eye(4), (len(self), 1, 1))
-        poses[:, :3, :3] = rotations_of(self.quaternions)
-        poses[:, :3, 3] = self.centers
-        return poses
+        return poses_from(self.quaternions, self.centers)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Boxes:
         """Return the boxes that a mask or indices select."""

@@ -72,6 +72,14 @@ def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
+def poses_from(quaternions: NDArray[np.floating], translations: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the (N, 4, 4) transforms of (N, 4) quaternions w, x, y, z, of any length but 0, and (N, 3) translations."""
+    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
+    poses[:, :3, :3] = rotations_of(quaternions)
+    poses[:, :3, 3] = translations
+    return poses
+
+
 def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations; the first number that is not 0 is positive."""
     r = np.asarray(rotations, np.float64)

@@ -287,3 +287,23 @@ def _cells(width: float, step: float) -> int:
     """Return the number of cells of size `step` that cover `width`. The tolerance accounts for the float32 bounds of the format."""
     ratio = width / step
     return max(1, round(ratio) if abs(ratio - round(ratio)) <= 1e-4 else math.ceil(ratio))
+
+
+def most_frequent(
+    cells: NDArray[np.integer], labels: NDArray[np.integer]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the label that occurs most often in each cell, the lowest of several.
+
+    Args:
+        cells: (N,) numbers of cells, not negative; times the number of labels they must be below 2**63.
+        labels: (N,) labels, not negative.
+
+    Returns:
+        (C,) the cells that occur, increasing, and (C,) their labels.
+    """
+    channels = int(labels.max(initial=0)) + 1
+    pairs, counts = np.unique(cells.astype(np.int64) * channels + labels, return_counts=True)
+    owners = pairs // channels
+    order = np.lexsort((pairs, -counts, owners))
+    best = order[np.flatnonzero(np.diff(owners[order], prepend=-1))]
+    return owners[best], pairs[best] % channels

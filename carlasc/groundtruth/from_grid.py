@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec, most_frequent
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.inputs import (
     FrameData,
@@ -49,13 +49,11 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
     centers = grid.spec.from_axes(grid.spec.centers().reshape(-1, 3)[known])
     voxel = spec.flat_index(centers)
     inside = voxel >= 0
-    labels = grid.labels.reshape(-1)[known][inside].astype(np.int64)
+    labels = grid.labels.reshape(-1)[known][inside]
     weights = None if grid.counts is None else grid.counts.reshape(-1)[known][inside]
-    pairs, cells = np.unique(voxel[inside] * classes.num_channels + labels, return_counts=True)
-    # Sorted by increasing number of cells, then by decreasing id: the last one written wins.
-    order = np.lexsort((-(pairs % classes.num_channels), cells))
     coarse = np.zeros(spec.num_voxels, classes.dtype)
-    coarse[pairs[order] // classes.num_channels] = (pairs[order] % classes.num_channels).astype(classes.dtype)
+    voxels, winners = most_frequent(voxel[inside], labels)
+    coarse[voxels] = winners.astype(classes.dtype)
     counts = np.bincount(voxel[inside], weights, spec.num_voxels)
     return Grid(spec, coarse.reshape(spec.size), counts.astype(np.float32).reshape(spec.size))
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from carlasc.converting import (
     Cloud,
-    Converter,
     FrameHandle,
     Recording,
     Sensor,
@@ -27,10 +26,8 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
-    MAX_RANGE_M,
-    MIN_RANGE_M,
-    SCANNER,
     Calibration,
+    KittiConverter,
     frames_of,
     read_array,
     read_scan,
@@ -43,16 +40,12 @@ _STANDING = {  # class of moving actors -> class of the same actors when they st
 _TEST_FIRST, _VALIDATION = 11, 8
 
 
-class SemanticKitti(Converter):
+class SemanticKitti(KittiConverter):
     """Reads SemanticKITTI, one of its sequences, or KITTI odometry data."""
 
     title: ClassVar[str] = "SemanticKITTI, or KITTI odometry data without labels"
-    license = "CC BY-NC-SA 3.0"
     classes = SEMANTICKITTI
     to_carla = REMAPS["semantickitti_to_carla"]
-    sensor = SCANNER
-    min_range_m = MIN_RANGE_M
-    max_range_m = MAX_RANGE_M
 
     def sequences(self) -> list[Recording]:
         """Return the sequences, by number.

@@ -11,17 +11,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.geometry import Transform, check_rigid, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti360_classes import KITTI360, KITTI360_TO_CARLA
 from carlasc_converters.kitti360_labels import MAX_DISTANCE_M, label_points, window_at, windows_of
 from carlasc_converters.kitti_files import (
-    MAX_RANGE_M,
-    MIN_RANGE_M,
-    SCANNER,
     Calibration,
     FrameTimes,
+    KittiConverter,
     frames_of,
     read_scan,
     sweep_seconds,
@@ -32,16 +30,12 @@ _SCANS = "velodyne_points"
 _TICK_S = 1e-4  # points of so short a time have the same pose
 
 
-class Kitti360(Converter):
+class Kitti360(KittiConverter):
     """Reads KITTI-360: the whole data set, or one of its drives."""
 
     title: ClassVar[str] = "KITTI-360: Velodyne scans, with labels of the accumulated clouds where they exist"
-    license = "CC BY-NC-SA 3.0"
     classes = KITTI360
     to_carla = KITTI360_TO_CARLA
-    sensor = SCANNER
-    min_range_m = MIN_RANGE_M
-    max_range_m = MAX_RANGE_M
 
     def sequences(self) -> list[Recording]:
         """Return the drives, by number.

@@ -1,4 +1,4 @@
-"""The files that the data sets of the KITTI family have in common: scans, calibrations and time stamps."""
+"""What the data sets of the KITTI family have in common: the car and its scanner, and the files of scans, calibrations and time stamps."""
 
 from __future__ import annotations
 
@@ -10,15 +10,43 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.converting import Converter
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 
-SCANNER = "Velodyne HDL-64E"
 HEIGHT_M = 1.73  # of the scanner above the ground, on KITTI's car
-MIN_RANGE_M, MAX_RANGE_M = 2.5, 70.0
 _AGAIN = "copy it again"
 _NANOSECOND = np.timedelta64(1, "ns")
+
+
+class KittiConverter(Converter):
+    """A data set that KITTI's car recorded."""
+
+    license = "CC BY-NC-SA 3.0"
+    sensor = "Velodyne HDL-64E"
+    min_range_m = 2.5
+    max_range_m = 70.0
+
+
+def read_lines(path: Path, expected: str, content: str) -> list[str]:
+    """Return the lines of a text file, without spaces at their ends and without empty lines at the end of the file.
+
+    Args:
+        path: the file.
+        expected: what the file is for, in the error if it does not exist.
+        content: what it holds, in the error if it is not text.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it is not text.
+    """
+    try:
+        return [line.strip() for line in path.read_text().rstrip().splitlines()]
+    except FileNotFoundError:
+        raise MissingDataError(path, expected=expected, found="no such file", advice="copy it") from None
+    except UnicodeDecodeError as error:
+        raise FormatError(path, expected=content, found=f"a file that is not text ({error})") from error
 
 
 def read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
@@ -99,18 +127,11 @@ class Calibration:
             MissingDataError: the file does not exist.
             FormatError: it is not text.
         """
-        try:
-            lines = path.read_text().splitlines()
-        except FileNotFoundError:
-            raise MissingDataError(path, expected=expected, found="no such file", advice="copy it") from None
-        except UnicodeDecodeError as error:
-            found = f"a file that is not text ({error})"
-            raise FormatError(path, expected="NAME: and 12 numbers per line", found=found) from error
         values: dict[str, list[float]] = {}
-        for line in lines:
-            name, colon, rest = line.strip().partition(":")
+        for line in read_lines(path, expected, "NAME: and 12 numbers per line"):
+            name, colon, rest = line.partition(":")
             if not colon:
-                name, _, rest = line.strip().partition(" ")
+                name, _, rest = line.partition(" ")
                 name, rest = ("", line) if _is_number(name) else (name, rest)
             if all(map(_is_number, rest.split())):
                 values[name.strip()] = [float(value) for value in rest.split()]
@@ -158,12 +179,7 @@ def read_stamps(path: Path) -> NDArray[np.datetime64]:
         MissingDataError: the file does not exist.
         FormatError: a line is not a time.
     """
-    try:
-        lines = [line.strip() for line in path.read_text().rstrip().splitlines()]
-    except FileNotFoundError:
-        raise MissingDataError(path, expected="a time per frame", found="no such file", advice="copy it") from None
-    except UnicodeDecodeError as error:
-        raise FormatError(path, expected="a time per line", found=f"a file that is not text ({error})") from error
+    lines = read_lines(path, "a time per frame", "a time per line")
     stamps = np.full(len(lines), np.datetime64("NaT"), "datetime64[ns]")
     for number, line in enumerate(lines):
         try:

@@ -12,18 +12,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
-    MAX_RANGE_M,
-    MIN_RANGE_M,
-    SCANNER,
     Calibration,
     FrameTimes,
+    KittiConverter,
     frames_of,
     read_scan,
     read_stamps,
@@ -36,16 +34,12 @@ _DRIVE = re.compile(r"(\d{4}_\d\d_\d\d)_drive_(\d{4})_sync")
 _SCANS = "velodyne_points"
 
 
-class KittiRaw(Converter):
+class KittiRaw(KittiConverter):
     """Reads KITTI's raw data (the "synced+rectified" drives): all dates, one date, or one drive."""
 
     title: ClassVar[str] = "KITTI raw data: synced drives, with tracklets where they exist"
-    license = "CC BY-NC-SA 3.0"
     classes = KITTI
     to_carla = KITTI_TO_CARLA
-    sensor = SCANNER
-    min_range_m = MIN_RANGE_M
-    max_range_m = MAX_RANGE_M
 
     def sequences(self) -> list[Recording]:
         """Return the drives, by date and number.

@@ -11,18 +11,17 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW, BoxRows, class_of
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
-    MAX_RANGE_M,
-    MIN_RANGE_M,
-    SCANNER,
     Calibration,
+    KittiConverter,
     frames_of,
+    read_lines,
     read_scan,
     sweep_seconds,
 )
@@ -35,16 +34,12 @@ _MAX_TRACK = 2**32 - 1  # tracks are kept as uint32, and count from 1
 _COLUMNS = 17  # frame, track, type, truncated, occluded, alpha, box in the image (4), h w l, x y z, rotation about y
 
 
-class KittiTracking(Converter):
+class KittiTracking(KittiConverter):
     """Reads KITTI's tracking benchmark: both parts, or one of them."""
 
     title: ClassVar[str] = "KITTI tracking benchmark, with or without oxts"
-    license = "CC BY-NC-SA 3.0"
     classes = KITTI
     to_carla = KITTI_TO_CARLA
-    sensor = SCANNER
-    min_range_m = MIN_RANGE_M
-    max_range_m = MAX_RANGE_M
 
     def sequences(self) -> list[Recording]:
         """Return the sequences, by part and number.
@@ -144,7 +139,7 @@ class TrackingSequence(Recording):
         )
         lidar_T_camera = invert(camera_T_lidar)
         rows = BoxRows(str(path), self._numbers)
-        for line, row in enumerate(_lines(path), 1):
+        for line, row in enumerate(map(str.split, filter(None, read_lines(path, "boxes", "a line per box"))), 1):
             where = f"{path}: line {line}"
             if len(row) < _COLUMNS:
                 raise FormatError(where, expected=f"{_COLUMNS} columns", found=str(len(row)), advice="copy it again")
@@ -185,13 +180,6 @@ class TrackingFrame(FrameHandle):
         """Read the points, and find their times from their azimuths."""
         points = read_scan(self.location)
         return [Cloud(points, seconds=sweep_seconds(points, PERIOD_S))]
-
-
-def _lines(path: Path) -> list[list[str]]:
-    try:
-        return [line.split() for line in path.read_text().splitlines() if line.strip()]
-    except UnicodeDecodeError as error:
-        raise FormatError(path, expected="a line per box", found=f"a file that is not text ({error})") from error
 
 
 def _camera_T_box(center: NDArray[np.float64], turn_rad: float) -> Transform:

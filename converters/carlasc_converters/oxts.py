@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.kitti_files import read_lines
 
 COLUMNS = 30
 _EARTH_M = 6378137.0
@@ -23,12 +24,7 @@ def read_packets(path: Path) -> NDArray[np.float64]:
         MissingDataError: the file does not exist.
         FormatError: a line does not have 30 finite numbers.
     """
-    try:
-        lines = path.read_text().rstrip().splitlines()
-    except FileNotFoundError:
-        raise MissingDataError(path, expected="a packet of OXTS", found="no such file", advice="copy it") from None
-    except UnicodeDecodeError as error:
-        raise FormatError(path, expected="numbers", found=f"a file that is not text ({error})") from error
+    lines = read_lines(path, "a packet of OXTS", "numbers")
     packets = np.empty((len(lines), COLUMNS))
     for number, line in enumerate(lines):
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import rotations_of
+from carlasc.core.geometry import poses_from
 from carlasc.errors import FormatError
 
 _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
@@ -28,7 +28,4 @@ def poses_of(quaternions: NDArray[np.floating], translations: NDArray[np.floatin
         row = int(np.argmin(valid))
         found = f"{np.asarray(quaternions[row], np.float64).tolist()} in row {row}"
         raise FormatError(where, expected="a rotation: a quaternion w, x, y, z of length 1", found=found)
-    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
-    poses[:, :3, :3] = rotations_of(quaternions)
-    poses[:, :3, 3] = translations
-    return poses
+    return poses_from(quaternions, translations)

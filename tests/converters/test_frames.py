@@ -20,7 +20,7 @@ from carlasc.converting.places import check_outside
 from carlasc.converting.plans import begin, choose_recordings, plan_recording
 from carlasc.converting.scans import Block, FrameJob, convert_block, make_fields
 from carlasc.converting.target import Target
-from carlasc.converting.trajectory import jitter, read_times, read_trajectory, scan_poses
+from carlasc.converting.trajectory import frame_times, jitter, read_trajectory, scan_poses
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
@@ -157,11 +157,15 @@ def recording_of(poses, times=None, frames=(0, 1)):
     return MemoryRecording([frame_of([0], number=number) for number in frames], poses, times)
 
 
+def times_of(recording):
+    return frame_times(recording, recording.times())
+
+
 def test_poses_are_relative_to_the_first_frame_and_in_the_frame_of_the_first_sensor():
     world = np.stack([translation((5, 0, 0)) @ rotation_z(1.0), translation((6, 1, 0)) @ rotation_z(1.2)])
     recording = recording_of(world)
     recording.sensors = (Sensor("roof", translation((1.0, 0.0, 1.5)) @ rotation_z(0.5)),)
-    times = read_times(recording)
+    times = times_of(recording)
     trajectory = read_trajectory(recording, times, "auto", force=False)
     poses = scan_poses(trajectory, recording, times)
     scans = world @ translation((1.0, 0.0, 1.5))  # the axes are those of the vehicle
@@ -170,10 +174,10 @@ def test_poses_are_relative_to_the_first_frame_and_in_the_frame_of_the_first_sen
 
 def test_times_are_those_of_the_recording_or_a_tenth_of_a_second_apart():
     poses = np.tile(np.eye(4), (4, 1, 1))
-    assert read_times(recording_of(poses, np.array([3.0, 3.25]))).tolist() == [3.0, 3.25]
-    np.testing.assert_allclose(read_times(recording_of(poses, frames=(0, 3))), [0, 0.1, 0.2, 0.3])
+    assert times_of(recording_of(poses, np.array([3.0, 3.25]))).tolist() == [3.0, 3.25]
+    np.testing.assert_allclose(times_of(recording_of(poses, frames=(0, 3))), [0, 0.1, 0.2, 0.3])
     with pytest.raises(FormatError, match="expected a time for each frame up to 1, found 1 times"):
-        read_times(recording_of(poses, np.array([3.0])))
+        times_of(recording_of(poses, np.array([3.0])))
 
 
 def test_poses_at_their_own_times_are_interpolated():
@@ -181,7 +185,7 @@ def test_poses_at_their_own_times_are_interpolated():
     turning = np.stack([rotation_z(0.0), translation((2, 0, 0)) @ rotation_z(0.4)])
     recording.poses = lambda *, force=False: Trajectory(turning, np.array([10.0, 10.2]))
     recording.times = lambda: np.array([10.05, 10.1])
-    times = read_times(recording)
+    times = times_of(recording)
     poses = scan_poses(read_trajectory(recording, times, "auto", force=False), recording, times)
     half = translation((1, 0, 0)) @ rotation_z(0.2)
     quarter = translation((0.5, 0, 0)) @ rotation_z(0.1)

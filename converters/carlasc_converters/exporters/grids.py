@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -80,10 +81,7 @@ class GridExporter(FrameExporter):
             ArgumentError: the grid of that name is not Cartesian.
         """
         grids = {name: spec for name, spec in sequence.grids.items() if f"{name}/labels" in sequence.fields()}
-        return choose_grid(sequence, grids, self.grid, self._preference(sequence))
-
-    def _preference(self, sequence: storage.Sequence) -> tuple[GridSpec, TargetFrame]:
-        return self.target, self.frame_of(sequence)
+        return choose_grid(sequence, grids, self.grid, (self.target, self.frame_of(sequence)))
 
     def read(self, sequence: storage.Sequence, frame: int) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
         """Return a frame's grid in the target's voxels and classes: (X, Y, Z) labels, and which voxels are known.
@@ -152,6 +150,13 @@ def choose_grid(
             if is_same(frame.spec_in(candidate, sequence.metadata.axes), spec):
                 return name
     return min(flat, key=lambda name: (float(np.prod(flat[name].voxel_size)), name))
+
+
+def number_folders(names: Sequence[str], prefix: str, digits: int) -> dict[str, str]:
+    """Return a number of so many digits for each name: that of names which end in the prefix and a number, and the next free one of others."""
+    numbers = {name: match[1] for name in names if (match := re.search(rf"{prefix}(\d{{{digits}}})$", name))}
+    free = (f"{number:0{digits}d}" for number in range(10_000) if f"{number:0{digits}d}" not in numbers.values())
+    return {name: numbers.get(name) or next(free) for name in names}
 
 
 def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[float, bool]:

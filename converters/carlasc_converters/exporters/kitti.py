@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +14,7 @@ from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI1
 from carlasc.errors import MissingDataError
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
-from carlasc_converters.exporters.grids import choose_grid, read_points, scan_occupancy
+from carlasc_converters.exporters.grids import choose_grid, number_folders, read_points, scan_occupancy
 from carlasc_converters.exporters.occlusion import occluded_voxels
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 
@@ -68,9 +67,7 @@ class KittiExporter(FrameExporter):
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:
         """Return sequences/NN for each name: 08 for KITTI_08, and the next free number for other names."""
-        numbers = {name: match[1] for name in names if (match := re.search(r"KITTI_(\d\d)$", name))}
-        free = (f"{number:02d}" for number in range(10_000) if f"{number:02d}" not in numbers.values())
-        return {name: f"sequences/{numbers.get(name) or next(free)}" for name in names}
+        return {name: f"sequences/{number}" for name, number in number_folders(names, "KITTI_", 2).items()}
 
     def check(self, sequence: storage.Sequence) -> list[str]:
         """Check the grid and the classes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,7 +12,7 @@ from carlasc.core.benchmarks import IGNORED, SSCBENCH_TO_RAW, TO_SSCBENCH
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError
-from carlasc_converters.exporters.grids import GridExporter, read_points, scan_occupancy
+from carlasc_converters.exporters.grids import GridExporter, number_folders, read_points, scan_occupancy
 from carlasc_converters.kitti_voxels import pack_bits
 
 # The files hold raw ids of SemanticKITTI, which therefore stay; the set has no outliers.
@@ -56,9 +55,10 @@ class SscBenchExporter(GridExporter):
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:
         """Return data_2d_raw/2013_05_28_drive_XXXX_sync for each name: 0003 for KITTI360_0003, and the next free number for other names."""
-        numbers = {name: match[1] for name in names if (match := re.search(r"KITTI360_(\d{4})$", name))}
-        free = (f"{number:04d}" for number in range(10_000) if f"{number:04d}" not in numbers.values())
-        return {name: f"data_2d_raw/2013_05_28_drive_{numbers.get(name) or next(free)}_sync" for name in names}
+        return {
+            name: f"data_2d_raw/2013_05_28_drive_{number}_sync"
+            for name, number in number_folders(names, "KITTI360_", 4).items()
+        }
 
     def frames(self, sequence: storage.Sequence) -> list[int]:
         """Return every 5th frame that has the grid."""
