@@ -1,62 +1,71 @@
-"""Calling one function with many items in parallel: in processes of our own, or in any `concurrent.futures.Executor`."""
+"""Calling one function with many items in parallel: in processes of our own, in an executor of the caller, or on a Dask cluster."""
 
 from __future__ import annotations
 
 import os
-import signal
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager
-from multiprocessing import get_context
-from typing import Any, TypeVar
+from itertools import chain, islice
+from typing import TypeVar
 
 from carlasc.errors import ArgumentError, CarlascError
+from carlasc.running.clients import DaskClient, LazyClient, run_on_cluster
+from carlasc.running.pools import LostTaskError, OwnProcesses
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_TERMINATED = 128 + signal.SIGTERM
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-_GRACE_S = 3.0  # time given to a worker to remove the file that it was writing
+Engine = Executor | DaskClient | LazyClient
+"""What does work in parallel: any `concurrent.futures.Executor`, a `distributed.Client` of Dask, or what `open_cluster` yields."""
 
 
 def run_all(
     function: Callable[[Item], Result],
-    items: Sequence[Item],
+    items: Iterable[Item],
     *,
     workers: int | None = None,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
+    lost: Callable[[Item, str], Result] | None = None,
 ) -> Generator[Result, None, None]:
     """Yield `function(item)` for every item, in the order of the items.
 
-    At most twice as many items as workers are in progress at a time, so that memory use does not grow with the number of items.
+    At most twice as many items as workers are in progress at a time (four times as many on a cluster), so that memory use does not grow
+    with the number of items.
     Without an executor, the work is done in new processes with one thread each or, with one worker, in this process. When the
     generator is closed or interrupted, these processes stop at once, and each removes the file that it was writing. They import the
     caller's main module again: a script must guard its work with `if __name__ == "__main__":`.
 
+    If a worker process dies, the items that it worked on are worked on again by another, so a function may run more than once with an
+    item. An item that three worker processes died of is given up.
+
     Args:
         function: a top-level function; it and the items are pickled.
-        items: the arguments of the calls.
+        items: the arguments of the calls. They are taken as work proceeds, and making one may call `run_all` with the same executor.
         workers: number of processes, all cores if None. With an executor: the number of its workers.
         executor: does the work instead; it is left open.
+        lost: makes the result of an item that is given up, from the item and a message. Without it, such an item is an error.
 
     Raises:
         ArgumentError: `workers` is not positive.
-        CarlascError: a worker process died.
+        CarlascError: an item is given up and there is no `lost`, the worker processes of a caller's executor died, or the connection to
+            a cluster is lost.
     """
-    workers = count_workers(workers)
-    if isinstance(executor, _Processes):
-        yield from (
-            _submit_all(executor, _Task(function), items, 2 * workers) if len(items) > 1 else map(function, items)
-        )
-    elif executor is not None:
-        yield from _submit_all(executor, function, items, 2 * workers)
-    elif min(workers, len(items)) <= 1:
+    workers, waiting = count_workers(workers), iter(items)
+    first = list(islice(waiting, 2))
+    items, is_one = chain(first, waiting), len(first) < 2
+    if not first:
+        return
+    if executor is None and workers > 1 and not is_one:
+        with _own_processes(workers) as pool:
+            yield from _submit_all(pool, function, items, 2 * workers, lost)
+    elif executor is None or (isinstance(executor, OwnProcesses) and is_one):
         yield from map(function, items)
+    elif isinstance(executor, Executor):
+        yield from _submit_all(executor, function, items, 2 * workers, lost)
     else:
-        with _own_processes(min(workers, len(items))) as pool:
-            yield from _submit_all(pool, _Task(function), items, 2 * workers)
+        yield from run_on_cluster(executor, function, items, lost)
 
 
 def count_workers(workers: int | None) -> int:
@@ -74,16 +83,30 @@ def count_workers(workers: int | None) -> int:
 
 
 def _submit_all(
-    executor: Executor, function: Callable[[Item], Result], items: Sequence[Item], limit: int
+    executor: Executor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    limit: int,
+    lost: Callable[[Item, str], Result] | None,
 ) -> Iterator[Result]:
-    pending: deque[Future[Result]] = deque()
+    pending: deque[tuple[Item, Future[Result]]] = deque()
+
+    def take() -> Result:
+        item, future = pending.popleft()
+        try:
+            return future.result()
+        except LostTaskError as error:
+            if lost is None:
+                raise
+            return lost(item, str(error))
+
     try:
         for item in items:
             if len(pending) == limit:
-                yield pending.popleft().result()
-            pending.append(executor.submit(function, item))
+                yield take()
+            pending.append((item, executor.submit(function, item)))
         while pending:
-            yield pending.popleft().result()
+            yield take()
     except BrokenExecutor as error:
         raise CarlascError(
             "a worker process died",
@@ -91,12 +114,12 @@ def _submit_all(
             advice="try fewer `workers` or a coarser grid",
         ) from error
     finally:
-        for future in pending:
+        for _, future in pending:
             future.cancel()
 
 
 @contextmanager
-def one_pool(workers: int, executor: Executor | None) -> Iterator[Executor | None]:
+def one_pool(workers: int, executor: Engine | None) -> Iterator[Engine | None]:
     """Yield an executor for several calls of `run_all`, so that its processes start only once.
 
     It is `executor` if that is given, and None, which `run_all` takes for work in this process, with one worker.
@@ -115,70 +138,10 @@ def one_pool(workers: int, executor: Executor | None) -> Iterator[Executor | Non
 @contextmanager
 def _own_processes(workers: int) -> Iterator[Executor]:
     """Yield an executor whose processes end with the block, at once if the block fails or is interrupted."""
-    pool = _Processes(workers, mp_context=get_context("spawn"), initializer=_prepare_worker)
+    pool = OwnProcesses(workers)
     try:
         yield pool
     except BaseException:
         pool.stop()
         raise
     pool.shutdown()
-
-
-class _Processes(ProcessPoolExecutor):
-    """A pool whose processes ignore Ctrl-C, use one thread each, and can be stopped in the middle of a task.
-
-    Ctrl-C reaches all processes of a terminal; only the main process handles it, and stops the others.
-    """
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        with _inherited_by_workers():  # a pool starts its processes when tasks are submitted
-            return super().submit(fn, *args, **kwargs)
-
-    def stop(self) -> None:
-        """End the processes now; each is given time to remove the file that it was writing."""
-        processes = list((self._processes or {}).values())
-        self.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join(_GRACE_S)
-            if process.is_alive():
-                process.kill()
-
-
-@contextmanager
-def _inherited_by_workers() -> Iterator[None]:
-    """Within the block, block Ctrl-C and limit libraries to one thread: processes that are started in it inherit both."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-def _prepare_worker() -> None:
-    signal.signal(signal.SIGTERM, _exit_worker)
-
-
-def _exit_worker(*_: object) -> None:
-    raise SystemExit(_TERMINATED)
-
-
-class _Task:
-    """A function whose process ends on SIGTERM once the function has cleaned up, instead of taking the next task."""
-
-    def __init__(self, function: Callable[[Any], Any]) -> None:
-        self.function = function
-
-    def __call__(self, item: Any) -> Any:
-        try:
-            return self.function(item)
-        except SystemExit:
-            os._exit(_TERMINATED)

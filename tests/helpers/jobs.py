@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from carlasc.storage.files import write_atomic
@@ -51,3 +52,55 @@ def write_for_a_minute(path: Path) -> None:
 
     if path.suffix:
         write_atomic(path, write_slowly)
+
+
+def kill_itself_at_three(number: int) -> int:
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die_once(mark: Path) -> str:
+    """Kill the process that comes here first."""
+    try:
+        mark.touch(exist_ok=False)
+    except FileExistsError:
+        return mark.name
+    os.kill(os.getpid(), signal.SIGKILL)
+    return ""
+
+
+def name_of_process_soon(_: object) -> int:
+    time.sleep(0.005)
+    return os.getpid()
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 10) -> None:
+    """Wait until a condition holds; for tests, in the main process."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def write_own_number(path: Path) -> int:
+    """Write the number that a file is named after into it, slowly enough to be killed."""
+    time.sleep(0.005)
+    write_atomic(path, path.name.encode())
+    return int(path.name)
+
+
+def take_time(_: object) -> tuple[float, float]:
+    """Return when a task began and ended, in seconds of a clock that all processes share."""
+    begin = time.monotonic()
+    time.sleep(0.3)
+    return begin, time.monotonic()
+
+
+def compile_something(_: object) -> tuple[int, int]:
+    """Return this process, and how often it compiled a function that it did not find in the cache."""
+    from helpers.compiled import add_one
+
+    assert add_one(1) == 2
+    time.sleep(0.1)
+    return os.getpid(), sum(add_one.stats.cache_misses.values())

@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
@@ -72,10 +74,35 @@ def test_workers_are_deaf_to_ctrl_c():
     assert list(run_all(jobs.ignores_interrupt, range(2), workers=2)) == [True, True]
 
 
-def test_a_worker_that_is_killed_is_one_clear_line():
-    with pytest.raises(CarlascError, match="a worker process died: it ran out of memory, was killed") as caught:
-        list(run_all(jobs.kill_itself, range(4), workers=2))
+def test_what_a_killed_worker_worked_on_is_done_by_another(tmp_path: Path):
+    marks = [tmp_path / f"{number}" for number in range(4)]
+    assert list(run_all(jobs.die_once, marks, workers=2)) == ["0", "1", "2", "3"]
+
+
+def test_what_always_kills_its_worker_is_given_up_and_nothing_else():
+    results = run_all(jobs.kill_itself_at_three, range(8), workers=2, lost=lambda item, message: f"{item}: {message}")
+    found = list(results)
+    assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7]
+    assert found[3].startswith("3: a task: 3 worker processes died while they did it: they ran out of memory")
+
+
+def test_without_a_result_for_what_is_given_up_there_is_one_clear_line():
+    with pytest.raises(CarlascError, match="a task: 3 worker processes died while they did it") as caught:
+        list(run_all(jobs.kill_itself, range(2), workers=2))
     assert "\n" not in str(caught.value)
+
+
+def test_workers_that_cannot_start_are_one_clear_line(tmp_path: Path):
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "from carlasc.running import run_all\n"
+        "try:\n"
+        "    list(run_all(abs, range(4), workers=2))\n"
+        "except Exception as error:\n"
+        "    raise SystemExit(f'{type(error).__name__}: {error}')\n"
+    )
+    result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert "CarlascError: worker processes die as soon as they start: " in result.stderr.splitlines()[-1]
 
 
 def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file(tmp_path: Path):

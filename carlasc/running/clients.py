@@ -1,0 +1,165 @@
+"""Calling one function with many items on the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cached_property
+from itertools import islice, takewhile
+from typing import Any, Protocol, TypeVar
+
+from carlasc.errors import CarlascError, import_extra
+from carlasc.running.pools import LostTaskError
+from carlasc.running.workers import Session, run_task
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_AHEAD = 4  # tasks that the scheduler knows, per thread of the workers
+_LEAST = 32  # also with few threads, so that calls for several tasks at once are enough
+_TOGETHER = 16  # results that are fetched together, at most
+_COUNT_S = 1.0  # workers are counted again after this time
+
+
+class DaskClient(Protocol):
+    """What is used of a `distributed.Client`."""
+
+    id: str
+    status: str
+
+    def map(self, func: Any, *iterables: Any, **kwargs: Any) -> Any:
+        """Start tasks."""
+
+    def gather(self, futures: Any) -> Any:
+        """Return the results of tasks."""
+
+    def nthreads(self) -> Any:
+        """Return the number of threads of each worker."""
+
+
+class LazyClient:
+    """A client that connects when it is first used: a cluster starts no jobs for a run that has nothing to do, or wrong arguments.
+
+    Args:
+        connect: returns the client.
+    """
+
+    def __init__(self, connect: Callable[[], DaskClient]) -> None:
+        self._connect = connect
+
+    @cached_property
+    def client(self) -> DaskClient:
+        """The client of Dask."""
+        return self._connect()
+
+
+def run_on_cluster(
+    client: DaskClient | LazyClient,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    lost: Callable[[Item, str], Result] | None,
+) -> Generator[Result, None, None]:
+    """Yield `function(item)` for every item, in the order of the items; see `carlasc.running.run_all`.
+
+    The scheduler knows a few tasks per worker at a time, and gives those of a worker that died to others. A result stays on its worker
+    until it is asked for; then the scheduler forgets the task.
+
+    Raises:
+        CarlascError: the connection to the scheduler is lost, a worker has other versions, or an item is given up and there is no `lost`.
+    """
+    client = client.client if isinstance(client, LazyClient) else client
+    distributed = import_extra("distributed", "cluster")
+    with one_line_if_lost(client):
+        tasks = _Tasks(client, function, distributed)
+        waiting = iter(items)
+        try:
+            tasks.submit(list(islice(waiting, tasks.window)))
+            while tasks.pending:
+                yield from tasks.take(lost)
+                if len(tasks.pending) <= tasks.window // 2:  # several at once: a call costs as much as a task
+                    tasks.submit(list(islice(waiting, tasks.window - len(tasks.pending))))
+        finally:
+            _release(tasks.pending)
+
+
+class _Tasks:
+    """The tasks of a run that the scheduler knows, in the order of the items."""
+
+    def __init__(self, client: DaskClient, function: Callable[[Any], Any], distributed: Any) -> None:
+        import cloudpickle
+
+        self.pending: deque[tuple[Any, Any]] = deque()
+        self._client, self._function, self._session = client, function, Session.of(client.id)
+        self._dumps = cloudpickle.dumps
+        self._killed = distributed.scheduler.KilledWorker
+        self._threads, self._counted = 1, -_COUNT_S
+
+    @property
+    def window(self) -> int:
+        """Number of tasks that the scheduler should know. It grows when workers come."""
+        if time.monotonic() - self._counted > _COUNT_S:
+            self._threads, self._counted = sum(self._client.nthreads().values()), time.monotonic()
+        return max(_AHEAD * self._threads, _LEAST)
+
+    def submit(self, items: list[Any]) -> None:
+        """Start the tasks of some items."""
+        if items:
+            calls = [self._dumps((self._function, item)) for item in items]
+            name = os.urandom(8).hex()
+            keys = [f"carlasc-{name}-{number}" for number in range(len(calls))]
+            futures = self._client.map(run_task, [self._session] * len(calls), calls, key=keys)
+            self.pending.extend(zip(items, futures, strict=True))
+
+    def take(self, lost: Callable[[Any, str], Any] | None) -> Iterator[Any]:
+        """Yield the result of the first task, and those of the tasks after it that are done too."""
+        self.pending[0][1].exception()  # waits for its end
+        done = list(takewhile(lambda entry: entry[1].status == "finished", islice(self.pending, _TOGETHER)))
+        batch = [self.pending.popleft() for _ in range(max(len(done), 1))]
+        try:
+            yield from self._results(batch, lost, together=bool(done))
+        finally:
+            _release(batch)
+
+    def _results(
+        self, batch: list[tuple[Any, Any]], lost: Callable[[Any, str], Any] | None, *, together: bool
+    ) -> Iterator[Any]:
+        if together:
+            with suppress(self._killed):  # a result was lost with its worker, and so was the worker that made it again
+                yield from self._client.gather([future for _, future in batch])
+                return
+        for item, future in batch:
+            try:
+                result = future.result()
+            except self._killed as error:
+                if lost is None:
+                    raise LostTaskError from error
+                result = lost(item, str(LostTaskError()))
+            yield result
+
+
+def _release(tasks: Iterable[tuple[Any, Any]]) -> None:
+    """Let the scheduler forget tasks: it cancels those that are not done."""
+    for _, future in tasks:
+        future.release()
+
+
+@contextmanager
+def one_line_if_lost(client: DaskClient) -> Iterator[None]:
+    """Raise an error of one line if the connection to the scheduler is lost in the block."""
+    from distributed.client import CancelledError
+
+    try:
+        yield
+    except CarlascError:
+        raise
+    except Exception as error:
+        if client.status == "running" and not isinstance(error, CancelledError):
+            raise  # an error of the function
+        raise CarlascError(
+            f"the scheduler {getattr(getattr(client, 'scheduler', None), 'address', '')}".rstrip(),
+            problem="the connection was lost",
+            advice="see whether it still runs, and run the same command again to continue",
+        ) from error

@@ -1,0 +1,202 @@
+"""A pool of processes of our own, which stop at once when they are told to, and which are replaced when they die."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any
+
+from carlasc.errors import CarlascError
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+"""Variables of the environment that set the number of threads of the libraries that compute."""
+
+DEATHS = 3
+"""A task whose worker process died so many times is not tried again."""
+
+_TERMINATED = 128 + signal.SIGTERM
+_GRACE_S = 3.0  # time given to a worker to remove the file that it was writing
+
+
+class LostTaskError(CarlascError):
+    """A task killed every worker process that tried it, or was there when they were killed."""
+
+    def __init__(self, where: object = "a task") -> None:
+        super().__init__(
+            where,
+            problem=f"{DEATHS} worker processes died while they did it: they ran out of memory, crashed, or were killed",
+            advice="try fewer `workers` or a coarser grid",
+        )
+
+
+class OwnProcesses(Executor):
+    """Processes that ignore Ctrl-C, use one thread each, and can be stopped in the middle of a task.
+
+    Ctrl-C reaches all processes of a terminal; only the main process handles it, and stops the others. When a process dies, all are
+    replaced, and the tasks that were lost run again, one at a time: so one that kills its process takes no other with it. A task that
+    is lost three times raises LostTaskError.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._workers, self._pool = workers, _Pool(workers)
+        self._tasks: dict[int, _Task] = {}
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Start a task. Its result is asked for in the thread that submits."""
+        task = _Task(self, _Cleanly(fn), args, kwargs)
+        try:
+            task.start(self._pool)
+        except BrokenProcessPool:
+            self.recover()
+            task.start(self._pool)
+        self._tasks[id(task)] = task
+        return task
+
+    def stop(self) -> None:
+        """End the processes now; each is given time to remove the file that it was writing."""
+        self._tasks.clear()
+        self._pool.stop()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes when they have done their tasks."""
+        self._pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def recover(self) -> None:
+        """Do the tasks again that were lost when a process died, each alone in a process, and replace the processes.
+
+        Raises:
+            CarlascError: new processes die before they do anything.
+        """
+        self._pool.shutdown()
+        self._pool = _Pool(1)
+        for task in [task for task in self._tasks.values() if task.was_lost()]:
+            for _ in range(DEATHS - 1):
+                self._renew(1)
+                task.start(self._pool)
+                if not task.was_lost():
+                    break
+        self._pool.shutdown()
+        self._pool = _Pool(self._workers)
+        self._renew(self._workers)
+
+    def forget(self, task: _Task) -> None:
+        """Forget a task whose result was taken."""
+        self._tasks.pop(id(task), None)
+
+    def _renew(self, workers: int) -> None:
+        """Replace the processes if one has died."""
+        for _ in range(DEATHS):
+            if self._is_alive():
+                return
+            self._pool.shutdown()
+            self._pool = _Pool(workers)
+        if not self._is_alive():
+            raise CarlascError(
+                "worker processes die as soon as they start",
+                problem='there is no memory for them, or they are started by a script without `if __name__ == "__main__":`',
+                advice="try fewer `workers`",
+            )
+
+    def _is_alive(self) -> bool:
+        try:
+            return self._pool.submit(int).exception() is None
+        except BrokenProcessPool:
+            return False
+
+
+class _Task(Future[Any]):
+    """A task that its pool may start several times."""
+
+    def __init__(
+        self, pool: OwnProcesses, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> None:
+        super().__init__()
+        self._owner, self._call, self._attempt = pool, (function, args, kwargs), Future[Any]()
+
+    def start(self, pool: ProcessPoolExecutor) -> None:
+        function, args, kwargs = self._call
+        self._attempt = pool.submit(function, *args, **kwargs)
+
+    def was_lost(self) -> bool:
+        """Return whether the process died; waits for the end of the task."""
+        return isinstance(self._attempt.exception(), BrokenProcessPool)
+
+    def result(self, timeout: float | None = None) -> Any:
+        try:
+            return self._attempt.result(timeout)
+        except BrokenProcessPool:
+            self._owner.recover()
+        finally:
+            self._owner.forget(self)
+        try:
+            return self._attempt.result(timeout)
+        except BrokenProcessPool as error:
+            raise LostTaskError from error
+
+    def cancel(self) -> bool:
+        self._owner.forget(self)
+        return self._attempt.cancel()
+
+
+class _Pool(ProcessPoolExecutor):
+    """The processes of a moment: when one dies, the others end too."""
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(workers, mp_context=get_context("spawn"), initializer=_prepare_worker)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        with inherited_by_workers():  # a pool starts its processes when tasks are submitted
+            return super().submit(fn, *args, **kwargs)
+
+    def stop(self) -> None:
+        processes = list((self._processes or {}).values())
+        self.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join(_GRACE_S)
+            if process.is_alive():
+                process.kill()
+
+
+@contextmanager
+def inherited_by_workers() -> Iterator[None]:
+    """Within the block, block Ctrl-C and limit libraries to one thread: processes that are started in it inherit both."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _prepare_worker() -> None:
+    signal.signal(signal.SIGTERM, _exit_worker)
+
+
+def _exit_worker(*_: object) -> None:
+    raise SystemExit(_TERMINATED)
+
+
+class _Cleanly:
+    """A function whose process ends on SIGTERM once the function has cleaned up, instead of taking the next task."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return self.function(*args, **kwargs)
+        except SystemExit:
+            os._exit(_TERMINATED)

@@ -1,0 +1,158 @@
+"""What a worker of a cluster does before its first task: it compares versions, limits threads, and lets one worker of a host compile."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import platform
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
+from functools import cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+import carlasc
+from carlasc.errors import CarlascError
+from carlasc.running.pools import ONE_THREAD
+
+
+@dataclass(frozen=True)
+class Versions:
+    """The versions on which results depend.
+
+    Attributes:
+        carlasc: version of the package, and a digest of its source: rules change between versions too.
+        python: version of Python, without its last part.
+        numpy: version of NumPy.
+        numba: version of Numba.
+    """
+
+    carlasc: str
+    python: str
+    numpy: str
+    numba: str
+
+    @classmethod
+    def here(cls) -> Self:
+        """Return the versions of this process."""
+        return cls(
+            f"{carlasc.__version__} (source {_digest_of_source()})",
+            ".".join(platform.python_version_tuple()[:2]),
+            version("numpy"),
+            version("numba"),
+        )
+
+    def check(self, other: Versions, worker: str) -> None:
+        """Check that a worker has these versions.
+
+        Raises:
+            CarlascError: it has others.
+        """
+        names = [field.name for field in fields(self) if getattr(self, field.name) != getattr(other, field.name)]
+        if names:
+            raise CarlascError(
+                f"worker {worker}",
+                expected=" and ".join(f"{name} {getattr(self, name)}" for name in names),
+                found=" and ".join(f"{name} {getattr(other, name)}" for name in names),
+                advice="install the same versions on all workers, or results would depend on who made them",
+            )
+
+
+@cache
+def _digest_of_source() -> str:
+    root, digest = Path(carlasc.__file__).parent, hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+@dataclass(frozen=True)
+class Session:
+    """What all tasks of a run have in common.
+
+    Attributes:
+        name: unique name of the run.
+        versions: those of the process that started it.
+        folder: its current folder, which relative paths start from.
+    """
+
+    name: str
+    versions: Versions
+    folder: str
+
+    @classmethod
+    def of(cls, name: str) -> Self:
+        """Return the session of this process with a name."""
+        return cls(name, Versions.here(), str(Path.cwd()))
+
+
+def run_task(session: Session, call: bytes) -> Any:
+    """Call a function with an item, in a worker.
+
+    Args:
+        session: the run.
+        call: the pickled function and item.
+
+    Raises:
+        CarlascError: the worker has other versions, or lacks a package.
+    """
+    _prepare(session)
+    try:
+        function, item = pickle.loads(call)
+    except (ImportError, AttributeError) as error:
+        raise CarlascError(
+            f"worker {_name()}",
+            problem=f"it cannot load the work: {error}",
+            advice="install the same packages on all workers",
+        ) from error
+    with _compiling(session, function, item):
+        return function(item)
+
+
+@cache
+def _prepare(session: Session) -> None:
+    """Check the versions of this process, and set it up for a run."""
+    session.versions.check(Versions.here(), _name())
+    for name in ONE_THREAD:  # a worker has one thread: libraries that were not loaded yet follow
+        os.environ.setdefault(name, "1")
+    with suppress(OSError):  # a worker without this folder can still read absolute paths and URLs
+        os.chdir(session.folder)
+
+
+def _name() -> str:
+    from distributed import get_worker
+
+    return str(get_worker().address)
+
+
+_compiled: set[tuple[str, str]] = set()
+
+
+@contextmanager
+def _compiling(session: Session, function: Callable[[Any], Any], item: Any) -> Iterator[None]:
+    """Let the first task of a kind run alone on its host: what it compiles is cached, and the other workers load it."""
+    import fcntl
+
+    called = function.func if isinstance(function, partial) else function
+    name = f"{called.__module__}.{getattr(called, '__qualname__', type(called).__qualname__)}.{type(item).__qualname__}"
+    if (session.name, name) in _compiled:
+        yield
+        return
+    folder = Path(tempfile.gettempdir()) / f"carlasc-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    digest = hashlib.sha256(name.encode()).hexdigest()[:16]
+    with (folder / f"{digest}.lock").open("a+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # it is free again when this process ends, however it ends
+        file.seek(0)
+        if file.read() == session.name:
+            fcntl.flock(file, fcntl.LOCK_UN)
+            yield
+        else:
+            yield
+            file.truncate(0)
+            file.write(session.name)
+    _compiled.add((session.name, name))

@@ -1,0 +1,104 @@
+"""Clusters that cannot be used, or that break in the middle."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+from helpers import clusters, jobs
+
+from carlasc.errors import ArgumentError, CarlascError
+from carlasc.running import open_cluster, run_all
+
+pytestmark = pytest.mark.needs("distributed")
+
+
+def run(where: str, count: int = 4, workers: int | None = None) -> list[int]:
+    with open_cluster(where, workers=workers) as cluster:
+        return list(run_all(jobs.square, range(count), executor=cluster))
+
+
+@pytest.mark.parametrize("where", ["nonsense", "local:0", "local:x", "no.such.Class", "carlasc.NoSuchClass", ""])
+def test_what_is_no_cluster(where):
+    with pytest.raises(ArgumentError, match=r"cluster: expected local, local:N, tcp://HOST:PORT, slurm, or the dotted"):
+        run(where)
+
+
+def test_two_numbers_of_workers_contradict_each_other():
+    with pytest.raises(ArgumentError, match="workers: expected none beside local:2, found 3"):
+        run("local:2", workers=3)
+
+
+def test_no_scheduler_at_the_address(monkeypatch):
+    monkeypatch.setenv("DASK_CARLASC__CONNECT_TIMEOUT", "0.5s")
+    import dask
+
+    with dask.config.set({"carlasc.connect-timeout": "0.5s"}):
+        for where in ("tcp://127.0.0.1:1", "tls://127.0.0.1:1", "tcp://nowhere.invalid:8786"):
+            with pytest.raises(CarlascError, match=f"^cluster {where}: no scheduler answers: ") as caught:
+                run(where)
+            assert "\n" not in str(caught.value)
+
+
+def test_no_work_opens_nothing():
+    with open_cluster("tcp://127.0.0.1:1") as cluster:
+        assert list(run_all(jobs.square, [], executor=cluster)) == []
+
+
+@pytest.mark.slow
+def test_a_cluster_without_workers(tmp_path: Path):
+    import dask
+
+    with pytest.raises(ArgumentError, match="workers: expected the number of jobs or workers that helpers"):
+        run("helpers.clusters.no_workers")
+    with pytest.raises(CarlascError, match="cluster helpers.clusters.broken: it does not start: no more machines"):
+        run("helpers.clusters.broken")
+    with (
+        dask.config.set({"carlasc.workers-timeout": "300ms"}),
+        clusters.scheduler(tmp_path) as (address, _),
+        pytest.raises(CarlascError, match="no worker came within 0.3 s: look at its jobs"),
+    ):
+        run(address)
+
+
+@pytest.mark.slow
+def test_workers_with_other_versions_and_workers_without_carlasc(tmp_path: Path):
+    wrong = {
+        "import carlasc; carlasc.__version__ = '0.0.1'": r"carlasc 0\.0\.1",
+        "sys.modules['carlasc'] = None": "none",
+    }
+    with clusters.scheduler(tmp_path) as (address, _):
+        for before, found in wrong.items():
+            message = rf"^worker tcp://\S+: expected carlasc .* found {found}"
+            with clusters.worker(address, before), pytest.raises(CarlascError, match=message):
+                run(address)
+        with clusters.worker(address):
+            assert run(address) == [0, 1, 4, 9]
+
+
+@pytest.mark.slow
+def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
+    other = "import carlasc; carlasc.__version__ = '0.0.1'"
+    with clusters.scheduler(tmp_path) as (address, _), clusters.worker(address), open_cluster(address) as cluster:
+        results = run_all(jobs.name_of_process, range(1000), executor=cluster)
+        next(results)
+        with clusters.worker(address, other), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
+            list(results)
+
+
+def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
+    with clusters.scheduler(tmp_path) as (address, process), clusters.worker(address), open_cluster(address) as cluster:
+        results = run_all(jobs.name_of_process, range(1000), executor=cluster)
+        next(results)
+        process.send_signal(signal.SIGKILL)
+        with pytest.raises(
+            CarlascError, match=f"^the scheduler {address}: the connection was lost: see whether"
+        ) as caught:
+            list(results)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_class_that_starts_a_cluster():
+    assert run("helpers.clusters.two_workers") == [0, 1, 4, 9]
