@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import copy
 import importlib
+import re
 from types import ModuleType
 from typing import Self
+
+_USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
+_QUERY = re.compile(r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*")  # a signature or a token
 
 
 class CarlascError(Exception):
@@ -27,10 +31,9 @@ class CarlascError(Exception):
     def __init__(
         self, where: object, *, problem: str = "", expected: str = "", found: str = "", advice: str = ""
     ) -> None:
-        super().__init__(
-            str(where)
-        )  # the only positional argument, so that errors pickle: the rest travels in __dict__
-        self.where, self.problem = str(where), problem
+        shown = without_credentials(str(where))
+        super().__init__(shown)  # the only positional argument, so that errors pickle: the rest travels in __dict__
+        self.where, self.problem = shown, problem
         self.expected, self.found, self.advice = expected, found, advice
 
     def __str__(self) -> str:
@@ -38,13 +41,18 @@ class CarlascError(Exception):
             f"{verb} {text}" for verb, text in (("expected", self.expected), ("found", self.found)) if text
         )
         text = ": ".join(part for part in (self.where, self.problem, comparison, self.advice) if part)
-        return " ".join(text.splitlines())  # other libraries' messages may have several lines
+        return without_credentials(" ".join(text.splitlines()))  # other libraries' messages may have several lines
 
     def within(self, where: object) -> Self:
         """Return a copy that also names what contains the place: `within("a.zip")` of an error at "b" is at "a.zip: b"."""
         error = copy.copy(self)
         error.where = f"{where}: {self.where}"
         return error
+
+
+def without_credentials(text: str) -> str:
+    """Return a text without what its URLs say of credentials: user and password, and queries, which may be signatures."""
+    return _QUERY.sub(r"\1", _USER.sub("", text)) if "://" in text else text
 
 
 class FormatError(CarlascError, ValueError):

@@ -15,6 +15,8 @@ from carlasc.errors import DependencyError
 
 DATA = Path(__file__).parent / "data"
 
+os.environ.setdefault("CARLASC_REMOTE_BACKOFF_S", "0.01")  # servers of tests that fail need no time to recover
+
 hypothesis.settings.register_profile("carlasc", deadline=None)  # how long an example takes is the machine's affair
 hypothesis.settings.load_profile("carlasc")
 

@@ -16,12 +16,18 @@ from typing import Any, BinaryIO
 from carlasc.errors import FormatError, StorageError
 
 
-def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], object]) -> None:
+def write_atomic(
+    path: Path, content: bytes | memoryview | Callable[[BinaryIO], object], *, create: bool = False
+) -> bool:
     """Write a file under a temporary name in its folder, then rename it: it exists whole or not at all, also after Ctrl-C or on a full disk.
 
     Args:
         path: the file; missing parent folders are created.
         content: the bytes, or a function that writes them to an open file.
+        create: write only a file that does not exist. Of several processes that do so at once, exactly one succeeds.
+
+    Returns:
+        False if `create` is given and the file exists; True otherwise.
 
     Raises:
         StorageError: the disk is full or the folder cannot be written to; nothing is left behind.
@@ -35,34 +41,29 @@ def write_atomic(path: Path, content: bytes | memoryview | Callable[[BinaryIO], 
                 content(file)
             else:
                 file.write(content)
-        temporary.replace(path)
+        if create:
+            os.link(temporary, path)  # a rename would replace a file that another process has just written
+        else:
+            temporary.replace(path)
+    except FileExistsError as error:
+        if create and path.is_file():
+            return False
+        raise _storage_error(path, error) from error
     except OSError as error:
         raise _storage_error(path, error) from error
     finally:
         with suppress(OSError):  # it does not exist after success, nor does its folder where a file is in the way
             temporary.unlink()
+    return True
 
 
-def append_line(path: Path, line: str) -> None:
-    """Add a line to a text file, which is created, with its folders, if it does not exist.
-
-    Raises:
-        StorageError: the disk is full or the folder cannot be written to.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as file:
-            file.write(f"{line}\n")
-    except OSError as error:
-        raise _storage_error(path, error) from error
-
-
-def remove_stale(folder: Path) -> None:
-    """Remove the temporary files that killed writers left in a folder and in the folders in it.
+def remove_stale(folder: Path, *, deep: bool = False) -> None:
+    """Remove the temporary files that killed writers left in a folder and in the folders in it; with `deep`, also in the folders in these.
 
     A temporary file is stale if the process on this machine that wrote it has ended, or if it is a day old.
     """
-    for part in (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}")):
+    found = folder.rglob(f".*{_PART}") if deep else (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}"))
+    for part in list(found):
         match = re.search(rf"\.{re.escape(_HOST)}-([0-9]+)\.[^.]+{re.escape(_PART)}$", part.name)
         try:
             if (match and not _is_alive(int(match[1]))) or time.time() - part.stat().st_mtime > 86400:

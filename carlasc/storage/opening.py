@@ -3,28 +3,42 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.storage.folders.folder import FolderSource
+from carlasc.storage.caching import Cache, CachedTree
+from carlasc.storage.folders.folder import FolderSink, FolderSource
 from carlasc.storage.folders.published import PublishedSource
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
+from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, is_url
 from carlasc.storage.folders.zipped import ZipTree
 from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK
 from carlasc.storage.packed.protocol import Options, PackedSink
 from carlasc.storage.protocol import Source
+from carlasc.storage.remote import target_of
+from carlasc.storage.sinks import Sink
+from carlasc.storage.targets import Target
+
+PACKED = (".zarr", ".h5", ".hdf5", ".parquet")
+"""Endings of the names of packed stores."""
+
+if TYPE_CHECKING:
+    from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
 
 _ZIP, _EMPTY_ZIP, _HDF5, _PARQUET = b"PK\x03\x04", b"PK\x05\x06", b"\x89HDF\r\n\x1a\n", b"PAR1"
 _SIGNATURE = 8  # number of leading bytes that identify the kind of file
 
 
-def open(path: str | os.PathLike[str], **storage_options: Any) -> Source:
+def open(
+    path: str | os.PathLike[str], *, cache: str | os.PathLike[str] | Cache | None = None, **storage_options: Any
+) -> Source:
     """Open a store of sequences. Its kind is determined from its content, not from the ending of its name.
 
     Args:
         path: a folder of the published layout (the data set, a split, a sequence, one `<coordinates>` folder), a zip of such a folder (read
             in place), a packed store (zarr, HDF5, Parquet), or the URL of any of these (http, s3, and all other protocols of fsspec).
+        cache: a folder of this machine, or a `carlasc.Cache`, for the files of a packed zarr store or a folder behind a URL: each file
+            is fetched whole, once for all processes. Stores on this machine need none: it is not used for them.
         **storage_options: options of fsspec for the URL, such as `anon=True` or `endpoint_url=...`.
 
     Returns:
@@ -32,12 +46,13 @@ def open(path: str | os.PathLike[str], **storage_options: Any) -> Source:
 
     Raises:
         MissingDataError: nothing exists at the path.
+        ArgumentError: `cache` is given for a remote store that is a single file, or for tables.
         FormatError: the content is none of these, or is damaged.
         DependencyError: a package is missing; the message names the extra of carlasc that installs it.
     """
     text = os.fspath(path)
-    if "://" in text and not text.startswith("file://"):
-        return _open_remote(RemoteTree(text, storage_options))
+    if is_url(text):
+        return _open_remote(RemoteTree(text, storage_options), cache)
     local = Path(text.removeprefix("file://"))
     if local.is_dir():
         return _open_store(LocalTree(local)) or FolderSource(local)
@@ -60,35 +75,77 @@ def as_source(source: str | os.PathLike[str] | Source) -> Source:
     return source if isinstance(source, Source) else open(source)
 
 
-def open_sink(path: Path, options: Options, overwrite: bool) -> PackedSink:
+def open_sink(
+    path: str | os.PathLike[str] | Target, options: Options | None, overwrite: bool, **storage_options: Any
+) -> PackedSink | ZarrSink:
     """Start a packed store. The ending of its name gives its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`.
 
     Raises:
-        ArgumentError: another ending, or an option that the store does not have.
+        ArgumentError: another ending, an option that the store does not have, or a URL where the store is written on this machine only.
         ConflictError: the path already exists, and `overwrite` is not given.
         DependencyError: a package is missing.
     """
-    if path.suffix == ".zarr":
-        from carlasc.storage.packed.arrays.zarr_store import ZarrSink
+    kind = PurePosixPath(path.location if isinstance(path, Target) else path).suffix
+    if kind not in PACKED:
+        raise ArgumentError(path, expected="a store ending in .zarr, .h5 or .parquet", found=kind or "no ending")
+    if kind == ".zarr":
+        from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
 
-        return ZarrSink(path, options, overwrite)
-    if path.suffix in (".h5", ".hdf5"):
-        from carlasc.storage.packed.arrays.hdf5_store import HDF5Sink
-
-        return HDF5Sink(path, options, overwrite)
-    if path.suffix == ".parquet":
+        return ZarrSink(target_of(path, **storage_options), options, overwrite)
+    if isinstance(path, Target) or is_url(path):
+        raise ArgumentError(
+            "out",
+            expected="a .zarr store, or a folder, in an object store",
+            found=f"a {kind} store, which is one growing file",
+            advice="write it to a file and upload it",
+        )
+    if kind == ".parquet":
         from carlasc.storage.packed.tables.writing import ParquetSink
 
         return ParquetSink(path, options, overwrite)
-    raise ArgumentError(
-        path, expected="a store ending in .zarr, .h5 or .parquet", found=f"{path.suffix or 'no ending'}"
-    )
+    from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
+
+    return HDF5Sink(path, options, overwrite)
 
 
-def _open_remote(tree: RemoteTree) -> Source:
-    if tree.size() is not None:
+def as_sink(out: str | os.PathLike[str] | Target | Sink, *, overwrite: bool = False, **storage_options: Any) -> Sink:
+    """Return a Sink unchanged; start one at any other place.
+
+    Args:
+        out: a folder of the published layout, or a packed store, whose name ends in .zarr, .h5, .hdf5 or .parquet; a path or a URL.
+        overwrite: replace an existing packed store.
+        **storage_options: options of fsspec for a URL.
+
+    Raises:
+        ArgumentError: nothing can be written there.
+        ConflictError: a packed store exists there, and `overwrite` is not given.
+        DependencyError: a package is missing.
+    """
+    if isinstance(out, Sink):
+        return out
+    if PurePosixPath(out.location if isinstance(out, Target) else out).suffix in PACKED:
+        return open_sink(out, None, overwrite, **storage_options)
+    return FolderSink(out, **storage_options)
+
+
+def _open_remote(tree: RemoteTree, cache: str | os.PathLike[str] | Cache | None) -> Source:
+    is_file = tree.size() is not None
+    if cache is not None and (is_file or tree.is_file(TABLES_MARK)):
+        raise ArgumentError(
+            "cache",
+            expected="a packed zarr store, or a folder of the layout",
+            found=f"{tree.location}, which is {'one file' if is_file else 'a store of tables'}",
+            advice="pack the data into a .zarr, or leave `cache` out",
+        )
+    if is_file:
         tree.check_ranges()
         return _open_file(tree, "")
+    if cache is not None:
+        return _open_folder(CachedTree(tree, cache if isinstance(cache, Cache) else Cache(cache)))
+    return _open_folder(tree)
+
+
+def _open_folder(tree: Tree) -> Source:
     source = _open_store(tree)
     if source is None and not tree.entries():
         raise MissingDataError(

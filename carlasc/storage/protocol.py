@@ -1,4 +1,4 @@
-"""The protocol between the stores and all other modules: a Source yields sequences, a Sink takes them.
+"""The protocol by which stores are read: a Source yields sequences. `carlasc.storage.sinks` has that by which they are written.
 
 A sequence is one `<split>/<sequence>/<coordinates>` of the layout. It has fields and frames; one call reads one field of one
 frame as an array. A field that the sequence does not have is not listed by `fields()`. Sources hold paths, never open handles, so
@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import PurePosixPath
-from types import TracebackType
 from typing import Any, Self, cast
 
 import numpy as np
@@ -24,9 +23,10 @@ from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
-from carlasc.errors import ConflictError, FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
+from carlasc.storage.folders.trees import Tree
 from carlasc.storage.metadata import Metadata, check_format
 
 
@@ -40,6 +40,7 @@ class Sequence(ABC):
         split: "Train", "Val", "Test", or None.
         name: "Town01_Light".
         coordinates: "cartesian" or "cylindrical".
+        tree: the tree of files that it is read from; None if it is not read from one.
     """
 
     path: str
@@ -47,6 +48,7 @@ class Sequence(ABC):
     split: str | None
     name: str
     coordinates: Coordinates
+    tree: Tree | None = None
     _given_poses: NDArray[np.float64] | None = None
 
     @abstractmethod
@@ -98,6 +100,13 @@ class Sequence(ABC):
             (N, 3) or (N, 4) float32 metres of each frame: rows, or the transpose of contiguous x, y and z.
         """
         return self.read_many("points", frames)
+
+    def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
+        """Return the files that hold a field of some frames, each once, as paths in the tree of the store.
+
+        A cache fetches these files whole before the frames are read. The list is empty where the store does not say it.
+        """
+        return []
 
     @cached_property
     def metadata(self) -> Metadata:
@@ -278,90 +287,6 @@ class Source(ABC):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
-
-
-class SequenceWriter(ABC):
-    """Writes one sequence.
-
-    In a folder, a file is complete when `write` returns, even if the run fails later. A packed store is complete only after its sink
-    has been closed.
-
-    Attributes:
-        location: name of the output in errors.
-        concurrent: whether several processes may write at the same time, each with its own pickled copy of the writer.
-    """
-
-    location: str
-    concurrent: bool = False
-
-    @abstractmethod
-    def has(self, field: str, frame: int) -> bool:
-        """Return whether a field of a frame already exists and is complete."""
-
-    @abstractmethod
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
-        """Write one field of one frame; an existing one is replaced.
-
-        The params.json of a grid must be written before its first frame. Stores that append need the frames of each field in
-        increasing order.
-
-        Raises:
-            FormatError: the array does not fit the field.
-        """
-
-    @abstractmethod
-    def write_document(self, name: str, data: bytes) -> None:
-        """Write the bytes of a text file; an existing file is replaced."""
-
-    @abstractmethod
-    def read_document(self, name: str) -> bytes | None:
-        """Return the bytes of an existing text file, or None. A run uses this to continue the output of an earlier run."""
-
-    def read(self, field: str, frame: int) -> NDArray[Any] | None:
-        """Return an existing field of a frame as a flat array or (N, columns) rows; None if the store cannot read it."""
-        return None
-
-    def remove_grid(self, grid: str) -> None:
-        """Remove a grid. Its params.json is removed last, so that an interrupted removal can be continued.
-
-        Raises:
-            ConflictError: the store cannot remove grids.
-        """
-        raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new one")
-
-    def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)
-        """Finish the sequence, for example by writing an index. This is not called if the work failed."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-
-
-class Sink(ABC):
-    """A store that sequences are written to."""
-
-    location: str
-
-    @abstractmethod
-    def sequence(self, path: str) -> SequenceWriter:
-        """Start or continue the sequence at a path such as "Train/Town01_Light/cartesian"."""
-
-    def close(self) -> None:  # noqa: B027 (a folder has nothing to finish)
-        """Finish the store. A packed store gets its final name here. This is not called if the work failed."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
 
 
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:

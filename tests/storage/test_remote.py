@@ -12,12 +12,13 @@ from typing import Any
 import fsspec
 import numpy as np
 import pytest
+from helpers.object_store import faulty_server
 from helpers.sequences import files_of, write_dataset
 from storage.test_zipped import write_zip
 
 import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
-from carlasc.storage import Source
+from carlasc.storage import Source, layout
 from carlasc.storage.packing import pack
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
@@ -187,6 +188,51 @@ def test_a_server_without_ranges_is_an_error_before_anything_is_fetched(
     monkeypatch.setattr(handler, "ranges", False)
     with pytest.raises(CarlascError, match=r"other\.zip: expected a server that supports range requests.*download"):
         carlasc.open(f"{url}/other.zip")
+
+
+def read_all(source: Source) -> dict[str, Any]:
+    return {
+        f"{path}/{name}/{frame}": bytes(layout.field_named(name).encode(array, name))
+        for path, sequence in source.sequences().items()
+        for name in sorted(sequence.fields())
+        for frame, array in zip(
+            sequence.frames(name).tolist(), sequence.read_many(name, sequence.frames(name).tolist()), strict=True
+        )
+    }
+
+
+@pytest.mark.parametrize("fault", ["503", "drop", "cut", "too long", "too short", "other range"])
+def test_a_zip_is_read_from_a_web_server_that_fails_now_and_then(
+    published: Path, site: tuple[Path, str, type[RangeHandler]], fault: str
+) -> None:
+    folder, url, _ = site
+    write_zip(files_of(published), folder / "faulty.zip")
+    with faulty_server(url) as server:
+        # not the first one, by which a server without ranges is recognised
+        server.reset(lambda number, method, path: fault if number > 3 and number % 5 == 0 and method == "GET" else None)
+        assert read_all(carlasc.open(f"{server.url}/faulty.zip")) == read_all(carlasc.open(published))
+        assert server.made[fault] >= 3
+
+
+@pytest.mark.parametrize("kind", ["zip", "zarr"])
+def test_the_signature_of_a_url_is_sent_with_each_request_and_never_shown(
+    published: Path, site: tuple[Path, str, type[RangeHandler]], monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    folder, url, handler = site
+    place = folder / f"signed.{kind}"
+    if not place.exists():
+        write_zip(files_of(published), place) if kind == "zip" else pack(published, place)
+    answer = handler.do_GET
+
+    def refuse_unsigned(self: RangeHandler) -> None:
+        answer(self) if self.path.endswith("?sig=secret") else self.send_error(403)
+
+    monkeypatch.setattr(handler, "do_GET", refuse_unsigned)
+    source = carlasc.open(f"{url}/signed.{kind}?sig=secret")
+    assert read_all(source) == read_all(carlasc.open(published))
+    assert source.location == f"{url}/signed.{kind}" and "secret" not in repr(source)
+    with pytest.raises(CarlascError, match=r"signed\.(zip|zarr).*: access was refused \(403\)"):
+        carlasc.open(f"{url}/signed.{kind}?sig=wrong").sequences()
 
 
 def test_nothing_at_a_url_is_missing_data(site: tuple[Path, str, type[RangeHandler]]) -> None:

@@ -1,4 +1,4 @@
-"""The published layout in a folder: reading and writing, one file per frame and field."""
+"""The published layout in a folder: reading and writing, one file per frame and field. It is written to object stores too."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import MissingDataError
 from carlasc.storage import layout
-from carlasc.storage.files import remove_stale, write_atomic
-from carlasc.storage.folders.names import leads_outside
+from carlasc.storage.files import remove_stale
 from carlasc.storage.folders.published import PublishedSequence, PublishedSource
 from carlasc.storage.folders.trees import LocalTree
-from carlasc.storage.protocol import Sequence, SequenceWriter, Sink
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.remote import target_of
+from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.targets import LocalTarget, Target
 
 
 class FolderSource(PublishedSource):
@@ -59,65 +61,105 @@ class FolderSequence(PublishedSequence):
 
 
 class FolderSink(Sink):
-    """Writes the published layout into a folder."""
+    """Writes the published layout into a folder, on this machine or in an object store.
 
-    def __init__(self, out: str | os.PathLike[str]) -> None:
-        self.folder = Path(out)
-        self.location = str(self.folder)
+    Attributes:
+        target: where files are written.
+    """
+
+    is_readable = True
+
+    def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
+        """Take a folder, or the URL of one with options of fsspec; nothing is written yet.
+
+        Raises:
+            ArgumentError: nothing can be written to the URL.
+            DependencyError: the URL needs a package that is not installed.
+        """
+        self.target = target_of(out, **storage_options)
+        self.location = self.target.location
 
     def sequence(self, path: str) -> FolderWriter:
         """Start or continue a sequence's folder; the unfinished files of a run that was killed are removed."""
-        folder = _inside(self.folder, path)
-        remove_stale(folder)
-        return FolderWriter(folder)
+        target = self.target.below(path)
+        if isinstance(target, LocalTarget):
+            remove_stale(target.folder)
+        return FolderWriter(target)
+
+    def source(self) -> Source:
+        """Return the folder."""
+        return (
+            FolderSource(self.target.folder)
+            if isinstance(self.target, LocalTarget)
+            else PublishedSource(self.target.tree)
+        )
 
 
 class FolderWriter(SequenceWriter):
-    """Writes one `<coordinates>` folder, each file atomically; it can be pickled into workers."""
+    """Writes one `<coordinates>` folder, each file whole; it can be pickled into workers.
+
+    Attributes:
+        target: the folder.
+    """
 
     concurrent = True
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.location = str(folder)
+    def __init__(self, folder: str | os.PathLike[str] | Target) -> None:
+        self.target = target_of(folder)
+        self.location = self.target.location
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether the file exists; it is whole then, because files are renamed into place."""
-        return (self.folder / layout.field_named(field).file(frame)).is_file()
+        """Whether the file exists; it is whole then. In an object store, its folder is listed once."""
+        return self.target.tree.is_file(layout.field_named(field).file(frame))
+
+    def refresh(self) -> None:
+        """Forget the listings of folders in an object store."""
+        self.target.tree.refresh()
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Write one file."""
+        self.target.put(*self._file(field, frame, array))
+
+    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+        """Write the files of several frames; in an object store side by side, but the last one of each frame after its others."""
+        files = [
+            [self._file(field, frame, array) for field, array in fields.items()] for frame, fields in frames.items()
+        ]
+        self.target.put_many(dict(file for parts in files for file in parts[:-1]))
+        self.target.put_many(dict(parts[-1] for parts in files if parts))
+
+    def _file(self, field: str, frame: int, array: NDArray[Any]) -> tuple[str, bytes | memoryview]:
         entry = layout.field_named(field)
-        path = _inside(self.folder, entry.file(frame))
-        write_atomic(path, entry.encode(array, str(path)))
+        path = entry.file(frame)
+        return path, entry.encode(array, self.target.tree.where(path))
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Return the array of a file that exists."""
         entry = layout.field_named(field)
-        path = self.folder / entry.file(frame)
-        return entry.decode(path.read_bytes(), str(path))
+        path = entry.file(frame)
+        return entry.decode(self.target.tree.read(path), self.target.tree.where(path))
 
     def remove_grid(self, grid: str) -> None:
         """Remove the report and the frames of a grid, then its params.json; other files in its folder stay."""
-        (self.folder / layout.report_file(grid)).unlink(missing_ok=True)
+        self.target.remove(layout.report_file(grid))
         parts = [layout.field_named(f"{grid}/{part}").suffix for part in layout.GRID_FIELDS]
-        for path in _inside(self.folder, grid).iterdir():
-            if any(layout.frame_of(path.name, suffix) is not None for suffix in parts):
-                path.unlink()
-        (self.folder / layout.params_file(grid)).unlink()
+        names = [
+            name for name in self.target.tree.entries(grid) if any(layout.frame_of(name, s) is not None for s in parts)
+        ]
+        self.target.remove_many(f"{grid}/{name}" for name in names)
+        self.target.remove(layout.params_file(grid))
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
-        write_atomic(_inside(self.folder, name), data)
+        self.target.put(name, data)
+
+    def create_document(self, name: str, data: bytes) -> bool:
+        """Write a text file unless it exists."""
+        return self.target.put(name, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
         """Return a text file's bytes, None if it does not exist."""
-        path = self.folder / name
-        return path.read_bytes() if path.is_file() else None
-
-
-def _inside(folder: Path, path: str) -> Path:
-    """Return a path inside a folder; it may come from a store, which anybody may have made."""
-    if leads_outside(path):
-        raise FormatError(path, expected=f"a path inside {folder}", found="one that leads elsewhere")
-    return folder / path
+        try:
+            return bytes(self.target.tree.read(name))
+        except MissingDataError:
+            return None

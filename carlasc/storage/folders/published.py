@@ -54,6 +54,8 @@ class PublishedSource(Source):
 class PublishedSequence(Sequence):
     """One `<coordinates>` folder."""
 
+    tree: Tree
+
     def __init__(self, tree: Tree, path: str = "") -> None:
         self.tree = tree
         self.path = path
@@ -111,6 +113,10 @@ class PublishedSequence(Sequence):
         shape = self._shape(entry)
         files = zip(paths, self.tree.read_many(paths), strict=True)
         return [entry.decode(data, self.tree.where(path), shape) for path, data in files]
+
+    def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
+        """Return the file of each frame."""
+        return [self._prefix + self._entry(field).file(frame) for frame in frames]
 
     def _entry(self, field: str) -> layout.Field:
         if field not in self._listing:

@@ -5,19 +5,36 @@ No tree keeps a handle open, so that all of them can be pickled, and used on bot
 
 from __future__ import annotations
 
+import copy
 import mmap
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from carlasc.errors import CarlascError, FormatError, MissingDataError, import_extra
+from carlasc.errors import CarlascError, FormatError, MissingDataError, without_credentials
+from carlasc.storage.folders.blocks import RemoteFile
+from carlasc.storage.folders.requests import Request, Requests, WrongAnswerError, bucket_is_missing, fail
 
 # Bytes from which on a range is mapped. Reading the megabyte of a scan is faster than touching its mapped pages.
 _MAPPED = 1 << 22
-_EXTRAS = {"http": "aiohttp", "https": "aiohttp", "s3": "s3fs", "s3a": "s3fs"}  # packages of the extra `remote`
+
+# What file systems call a digest of a file's content, or the time of its last change.
+_CHANGES = (
+    "ETag",
+    "etag",
+    "Content-MD5",
+    "Digest",
+    "md5Hash",
+    "Last-Modified",
+    "LastModified",
+    "last_modified",
+    "mtime",
+    "created",
+)
 
 
 class Tree(ABC):
@@ -64,6 +81,9 @@ class Tree(ABC):
         """Return several ranges; remote trees request all of them at once."""
         return [self.read_range(*part) for part in ranges]
 
+    def refresh(self) -> None:  # noqa: B027 (most trees remember nothing)
+        """Forget listings: other processes may have written files since."""
+
     def where(self, path: str) -> str:
         """Return the name of a file of the tree in errors."""
         return f"{self.location}/{path}" if path else self.location
@@ -72,9 +92,19 @@ class Tree(ABC):
 class LocalTree(Tree):
     """A folder on this machine."""
 
-    def __init__(self, root: str | os.PathLike[str]) -> None:
-        self.root = Path(root)
+    def __init__(self, root: str | os.PathLike[str], *, mapped: bool = True) -> None:
+        """Take a folder.
+
+        Args:
+            root: the folder.
+            mapped: whether `read` maps files into memory, so that only what is used is read. A file must not be changed in place then.
+        """
+        self.root, self.mapped = Path(root), mapped
         self.location = str(self.root)
+
+    def below(self, folder: str) -> LocalTree:
+        """Return the tree of a folder in this one."""
+        return LocalTree(self.root / folder, mapped=self.mapped)
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder."""
@@ -91,9 +121,12 @@ class LocalTree(Tree):
         return (self.root / path).is_file()
 
     def read(self, path: str) -> bytes | memoryview:
-        """Map the file into memory: its bytes are read when they are used."""
+        """Read the file, or map it into memory: its bytes are read when they are used."""
         with self._opened(path) as descriptor:
-            if os.fstat(descriptor).st_size == 0:
+            size = os.fstat(descriptor).st_size
+            if not self.mapped:
+                return os.pread(descriptor, size, 0)
+            if size == 0:
                 return b""  # an empty file, such as an empty scan, cannot be mapped
             return memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
 
@@ -124,7 +157,10 @@ class LocalTree(Tree):
 
 
 class RemoteTree(Tree):
-    """A folder, or a single file (path ""), at any URL that fsspec knows: http, s3, memory, ..."""
+    """A folder, or a single file (path ""), at any URL that fsspec knows: http, s3, memory, ...
+
+    A folder is listed once. `size`, `read` and `paths` ask the server each time.
+    """
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
         """Remember the URL and fsspec's storage options; nothing is requested yet.
@@ -132,46 +168,88 @@ class RemoteTree(Tree):
         Raises:
             DependencyError: the URL needs a package that is not installed.
         """
-        self.location = url.rstrip("/")
-        self.options = dict(options or {})
-        scheme = url.partition("://")[0]
-        if scheme in _EXTRAS:
-            import_extra(_EXTRAS[scheme], "remote")
+        base, mark, query = url.partition("?") if url.startswith("http") else (url, "", "")
+        self._base, self._query = base.rstrip("/"), mark + query  # a signed URL: the signature follows each path
+        self.location = without_credentials(self._base)
+        self.requests = Requests(url.rstrip("/"), options)
         self._listed: dict[str, dict[str, bool]] = {}
+        self._sizes: dict[str, int] = {}  # of the files in the folders that were listed
 
-    @property
-    def _fs(self) -> Any:
-        """The file system of this process: fsspec keeps one for equal arguments, and makes a new one after a fork."""
-        from fsspec.core import url_to_fs
+    def url(self, path: str = "") -> str:
+        """Return the URL of a file; it may hold credentials, so it must not be shown (see `where`)."""
+        return f"{self._base}/{path}{self._query}" if path else self._base + self._query
 
-        try:
-            return url_to_fs(self.location, **self.options)[0]
-        except (ValueError, ImportError) as error:
-            raise CarlascError(self.location, problem=f"cannot be opened: {error}") from error
+    def below(self, folder: str) -> RemoteTree:
+        """Return the tree of a folder in this one."""
+        tree = copy.copy(self)
+        tree._base, tree.location = (f"{place}/{folder}" if folder else place for place in (self._base, self.location))
+        tree._listed, tree._sizes = {}, {}
+        return tree
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder, once."""
         if folder not in self._listed:
-            url = self.where(folder)
-            try:
-                found = self._fs.ls(f"{url}/" if url.startswith("http") else url, detail=True)
-            except (FileNotFoundError, NotADirectoryError):
+            url = self.url(folder)
+            if url.startswith("http") and not self._query:
+                url += "/"
+            (found,) = self.requests.send([Request("ls", url, {"detail": True})])
+            if isinstance(found, FileNotFoundError | NotADirectoryError) and not bucket_is_missing(found):
                 found = []
-            except Exception as error:  # noqa: BLE001 (each file system raises its own types)
-                _fail(url, error)
-            listed = {}
+            elif isinstance(found, Exception):
+                fail(self.where(folder), found)
+            listed, own = {}, self.where(folder).rpartition("/")[2]
             for entry in found:
                 name = str(entry["name"])
                 folder_like = entry["type"] == "directory" or name.endswith("/")
                 base = name.rstrip("/").rpartition("/")[2]
-                if base and base != url.rpartition("/")[2] and "?" not in base:
+                if base and base != own and "?" not in base:
                     listed[base] = folder_like
+                    if not folder_like and isinstance(entry.get("size"), int):
+                        self._sizes[f"{folder}/{base}" if folder else base] = entry["size"]
             self._listed[folder] = listed
         return self._listed[folder]
 
+    def refresh(self) -> None:
+        """Forget listings: other processes may have written files since."""
+        self._listed, self._sizes = {}, {}
+
+    def note(self, path: str, size: int | None) -> None:
+        """Remember that this process wrote a file of `size` bytes, or removed it (None), where its folder has been listed."""
+        self._sizes.pop(path, None)
+        if size is not None:
+            self._sizes[path] = size
+        name, is_folder = path, False
+        while name:
+            folder, _, base = name.rpartition("/")
+            if folder in self._listed:
+                if size is None and not is_folder:
+                    self._listed[folder].pop(base, None)
+                elif size is not None:
+                    self._listed[folder][base] = is_folder
+            name, is_folder = folder, True
+
     def is_file(self, path: str) -> bool:
         """Whether the file exists: asked of the server where folders cannot be listed (http), else of the folder's listing."""
-        return self.size(path) is not None if self.location.startswith("http") else super().is_file(path)
+        return self.size(path) is not None if self._base.startswith("http") else super().is_file(path)
+
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """Yield the paths of all files below a folder, or that of the file of this name, in any order."""
+        yield from self.sizes(folder)
+
+    def sizes(self, folder: str = "") -> dict[str, int]:
+        """Return the bytes of all files below a folder, or of the file of this name, by path."""
+        (found,) = self.requests.send([Request("find", self.url(folder), {"detail": True})])
+        if isinstance(found, FileNotFoundError) and not bucket_is_missing(found):
+            return {}
+        if isinstance(found, Exception):
+            fail(self.where(folder), found)
+        root = self.requests.fs._strip_protocol(self._base).rstrip("/") + "/"
+        sizes = {}
+        for name, about in found.items():
+            place = name if name.startswith("/") == root.startswith("/") else f"/{name}"
+            if place.startswith(root) and not place.endswith("/"):
+                sizes[place.removeprefix(root)] = about["size"]
+        return sizes
 
     def read(self, path: str) -> bytes | memoryview:
         """Fetch the file."""
@@ -182,48 +260,79 @@ class RemoteTree(Tree):
         return self.read_ranges([(path, start, end)])[0]
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
-        """Fetch the files, several at a time."""
-        urls = [self.where(path) for path in paths]
-        try:
-            return [bytes(data) for data in self._fs.cat_ranges(urls, None, None, on_error="raise")]
-        except Exception as error:  # noqa: BLE001
-            _fail(urls[0] if len(urls) == 1 else self.location, error)
+        """Fetch the files, several at a time. Their lengths are compared with the listing, where their folder has been listed."""
+        requests = [Request("get", self.url(path), {}, self._length_check(path)) for path in paths]
+        answers = self.requests.send(requests)
+        for place, (path, answer) in enumerate(zip(paths, answers, strict=True)):
+            if isinstance(answer, WrongAnswerError):  # replaced since it was listed?
+                self._sizes[path] = self._size(path)
+                (answers[place],) = self.requests.send([Request("get", self.url(path), {}, self._length_check(path))])
+            if isinstance(answers[place], Exception):
+                fail(self.where(path), answers[place])
+        return [bytes(data) for data in answers]
+
+    def _length_check(self, path: str) -> Callable[[bytes], None] | None:
+        expected = self._sizes.get(path)
+        return None if expected is None else partial(_check_size, expected)
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes]:  # type: ignore[override]
         """Fetch the ranges, several at a time."""
-        fs = self._fs
-        urls = [self.where(path) for path, _, _ in ranges]
-        try:
-            sizes = {
-                url: fs.size(url) for url in {u for u, (_, start, _) in zip(urls, ranges, strict=True) if start < 0}
-            }
-            starts = [max(0, sizes[url] + s) if s < 0 else s for url, (_, s, _) in zip(urls, ranges, strict=True)]
-            ends = [sizes[url] + e if s < 0 else e for url, (_, s, e) in zip(urls, ranges, strict=True)]
-            found = fs.cat_ranges(urls, starts, ends, on_error="raise")
-        except Exception as error:  # noqa: BLE001
-            _fail(urls[0] if len(set(urls)) == 1 else self.location, error)
-        parts = zip(found, starts, ends, urls, strict=True)
-        return [check_length(bytes(data), end - start, url) for data, start, end, url in parts]
+        sizes = {path: self._size(path) for path in {path for path, start, _ in ranges if start < 0}}
+        wanted = [(p, max(0, sizes[p] + s), sizes[p] + e) if s < 0 else (p, s, e) for p, s, e in ranges]
+        asked = [part for part in wanted if part[1] < part[2]]
+        answers = iter(self.requests.send([Request("get", self.url(p), {"start": s, "end": e}) for p, s, e in asked]))
+        return [self._checked(part, next(answers)) if part[1] < part[2] else b"" for part in wanted]
+
+    def _checked(self, part: tuple[str, int, int], answer: Any) -> bytes:
+        """Return an answer of the right length. A short one is asked for again, unless the file ends there."""
+        path, start, end = part
+        if isinstance(answer, Exception):
+            fail(self.where(path), answer)
+        if len(answer) != end - start and self._size(path) >= end:
+            check = partial(_check_size, end - start)
+            (answer,) = self.requests.send([Request("get", self.url(path), {"start": start, "end": end}, check)])
+            if isinstance(answer, Exception):
+                fail(self.where(path), answer)
+        return check_length(bytes(answer), end - start, self.where(path))
 
     def open(self, path: str) -> Any:
         """Open a file, for libraries that take file objects: it fetches blocks as they are needed."""
-        try:
-            return self._fs.open(self.where(path), "rb", cache_type="blockcache", block_size=1 << 18)
-        except Exception as error:  # noqa: BLE001
-            _fail(self.where(path), error)
+        return RemoteFile(partial(self.read_range, path), self._size(path))
 
     def size(self, path: str = "") -> int | None:
         """Return a file's size in bytes; None if it does not exist or is a folder (or a page that lists one)."""
-        url = self.where(path)
-        try:
-            found = self._fs.info(url)
-        except (FileNotFoundError, IsADirectoryError):
+        found = self._about(path)
+        return None if found is None else found["size"]
+
+    def version(self, path: str) -> tuple[int, str]:
+        """Return a file's size in bytes, and a text that changes when the file does, if the server knows of its changes.
+
+        The server is asked each time, whatever was listed before.
+
+        Raises:
+            MissingDataError: the file does not exist.
+        """
+        self.requests.fs.invalidate_cache(self.url(path))
+        found = self._about(path)
+        if found is None:
+            raise MissingDataError(self.where(path), expected="a file", found="nothing")
+        return found["size"], " ".join(str(found[name]) for name in _CHANGES if found.get(name))
+
+    def _about(self, path: str) -> dict[str, Any] | None:
+        """Return what the file system says of a file; None if it does not exist or is a folder (or a page that lists one)."""
+        (found,) = self.requests.send([Request("info", self.url(path))])
+        if isinstance(found, FileNotFoundError | IsADirectoryError) and not bucket_is_missing(found):
             return None
-        except Exception as error:  # noqa: BLE001
-            _fail(url, error)
-        if found.get("type") == "directory" or found.get("mimetype") == "text/html":
-            return None
-        return found["size"]
+        if isinstance(found, Exception):
+            fail(self.where(path), found)
+        folder = found.get("type") == "directory" or found.get("mimetype") == "text/html"
+        return None if folder else found
+
+    def _size(self, path: str) -> int:
+        size = self.size(path)
+        if size is None:
+            raise MissingDataError(self.where(path), expected="a file", found="nothing")
+        return size
 
     def check_ranges(self, path: str = "") -> None:
         """Request one byte: a server without range requests would send the whole file for each of them.
@@ -231,34 +340,38 @@ class RemoteTree(Tree):
         Raises:
             CarlascError: the server does not support range requests.
         """
-        url = self.where(path)
-        if not url.startswith("http"):
+        if not self._base.startswith("http"):
             return
-        from fsspec.asyn import sync
-
-        fs = self._fs
-
-        async def status() -> int:
-            session = await fs.set_session()
-            settings = dict(fs.kwargs)
-            headers = {**settings.pop("headers", {}), "Range": "bytes=0-0"}
-            async with session.get(fs.encode_url(url), headers=headers, **settings) as answer:
-                return int(answer.status)  # the body is not read
-
-        try:
-            found = sync(fs.loop, status)
-        except Exception as error:  # noqa: BLE001
-            _fail(url, error)
-        if found != 206:
+        (answer,) = self.requests.send([Request("get", self.url(path), {"start": 0, "end": 1})], attempts=2)
+        if isinstance(answer, WrongAnswerError):
             raise CarlascError(
-                url,
+                self.where(path),
                 expected="a server that supports range requests",
                 found="one that does not",
                 advice="download the file first",
             )
+        if isinstance(answer, Exception):
+            fail(self.where(path), answer)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_listed": {}}  # a worker lists what it needs
+        return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker lists what it needs
+
+
+def is_url(place: object) -> bool:
+    """Whether a place is a URL of another machine or of fsspec, rather than a path; `file://` is a path."""
+    return isinstance(place, str) and "://" in place and not place.startswith("file://")
+
+
+def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_options: Any) -> LocalTree | RemoteTree:
+    """Return the tree of files at a path or a URL; nothing is read yet.
+
+    Args:
+        place: a folder, or its URL.
+        mapped: whether files of a local folder are mapped into memory (see `LocalTree`).
+        **storage_options: options of fsspec for the URL.
+    """
+    text = os.fspath(place)
+    return RemoteTree(text, storage_options) if is_url(text) else LocalTree(text.removeprefix("file://"), mapped=mapped)
 
 
 def _map_range(descriptor: int, start: int, end: int, where: str) -> memoryview:
@@ -280,9 +393,6 @@ def check_length(data: bytes, expected: int, where: str) -> bytes:
     return data
 
 
-def _fail(where: str, error: Exception) -> NoReturn:
-    if isinstance(error, CarlascError):
-        raise error
-    if isinstance(error, FileNotFoundError):
-        raise MissingDataError(where, expected="a file", found="nothing") from error
-    raise CarlascError(where, problem=f"cannot be read: {type(error).__name__}: {error}") from error
+def _check_size(expected: int, data: bytes) -> None:
+    if len(data) != expected:
+        raise WrongAnswerError(f"{len(data)} bytes instead of {expected}")

@@ -1,0 +1,166 @@
+"""The protocol of stores that are written: a Sink takes sequences, a SequenceWriter their fields and frames.
+
+The other half of `carlasc.storage.protocol`, with the same fields and frames.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from numpy.typing import NDArray
+
+from carlasc.errors import ConflictError
+from carlasc.storage.protocol import Source
+
+
+class SequenceWriter(ABC):
+    """Writes one sequence.
+
+    In a folder, a file is complete when `write` returns, even if the run fails later. A packed store is complete only after its sink
+    has been closed.
+
+    Attributes:
+        location: name of the output in errors.
+        concurrent: whether several processes may write at the same time, each with its own pickled copy of the writer.
+        block: number of frames that are stored together, those of equal `frame // block`. Where `concurrent`, no two processes should
+            write different frames of one block at the same time; two that write the same frames lose nothing.
+    """
+
+    location: str
+    concurrent: bool = False
+    block: int = 1
+
+    def expect(  # noqa: B027 (most stores have nothing to record)
+        self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
+    ) -> None:
+        """Announce what a run is going to write, before it writes any frame.
+
+        Stores that several processes write cannot be finished as long as announced frames are missing. They also give every frame a
+        place of a fixed size, which must not depend on the frame that happens to be written first.
+
+        Args:
+            frames: numbers of the frames of each field.
+            rows: number of elements of a typical large frame, by field, such as the most points of a few scans.
+        """
+
+    @abstractmethod
+    def has(self, field: str, frame: int) -> bool:
+        """Return whether a field of a frame already exists and is complete."""
+
+    def refresh(self) -> None:  # noqa: B027 (most stores remember nothing)
+        """Forget which frames were missing: the next `has` sees what other processes have written until now."""
+
+    @abstractmethod
+    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+        """Write one field of one frame; an existing one is replaced.
+
+        The params.json of a grid must be written before its first frame. Stores that append need the frames of each field in
+        increasing order.
+
+        Raises:
+            FormatError: the array does not fit the field.
+        """
+
+    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+        """Write the fields of several frames, in the order given: by frame number, then by name of the field.
+
+        Stores that keep several frames in one file write those of a block together, and best get a whole block at once.
+        """
+        for frame, fields in frames.items():
+            for field, array in fields.items():
+                self.write(field, frame, array)
+
+    @abstractmethod
+    def write_document(self, name: str, data: bytes) -> None:
+        """Write the bytes of a text file; an existing file is replaced."""
+
+    def create_document(self, name: str, data: bytes) -> bool:
+        """Write a text file that does not exist yet, and return whether it did not.
+
+        Where `concurrent`, exactly one of several processes that do so at once succeeds.
+        """
+        if self.read_document(name) is not None:
+            return False
+        self.write_document(name, data)
+        return True
+
+    @abstractmethod
+    def read_document(self, name: str) -> bytes | None:
+        """Return the bytes of an existing text file, or None. A run uses this to continue the output of an earlier run."""
+
+    def read(self, field: str, frame: int) -> NDArray[Any] | None:
+        """Return an existing field of a frame as a flat array or (N, columns) rows; None if the store cannot read it."""
+        return None
+
+    def remove_grid(self, grid: str) -> None:
+        """Remove a grid. Its params.json is removed last, so that an interrupted removal can be continued.
+
+        Raises:
+            ConflictError: the store cannot remove grids.
+        """
+        raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new one")
+
+    def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)
+        """Finish the sequence, for example by writing an index. This is not called if the work failed."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+
+
+class Sink(ABC):
+    """A store that sequences are written to.
+
+    Attributes:
+        location: name of the store in errors.
+        is_finished: whether it can be opened as it is.
+        is_readable: whether `source` can be called.
+    """
+
+    location: str
+    is_finished: bool = False
+    is_readable: bool = False
+
+    @abstractmethod
+    def sequence(self, path: str) -> SequenceWriter:
+        """Start or continue the sequence at a path such as "Train/Town01_Light/cartesian"."""
+
+    def finish(self, *, incomplete: bool = False) -> None:  # noqa: B027 (a folder has nothing to finish)
+        """Finish the store: a packed store can be opened from then on. This is not called if the work failed.
+
+        Args:
+            incomplete: finish although announced frames are missing, because they could not be made.
+
+        Raises:
+            ConflictError: announced frames are missing.
+        """
+
+    def source(self) -> Source:
+        """Return what was written, to be read while more is written; a packed store must be finished before.
+
+        Raises:
+            ConflictError: the store is written from beginning to end, and read after that.
+        """
+        raise ConflictError(
+            self.location,
+            expected="a folder or a .zarr store, which can be read while more is added",
+            found="another one",
+            advice="write to one of these, then pack it",
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.finish()
