@@ -1,31 +1,46 @@
-"""Packing sequences into one store, which is several times smaller, and unpacking them to the published files again."""
+"""Packing sequences into one store, which is several times smaller."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, cast
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
+from carlasc.running.parts import Part
+from carlasc.running.processes import Engine, count_workers
 from carlasc.storage import layout
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.copying import (
+    Block,
+    Progress,
+    blocks_of,
+    copy_blocks,
+    copy_documents,
+    counter,
+    refuse_overlap,
+    typical_rows,
+)
 from carlasc.storage.folders.published import PublishedSequence
+from carlasc.storage.folders.trees import is_url
 from carlasc.storage.opening import as_source, open, open_sink
-from carlasc.storage.packed.output import put_in_place, unfinished
-from carlasc.storage.packed.protocol import Options, PackedSource
-from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.packed.protocol import Options, PackedSink, PackedSource, check_names
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.sinks import SequenceWriter
 
-Progress = Callable[[int, int], None]
+if TYPE_CHECKING:
+    from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter
+
 _BLOCK = 8  # frames that are read together
+_AHEAD = 2  # threads that read ahead of the writer of a store that is appended to
 
 
 @dataclass
@@ -33,7 +48,8 @@ class PackResult:
     """What `pack` did.
 
     Attributes:
-        out: the store.
+        out: the store: a path, or a URL.
+        is_finished: whether it can be opened; if not, other parts of the run are missing, and sizes are not known yet.
         sequences: paths of the sequences in it.
         frames: number of frames of all sequences.
         published_bytes: bytes of the published files, per field ("documents": the text files).
@@ -42,7 +58,8 @@ class PackResult:
         elapsed_s: seconds that it took.
     """
 
-    out: Path
+    out: Path | str
+    is_finished: bool = False
     sequences: list[str] = field(default_factory=list)
     frames: int = 0
     published_bytes: dict[str, int] = field(default_factory=dict)
@@ -56,25 +73,6 @@ class PackResult:
         return sum(self.stored_bytes.values()) / max(1, sum(self.published_bytes.values()))
 
 
-@dataclass
-class UnpackResult:
-    """What `unpack` did.
-
-    Attributes:
-        out: the folder.
-        sequences: paths of the sequences in it.
-        files: number of files written.
-        kept: number of files that an interrupted run had written.
-        elapsed_s: seconds that it took.
-    """
-
-    out: Path
-    sequences: list[str] = field(default_factory=list)
-    files: int = 0
-    kept: int = 0
-    elapsed_s: float = 0.0
-
-
 def pack(
     source: str | os.PathLike[str] | Source,
     out: str | os.PathLike[str],
@@ -82,22 +80,29 @@ def pack(
     small: bool = False,
     lossy_mm: float | None = None,
     overwrite: bool = False,
-    threads: int = 2,
+    workers: int | None = None,
+    executor: Engine | None = None,
+    part: Part = Part(),  # noqa: B008 (frozen)
     progress: Progress | None = None,
 ) -> PackResult:
     """Pack all sequences of `source` into one store. Nothing is lost, unless `lossy_mm` is given.
 
-    An interrupted run leaves `<out>.part`, which cannot be opened. The same call again finishes it: zarr and Parquet continue after the
-    last finished sequence, HDF5 starts again.
+    An interrupted run leaves a store that cannot be opened: a `.zarr` at `out`, others at `<out>.part`. The same call again finishes it:
+    zarr continues with the blocks of frames that are missing, Parquet after the last finished sequence, HDF5 starts again. Processes
+    import the main module again: call this under `if __name__ == "__main__":` in scripts, or with `workers=1`.
 
     Args:
         source: what to pack: anything that `carlasc.open` takes, or a source.
-        out: the store to write; its ending, `.zarr`, `.h5` or `.parquet`, says of which kind.
+        out: the store to write, a path or (.zarr) a URL of an object store; its ending, `.zarr`, `.h5` or `.parquet`, says of which kind.
         small: PCodec for points (zarr only): smaller, but fewer programs can read it.
         lossy_mm: quantise points to this many millimetres, which the store records. None keeps every bit.
         overwrite: replace a store that exists at `out`.
-        threads: number of threads that read ahead.
-        progress: called with (files done, all files).
+        workers: number of processes that pack blocks of frames into a `.zarr`; None for one per core, and fewer where there are few blocks.
+            Other stores have one writer: this is the number of threads that read ahead of it. With an executor: the number of its workers.
+        executor: packs the blocks instead of processes of our own (zarr only); it is not shut down.
+        part: packs only this part of the frames (zarr only); other commands pack the others. The part that finds that no frame is missing any
+            more finishes the store.
+        progress: called with (files done, all files of this part).
 
     Returns:
         What was packed, with the bytes before and after.
@@ -111,92 +116,83 @@ def pack(
     """
     began = time.perf_counter()
     options = Options(small, lossy_mm)
-    _check_threads(threads)
+    count_workers(workers)
+    part.refuse(overwrite)
+    if PurePath(out).suffix != ".zarr":
+        _refuse_several(out, executor, part)
     source = as_source(source)
-    result = PackResult(Path(out))
-    _refuse_overlap(result.out, source)
+    refuse_overlap(out, source)
+    result = PackResult(str(out) if is_url(out) else Path(out))
     sequences = source.sequences()
-    step = _steps(sequences, progress)
-    with _writing(result.out), open_sink(result.out, options, overwrite) as sink:
-        for path, sequence in sequences.items():
-            result.sequences.append(path)
-            result.frames += len(sequence.scan_frames())
-            if isinstance(sequence, PublishedSequence):
-                result.left_out += [f"{path or '.'}: {name}" for name in sequence.unknown_files()]
-            finished = sink.finished(path)
-            with nullcontext() if finished else sink.sequence(path) as writer:
-                if writer is not None:
-                    writer.identity = (sequence.split, sequence.name, sequence.coordinates)
-                _pack_sequence(sequence, writer, result.published_bytes, step, threads)
-    result.stored_bytes = cast(PackedSource, open(result.out)).stored_bytes()
-    result.elapsed_s = time.perf_counter() - began
-    return result
-
-
-def unpack(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
-    *,
-    overwrite: bool = False,
-    threads: int = 2,
-    progress: Progress | None = None,
-) -> UnpackResult:
-    """Write all sequences of `source` as published files: for a packed store, the same bytes that were packed.
-
-    An interrupted run leaves `<out>.part`; the same call again continues with the files that are missing.
-
-    Args:
-        source: a packed store, or anything else that `carlasc.open` takes, or a source.
-        out: the folder to write.
-        overwrite: write into a folder that exists and replace files of the same names; other files stay.
-        threads: number of threads that read ahead.
-        progress: called with (files done, all files).
-
-    Returns:
-        What was written.
-
-    Raises:
-        ConflictError: something exists at `out`, or `out` lies inside `source`.
-        FormatError, MissingDataError: a part of the source is damaged or missing.
-        StorageError: the files cannot be written: a full disk, a folder without write permission.
-    """
-    began = time.perf_counter()
-    _check_threads(threads)
-    source = as_source(source)
-    result = UnpackResult(Path(out))
-    _refuse_overlap(result.out, source)
-    if result.out.exists() and not overwrite:
-        raise ConflictError(
-            result.out,
-            expected="nothing there",
-            found="a folder" if result.out.is_dir() else "a file",
-            advice="choose another name, or give `overwrite=True`",
-        )
-    folder = result.out if result.out.exists() else unfinished(result.out)
-    sequences = source.sequences()
-    step = _steps(sequences, progress)
+    check_names([*sequences], source.location)
     for path, sequence in sequences.items():
         result.sequences.append(path)
-        writer = FolderSink(folder).sequence(path)
-        for name in sequence.documents():
-            writer.write_document(name, sequence.read_document(name))
-        for name in sorted(sequence.fields()):
-            frames = [frame for frame in sequence.frames(name).tolist() if overwrite or not writer.has(name, frame)]
-            kept = len(sequence.frames(name)) - len(frames)
-            for frame, array in _read_ahead(sequence, name, frames, threads):
-                writer.write(name, frame, array)
-                step(1)
-            step(kept)
-            result.kept += kept
-            result.files += len(frames)
-    if folder != result.out:
-        put_in_place(folder, result.out, overwrite=False)
+        result.frames += len(sequence.scan_frames())
+        if isinstance(sequence, PublishedSequence):
+            result.left_out += [f"{path or '.'}: {name}" for name in sequence.unknown_files()]
+    with _writing(out):
+        sink = open_sink(out, options, overwrite)
+        if isinstance(sink, PackedSink):
+            result.published_bytes = _append(sequences, sink, progress, workers or _AHEAD)
+            sink.finish()
+        elif not _pack_blocks(sequences, sink, workers, executor, part, progress):
+            return replace(result, elapsed_s=time.perf_counter() - began)
+    packed = cast(PackedSource, open(out))
+    result.published_bytes = result.published_bytes or packed.published_bytes()
+    result.stored_bytes, result.is_finished = packed.stored_bytes(), True
     result.elapsed_s = time.perf_counter() - began
     return result
+
+
+def _refuse_several(out: object, executor: Engine | None, part: Part) -> None:
+    """Refuse to write a store of one writer by several."""
+    for name, wanted in (("executor", executor is not None), ("part", part.count > 1)):
+        if wanted:
+            raise ArgumentError(name, expected="a .zarr store, which several processes can write", found=str(out))
+
+
+def _pack_blocks(
+    sequences: Mapping[str, Sequence],
+    sink: ZarrSink,
+    workers: int | None,
+    executor: Engine | None,
+    part: Part,
+    progress: Progress | None,
+) -> bool:
+    """Pack a part of the blocks of sequences, in any number of processes, and return whether the store is finished."""
+    if sink.is_finished and part.count == 1:
+        raise ConflictError(
+            sink.location,
+            expected="nothing there",
+            found="a finished store",
+            advice="choose another name, or give `overwrite=True`",
+        )
+    blocks: list[Block] = []
+    writers: list[ZarrWriter] = []
+    for path, sequence in sequences.items():
+        writers.append(writer := sink.sequence(path))
+        writer.identity = (sequence.split, sequence.name, sequence.coordinates)
+        copy_documents(sequence, writer)
+        fields = {name: sequence.frames(name).tolist() for name in sequence.fields()}
+        writer.expect(fields, typical_rows(sequence))
+        blocks += blocks_of(sequence, writer, writer.block)
+    ours = part.take(blocks)
+    missing, total = [block.missing() for block in ours], sum(block.files for block in ours)
+    step = counter(progress, total)
+    step(total - sum(block.files for block in missing))
+    copy_blocks(missing, workers=workers, executor=executor, step=step)
+    for writer in writers:
+        writer.close()
+    for writer in writers:
+        writer.refresh()
+    if part.count > 1 and any(block.missing().files for block in blocks):
+        return False  # another part finishes the store
+    sink.finish()
+    return True
 
 
 @contextmanager
-def _writing(out: Path) -> Iterator[None]:
+def _writing(out: object) -> Iterator[None]:
     """Report a store that cannot be written; sources raise their own errors."""
     try:
         yield
@@ -208,21 +204,32 @@ def _writing(out: Path) -> Iterator[None]:
         ) from error
 
 
-def _check_threads(threads: int) -> None:
-    if threads < 1:
-        raise ArgumentError("threads", expected="1 or more", found=str(threads))
+def _append(
+    sequences: Mapping[str, Sequence], sink: PackedSink, progress: Progress | None, threads: int
+) -> dict[str, int]:
+    """Pack sequences one after the other, and return their published bytes by field."""
+    files = sum(len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields())
+    step = counter(progress, files)
+    published: Counter[str] = Counter()
+    for path, sequence in sequences.items():
+        finished = sink.finished(path)
+        with nullcontext() if finished else sink.sequence(path) as writer:
+            if writer is not None:
+                writer.identity = (sequence.split, sequence.name, sequence.coordinates)
+            _append_sequence(sequence, writer, published, step, threads)
+    return dict(published)
 
 
-def _pack_sequence(
+def _append_sequence(
     sequence: Sequence,
     writer: SequenceWriter | None,
-    published_bytes: dict[str, int],
+    published: Counter[str],
     step: Callable[[int], None],
     threads: int,
 ) -> None:
     """Copy a sequence field by field and add up its published bytes; None for the writer of a sequence that is already packed."""
     documents = {name: sequence.read_document(name) for name in sequence.documents()}
-    published_bytes["documents"] = published_bytes.get("documents", 0) + sum(map(len, documents.values()))
+    published["documents"] += sum(map(len, documents.values()))
     if writer is not None:
         for name, data in documents.items():
             writer.write_document(name, data)
@@ -232,7 +239,7 @@ def _pack_sequence(
             if writer is not None:
                 writer.write(name, frame, array)
             itemsize = np.dtype(entry.dtype).itemsize if entry.dtype else array.itemsize
-            published_bytes[name] = published_bytes.get(name, 0) + array.size * itemsize
+            published[name] += array.size * itemsize
             step(1)
 
 
@@ -245,31 +252,3 @@ def _read_ahead(sequence: Sequence, name: str, frames: list[int], threads: int) 
             while len(ahead) < threads and number + len(ahead) < len(blocks):
                 ahead.append(pool.submit(sequence.read_many, name, blocks[number + len(ahead)]))
             yield from zip(block, ahead.popleft().result(), strict=True)
-
-
-def _steps(sequences: Mapping[str, Sequence], progress: Progress | None) -> Callable[[int], None]:
-    """Return a function that counts files and reports the count to `progress`."""
-    total = sum(len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields())
-    done = 0
-
-    def step(files: int) -> None:
-        nonlocal done
-        done += files
-        if progress is not None and files:
-            progress(done, total)
-
-    return step
-
-
-def _refuse_overlap(out: Path, source: Source) -> None:
-    """Refuse to write into the source, or over it."""
-    if "://" in source.location:
-        return
-    place, origin = out.resolve(), Path(source.location).resolve()
-    if place == origin or place.is_relative_to(origin) or origin.is_relative_to(place):
-        raise ConflictError(
-            out,
-            expected=f"a path outside of {source.location}",
-            found="one inside it or around it",
-            advice="choose another path",
-        )

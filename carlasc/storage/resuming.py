@@ -18,7 +18,7 @@ from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import SequenceWriter
+from carlasc.storage.sinks import SequenceWriter
 
 RECORD = "carlasc"
 RECORD_FORMAT = 1

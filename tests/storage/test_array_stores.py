@@ -13,6 +13,7 @@ from carlasc.errors import FormatError
 from carlasc.storage import Sequence
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.tables.writing import ParquetSink
 from carlasc.testing.data import SCANS, WHOLE
 
 h5py = pytest.importorskip("h5py")
@@ -77,7 +78,7 @@ def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_pat
         assert set(file[SCANS]) == {"documents", "times"}
 
 
-@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("h5", "hdf5plugin"), ("parquet", "pyarrow")])
+@pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])
 def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
     tmp_path: Path, kind: str, package: str
 ) -> None:
@@ -90,16 +91,15 @@ def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
     assert list(carlasc.open(tmp_path / f"x.{kind}").sequences()) == [WHOLE]
 
 
-@pytest.mark.parametrize(("kind", "package"), [("zarr", "zarr"), ("parquet", "pyarrow")])
-def test_what_an_interrupted_run_left_of_a_sequence_is_removed(tmp_path: Path, kind: str, package: str) -> None:
-    pytest.importorskip(package)
+def test_what_an_interrupted_run_left_of_a_sequence_of_tables_is_removed(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
     labels = np.arange(3, dtype=np.uint32)
-    interrupted = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
+    interrupted = ParquetSink(tmp_path / "x.parquet").sequence(SCANS)
     interrupted.write("instances", 0, labels)
     for writer in interrupted.writers.values():
         writer.close()  # the field is whole, its sequence is not
     assert any("instances" in name for name in files_of(tmp_path))
-    write(tmp_path / f"x.{kind}", [labels], None, "labels")
+    write(tmp_path / "x.parquet", [labels], None, "labels")
     assert not any("instances" in name for name in files_of(tmp_path))
 
 

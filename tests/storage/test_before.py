@@ -10,6 +10,7 @@ import pytest
 import carlasc
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI
 from carlasc.storage import layout
+from carlasc.testing.data import published_bytes
 
 ENDINGS = ("zarr", "h5", "parquet")
 KITTI = "Val/KITTI_08/cartesian"
@@ -87,3 +88,32 @@ def test_a_grid_made_of_a_capture_is_read(before):
         votes = sequence.read("small/votes", frame)
         assert votes["votes"].sum() == counts.sum() > 0
     assert json.loads((folder / "small/params.json").read_text())["carlasc"]["vote"] == "sensor"
+
+
+@pytest.mark.needs("numcodecs")
+def test_a_zarr_store_of_version_1_is_read(tmp_path):
+    with tarfile.open(Path(__file__).parents[1] / "data/before/zarr-1.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    published = carlasc.open(tmp_path / "published").sequences()
+    source = carlasc.open(tmp_path / "store.zarr")
+    assert source.version == 1
+    assert list(source.sequences()) == list(published)
+    read = 0
+    for path, sequence in source.sequences().items():
+        wanted = published[path]
+        assert sequence.fields() == wanted.fields()
+        assert sorted(sequence.documents()) == sorted(wanted.documents())
+        assert all(sequence.read_document(name) == wanted.read_document(name) for name in wanted.documents())
+        for name in sorted(wanted.fields()):
+            frames = wanted.frames(name).tolist()
+            assert sequence.frames(name).tolist() == frames
+            for frame, array in zip(frames, sequence.read_many(name, frames), strict=True):
+                assert published_bytes(name, array) == published_bytes(name, wanted.read(name, frame)), (name, frame)
+                read += 1
+        for frame in (2, 5):
+            xyz = sequence.read_xyz([frame])[0]
+            assert np.array_equal(xyz[:, :3], wanted.read("points", frame)[:, :3])
+        shards = sequence.files_of("points", [2, 5])
+        assert shards[0] == f"{path}/scans/points/xyz/c/0/0" and (tmp_path / "store.zarr" / shards[0]).is_file()
+    assert read == 56
+    assert source.sequences()[KITTI.replace("KITTI_08", "Town07_Heavy")].read("points", 5)[:, 3].any()

@@ -14,10 +14,9 @@ from helpers.sequences import files_of, write_dataset
 
 import carlasc
 from carlasc.errors import FormatError
-from carlasc.storage import FolderSource, Sequence, Source
+from carlasc.storage import FolderSource, Sequence, Source, pack, unpack
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.protocol import Options
-from carlasc.storage.packing import pack, unpack
 from carlasc.testing.data import SCANS, WHOLE
 
 PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
@@ -124,26 +123,64 @@ def change_kind(root: dict[str, Any]) -> None:
 
 
 def make_big_endian(root: dict[str, Any]) -> None:
-    codecs = node(root, f"{WHOLE}/scans/points/frames")["codecs"]
+    codecs = node(root, f"{WHOLE}/counts")["codecs"]
     codecs[0]["configuration"] = {"endian": "big"}
 
 
 def change_codec(root: dict[str, Any]) -> None:
-    node(root, f"{WHOLE}/scans/points/frames")["codecs"][1]["name"] = "gzip"
+    node(root, f"{WHOLE}/counts")["codecs"][1]["name"] = "gzip"
 
 
 def remove_array(root: dict[str, Any]) -> None:
-    del root["consolidated_metadata"]["metadata"][f"{WHOLE}/scans/points/frames"]
+    del root["consolidated_metadata"]["metadata"][f"{WHOLE}/counts"]
 
 
 def remove_field(root: dict[str, Any]) -> None:
     del root["consolidated_metadata"]["metadata"][f"{WHOLE}/scans/points"]
 
 
+def remove_chunk(root: dict[str, Any]) -> None:
+    del node(root, f"{WHOLE}/scans/points")["attributes"]["chunk"]
+
+
+def change_block(root: dict[str, Any]) -> None:
+    root["attributes"]["block"] = 0
+
+
+def forget_columns(root: dict[str, Any]) -> None:
+    del node(root, f"{WHOLE}/counts")["attributes"]["columns"]
+
+
+def shorten(root: dict[str, Any]) -> None:
+    node(root, f"{WHOLE}/scans/points/xyz")["shape"][1] = 5 * 16 * 16384
+
+
+def flatten(root: dict[str, Any]) -> None:
+    xyz = node(root, f"{WHOLE}/scans/points/xyz")
+    xyz["shape"][0] = xyz["chunk_grid"]["configuration"]["chunk_shape"][0] = 2
+    xyz["codecs"][0]["configuration"]["chunk_shape"][0] = 2
+
+
+def widen(root: dict[str, Any]) -> None:
+    node(root, f"{WHOLE}/scans/points/xyz")["data_type"] = "float64"
+
+
+def make_larger(root: dict[str, Any]) -> None:
+    xyz = node(root, f"{WHOLE}/scans/points/xyz")
+    xyz["codecs"][0]["configuration"]["chunk_shape"][1] = 1 << 15
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (take_completeness, "expected a finished store, found one whose packing was interrupted"),
+        (remove_chunk, "expected the size of its chunks, found None: the store is damaged"),
+        (change_block, "expected a number of frames in block, found 0"),
+        (forget_columns, r"expected \(4, 0\) numbers of elements, of rising frames, found others"),
+        (shorten, r"xyz: expected <f4 with room for frame 5, found <f4 of shape \(3, 1310720\)"),
+        (flatten, r"expected <f4 with room for frame 5, found <f4 of shape \(2, "),
+        (widen, r"expected <f4 with room for frame 5, found <f8"),
+        (make_larger, "the checksum does not match|found none: the store is damaged"),
+        (take_completeness, "expected a finished store, found one that is being written, or was interrupted"),
         (change_type, "expected the sequence that the store lists"),
         (remove_split, "expected the attribute split, found none: the store is damaged"),
         (change_kind, "expected a field of kind points, found 'values'"),

@@ -9,7 +9,7 @@ from helpers.sequences import scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source
-from carlasc.storage.packed.arrays.hdf5_store import HDF5Sink
+from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,8 @@ from typer.testing import CliRunner
 import carlasc
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
-from carlasc.storage import FolderSink, FolderSource
+from carlasc.storage import FolderSink, FolderSource, pack, unpack
 from carlasc.storage.packed.protocol import Options
-from carlasc.storage.packing import pack, unpack
 
 for package in ("zarr", "h5py", "hdf5plugin", "pyarrow"):
     pytest.importorskip(package)
@@ -128,6 +128,32 @@ def test_odd_shapes_and_every_bit_pattern_come_back(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("most", [255, 256, 65_535, 65_536, 2**24, 0.5, np.nan, -0.0, np.inf])
+def test_counts_of_any_size_come_back(tmp_path: Path, kind: str, most: float) -> None:
+    writer = FolderSink(tmp_path / "data").sequence(PATH)
+    writer.write_document("evaluation/params.json", params(SIZE))
+    for frame in range(2):
+        counts = np.zeros(SIZE, np.float32)
+        counts[0, 0, 0] = most if frame else 1
+        writer.write("evaluation/labels", frame, np.zeros(SIZE, np.uint32))
+        writer.write("evaluation/counts", frame, counts)
+    assert round_trip(tmp_path / "data", tmp_path / f"x.{kind}") == files_of(tmp_path / "data")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("largest", [255, 256, 65_536, 2**32 - 1])
+def test_labels_of_any_size_come_back(tmp_path: Path, kind: str, largest: int) -> None:
+    writer = FolderSink(tmp_path / "data").sequence(PATH)
+    writer.write_document("evaluation/params.json", params(SIZE))
+    labels = np.full(SIZE, largest, np.uint32)
+    writer.write("evaluation/labels", 0, labels)
+    writer.write("points", 0, np.zeros((3, 4), np.float32))
+    writer.write("labels", 0, np.array([0, 1, largest], np.uint32))
+    writer.write("instances", 0, np.array([0, 1, largest], np.uint32))
+    assert round_trip(tmp_path / "data", tmp_path / f"x.{kind}") == files_of(tmp_path / "data")
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_quantised_points_are_within_half_a_step_and_say_so(data: Path, tmp_path: Path, kind: str) -> None:
     pack(data, tmp_path / f"x.{kind}", lossy_mm=1)
     unpack(tmp_path / f"x.{kind}", tmp_path / "files")
@@ -220,13 +246,16 @@ def test_a_grid_whose_size_changes_is_an_error(tmp_path: Path, kind: str) -> Non
     writer.write("evaluation/labels", 1, grid(rng, (3, 5, 3))["labels"])
     with pytest.raises(FormatError, match=r"evaluation/000001\.label: expected 120 bytes"):
         pack(tmp_path / "data", tmp_path / f"x.{kind}")
-    assert not (tmp_path / f"x.{kind}").exists()
+    with pytest.raises(CarlascError, match="run the same command again"):
+        carlasc.open(tmp_path / f"x.{kind}")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_output_that_cannot_be_written_is_one_clear_error(data: Path, tmp_path: Path, kind: str) -> None:
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(CarlascError, match=rf"x\.{kind}: cannot be written: (Not a directory|File exists)"):
+    with pytest.raises(
+        CarlascError, match=rf"x\.{kind}(/zarr\.json)?: cannot be written: (Not a directory|File exists)"
+    ):
         pack(data / "Val", tmp_path / "file" / f"x.{kind}")
 
 
@@ -242,7 +271,7 @@ def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(data: Path, tmp_path
 
 
 KILLED = """
-import os, signal, sys, carlasc.storage.packing as packing
+import os, signal, sys, carlasc.storage as packing
 from carlasc.storage import FolderSource
 def kill(done, total):
     if done >= min(int(sys.argv[4]), total):
@@ -259,25 +288,28 @@ def test_a_killed_pack_leaves_no_store_and_a_second_run_finishes_it(
     out = tmp_path / f"x.{kind}"
     killed = subprocess.run([sys.executable, "-c", KILLED, "pack", data, out, str(files)], check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert not out.exists()
-    assert (tmp_path / f"x.{kind}.part").exists()
-    with pytest.raises(FormatError):
-        carlasc.open(tmp_path / f"x.{kind}.part").sequences()[PATH].read("points", 0)
+    assert out.exists() is (kind == "zarr")
+    with pytest.raises(CarlascError, match="run the same command again"):
+        carlasc.open(out)
     assert round_trip(data, out) == files_of(data)
     assert {entry.name for entry in tmp_path.iterdir()} == {out.name, "x.files"}
 
 
-def test_a_second_run_does_not_pack_finished_sequences_again(data: Path, tmp_path: Path) -> None:
+def test_a_second_run_does_not_pack_blocks_again(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.zarr"
     subprocess.run([sys.executable, "-c", KILLED, "pack", data, out, "999"], check=False)
-    finished = [
-        path for path in carlasc.open(data).sequences() if (out.with_name("x.zarr.part") / path / "scans").exists()
-    ]
-    assert PATH in finished
-    before = (out.with_name("x.zarr.part") / PATH / "scans" / "points" / "zarr.json").stat().st_mtime_ns
-    time.sleep(0.01)
+    before = {file: file.stat().st_mtime_ns for file in out.rglob("c/**/0") if file.is_file()}
+    assert len(before) == 37
     pack(data, out)
-    assert (out / PATH / "scans" / "points" / "zarr.json").stat().st_mtime_ns == before
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+
+
+def test_what_another_source_left_is_not_mixed_with_this_one(data: Path, tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-c", KILLED, "pack", data, tmp_path / "x.zarr", "1"], check=False)
+    other = write_dataset(tmp_path / "other", seed=1)
+    (other / PATH / "carlasc.json").write_bytes(b"{}")
+    with pytest.raises(ConflictError, match=r"carlasc\.json: expected the text file of this source, found another"):
+        pack(other, tmp_path / "x.zarr")
 
 
 def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> None:
@@ -328,6 +360,7 @@ def test_the_command_line_tells_wrong_usage_from_failure(
     data: Path, tmp_path: Path, arguments: list[str], code: int
 ) -> None:
     (tmp_path / "taken.zarr").mkdir()
+    (tmp_path / "taken.zarr" / "photo.jpg").write_bytes(b"1")
     out, *options = arguments
     result = runner.invoke(app, ["pack", str(data), str(tmp_path / out), *options])
     assert result.exit_code == code
@@ -343,11 +376,22 @@ def test_only_zarr_has_a_small_kind_and_the_command_names_the_option(data: Path,
     assert result.stderr.endswith("leave `--small` out\n")
 
 
-def test_no_threads_are_an_argument_error(data: Path, tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="threads: expected 1 or more, found 0"):
-        pack(data, tmp_path / "x.h5", threads=0)
-    with pytest.raises(ArgumentError, match="threads: expected 1 or more, found 0"):
-        unpack(data, tmp_path / "files", threads=0)
+def test_no_workers_are_an_argument_error(data: Path, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
+        pack(data, tmp_path / "x.h5", workers=0)
+    with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
+        unpack(data, tmp_path / "files", workers=0)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["h5", "parquet"])
+def test_stores_of_one_writer_take_no_executor(data: Path, tmp_path: Path, kind: str) -> None:
+    with (
+        ThreadPoolExecutor(1) as executor,
+        pytest.raises(ArgumentError, match=r"executor: expected a \.zarr store, which several processes can write"),
+    ):
+        pack(data, tmp_path / f"x.{kind}", executor=executor)
+    assert not list(tmp_path.iterdir())
 
 
 def test_results_say_how_long_it_took(data: Path, tmp_path: Path) -> None:

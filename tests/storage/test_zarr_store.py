@@ -11,7 +11,7 @@ from helpers.sequences import files_of, scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source, layout
-from carlasc.storage.packed.arrays.zarr_store import ZarrSink
+from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract
@@ -47,6 +47,8 @@ class TestZippedZarrSource(SourceContract):
 
 
 class TestZarrSink(SinkContract):
+    rising = False
+
     def sink(self, out: Path) -> Sink:
         return ZarrSink(out)
 
@@ -59,14 +61,18 @@ def test_zarr_python_reads_the_same_numbers(published: Path, tmp_path: Path, sma
     pack(published, tmp_path / "x.zarr", small=small)
     sequence = zarr.open_group(tmp_path / "x.zarr", mode="r")[WHOLE]
     reference = FolderSource(published).sequences()[WHOLE]
-    points = sequence["scans/points"]
-    for frame, (start, end) in zip(points["frames"][:], points["xyz_offsets"][:], strict=True):
-        assert np.array_equal(points["xyz"][:, start:end].T, reference.read("points", int(frame))[:, :3])
-    cells = sequence["grids/evaluation/labels"]
-    for position, frame in enumerate(cells["frames"][:]):
-        assert np.array_equal(cells["values"][position], reference.read("evaluation/labels", int(frame)))
+    columns = sequence["counts"].attrs["columns"]
+    counts = dict(zip(sequence["frames"][:].tolist(), sequence["counts"][:].tolist(), strict=True))
+    xyz, cells = sequence["scans/points/xyz"], sequence["grids/evaluation/labels/values"]
+    room = xyz.shards[1] // 16
+    assert ("pcodec" in str(xyz.metadata.codecs).lower()) is small
+    for frame in reference.frames("points").tolist():
+        count = counts[frame][columns.index("scans/points/xyz")]
+        assert np.array_equal(xyz[:, frame * room : frame * room + count].T, reference.read("points", frame)[:, :3])
+    for frame in reference.frames("evaluation/labels").tolist():
+        assert np.array_equal(cells[frame], reference.read("evaluation/labels", frame))
     assert np.array_equal(sequence["poses"][:], reference.poses)
-    assert bytes(sequence["documents/poses.txt"][:]) == reference.read_document("poses.txt")
+    assert np.array_equal(sequence["times"][:], reference.times)
 
 
 def test_metadata_are_consolidated_and_codecs_of_the_core_specification(store: Path) -> None:
@@ -88,16 +94,18 @@ def test_every_node_says_type_version_dtype_and_unit(store: Path) -> None:
             assert node["attributes"]["dtype"] == node["data_type"], name
 
 
-def test_labels_and_counts_shrink_to_a_byte_and_other_counts_stay(store: Path) -> None:
+def test_types_are_fixed_and_columns_that_no_frame_needs_are_absent(store: Path) -> None:
     group = zarr.open_group(store, mode="r")[WHOLE]
     assert group["scans/labels/values"].dtype == np.uint8
+    assert group["scans/instances/values"].dtype == np.uint32
     assert group["grids/evaluation/labels/values"].dtype == np.uint8
-    assert group["grids/evaluation/counts/values"].dtype == np.uint8
-    assert group["grids/evaluation_8x4x3/counts/values"].dtype == np.float32
+    assert group["grids/evaluation/counts/values"].dtype == np.uint16
+    assert group["grids/evaluation_8x4x3/counts/values_wide"].dtype == np.float32
+    assert "values" not in group["grids/evaluation_8x4x3/counts"]
     assert "fourth" not in group["scans/points"]
 
 
-def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
+def test_frames_that_do_not_fit_the_type_go_to_a_second_column(tmp_path: Path) -> None:
     values = [np.array([1, 255]), np.array([256, 3]), np.array([2]), np.array([70000, 0]), np.array([4, 5])]
     with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(SCANS) as writer:
         for frame, labels in enumerate(values):
@@ -105,8 +113,7 @@ def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
     sequence = carlasc.open(tmp_path / "x.zarr").sequences()[SCANS]
     for frame, labels in enumerate(values):
         assert sequence.read("labels", frame).tolist() == labels.tolist()
-    assert sequence.read("labels", 0).dtype == np.uint32
-    assert not [name for name in files_of(tmp_path / "x.zarr") if "uint" in name]
+    assert [sequence.read("labels", frame).dtype.itemsize for frame in range(5)] == [1, 4, 1, 4, 1]
 
 
 def test_a_scan_larger_than_the_first_takes_several_chunks(tmp_path: Path) -> None:
@@ -132,7 +139,8 @@ def shard_of(store: Path, field: str) -> Path:
 def test_a_corrupted_chunk_names_field_and_frame(store: Path, node: str, field: str) -> None:
     file = shard_of(store, node)
     data = bytearray(file.read_bytes())
-    data[len(data) // 8 if field == "points" else 20] ^= 1
+    index = 16 * 16 * (16 if field == "points" else 1) + 4
+    data[index + (len(data) - index) // 2] ^= 1
     file.write_bytes(data)
     sequence = carlasc.open(store).sequences()[WHOLE]
     failures = []
@@ -162,25 +170,22 @@ def test_a_missing_shard_is_damage_and_no_zeros(store: Path) -> None:
 def test_a_chunk_that_the_index_does_not_have_is_damage_and_no_zeros(store: Path) -> None:
     import google_crc32c
 
-    file = shard_of(store, "scans/points/xyz")
-    per_shard = json.loads((store / WHOLE / "scans/points/xyz/zarr.json").read_bytes())["chunk_grid"]["configuration"]
-    chunk = json.loads((store / WHOLE / "scans/points/xyz/zarr.json").read_bytes())["codecs"][0]["configuration"]
-    size = 16 * (per_shard["chunk_shape"][1] // chunk["chunk_shape"][1])
-    data = bytearray(file.read_bytes())
-    data[-4 - size + 32 : -4 - size + 48] = b"\xff" * 16  # of chunk 2, which is frame 5
-    data[-4:] = google_crc32c.value(bytes(data[-4 - size : -4])).to_bytes(4, "little")
+    file = store / WHOLE / "scans/points/xyz/c/0/0"
+    data, size, slot = bytearray(file.read_bytes()), 16 * 16 * 16, 16 * 16 * 5  # 16 bytes per slot, 16 slots per frame
+    data[slot : slot + 16] = b"\xff" * 16  # the first chunk of frame 5
+    data[size : size + 4] = google_crc32c.value(bytes(data[:size])).to_bytes(4, "little")
     file.write_bytes(data)
     sequence = carlasc.open(store).sequences()[WHOLE]
-    with pytest.raises(FormatError, match="field points, frame 5.*expected chunk 2, found none: the store is damaged"):
+    with pytest.raises(FormatError, match="field points, frame 5.*expected chunk 80, found none: the store is damaged"):
         sequence.read("points", 5)
     assert len(sequence.read("points", 2)) == 777
 
 
 def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
     root = json.loads((store / "zarr.json").read_bytes())
-    root["attributes"]["version"] = 2
+    root["attributes"]["version"] = 3
     (store / "zarr.json").write_text(json.dumps(root))
-    with pytest.raises(FormatError, match="found version 2: upgrade carlasc"):
+    with pytest.raises(FormatError, match="found version 3: upgrade carlasc"):
         carlasc.open(store)
 
 
@@ -190,34 +195,69 @@ def test_another_zarr_store_is_refused(tmp_path: Path) -> None:
         carlasc.open(tmp_path / "x.zarr")
 
 
-def test_an_unfinished_store_is_refused_under_either_name(published: Path, tmp_path: Path) -> None:
-    sink = ZarrSink(tmp_path / "x.zarr")
-    sink.sequence(SCANS).close()
-    assert not (tmp_path / "x.zarr").exists()
-    with pytest.raises(carlasc.errors.MissingDataError, match=r"x\.zarr\.part: run the same command again"):
+def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
+    ZarrSink(tmp_path / "x.zarr").sequence(SCANS).close()
+    with pytest.raises(
+        FormatError, match="being written, or was interrupted: run the same command again.*carlasc finish"
+    ):
         carlasc.open(tmp_path / "x.zarr")
-    with pytest.raises(FormatError):
-        carlasc.open(tmp_path / "x.zarr.part")
 
 
-def test_a_second_run_keeps_finished_sequences_unless_it_packs_differently(tmp_path: Path) -> None:
+def test_a_second_run_finds_what_exists_and_other_options_are_a_conflict(tmp_path: Path) -> None:
     points = np.ones((3, 4), np.float32)
     with ZarrSink(tmp_path / "x.zarr").sequence(SCANS) as writer:
         writer.write("points", 0, points)
-    assert ZarrSink(tmp_path / "x.zarr").finished(SCANS)
-    assert not ZarrSink(tmp_path / "x.zarr").finished(WHOLE)
-    assert not ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1)).finished(SCANS)
+    again = ZarrSink(tmp_path / "x.zarr").sequence(SCANS)
+    assert again.has("points", 0) and not again.has("points", 1) and not again.has("labels", 0)
+    assert np.array_equal(again.read("points", 0), points)
+    with pytest.raises(ConflictError, match=r"same options, found one with lossy_mm None.*overwrite=True"):
+        ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1))
+    assert not ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1), overwrite=True).sequence(SCANS).has("points", 0)
 
 
-def test_overwrite_replaces_a_store_but_no_other_folder(store: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
-        ZarrSink(store)
-    with ZarrSink(store, overwrite=True):
-        assert carlasc.open(store).sequences()  # the old one stands until the new one is finished
-    assert not carlasc.open(store).sequences()
+def test_more_is_added_to_a_finished_store_and_seen_when_it_is_finished_again(store: Path) -> None:
+    points = np.ones((3, 4), np.float32)
+    before = carlasc.open(store).sequences()[WHOLE]
+    old = before.read("points", 5)
+    sink = ZarrSink(store)
+    assert sink.is_finished
+    with sink.sequence(WHOLE) as writer:
+        assert writer.has("points", 5) and not writer.has("points", 20)
+        writer.write("points", 20, points)
+        writer.write("instances", 3, np.arange(4, dtype=np.uint32))
+    assert np.array_equal(carlasc.open(store).sequences()[WHOLE].read("points", 5), old)
+    assert carlasc.open(store).sequences()[WHOLE].frames("points").tolist() == [0, 1, 2, 5]
+    sink.finish()
+    after = carlasc.open(store).sequences()[WHOLE]
+    assert after.frames("points").tolist() == [0, 1, 2, 5, 20]
+    assert after.frames("instances").tolist() == [0, 1, 2, 3, 5]
+    assert np.array_equal(after.read("points", 20), points)
+    assert np.array_equal(after.read("instances", 5), before.read("instances", 5))
+
+
+def test_overwrite_keeps_the_old_store_until_the_new_one_is_finished(store: Path, tmp_path: Path) -> None:
+    before = files_of(store)
+    sink = ZarrSink(store, overwrite=True)
+    sink.sequence(SCANS).close()
+    assert files_of(store.with_name("x.zarr.old")) == before
+    joined = ZarrSink(store, overwrite=True)  # a second process of the same run, or the run again
+    assert not joined.is_finished
+    joined.finish()
+    assert list(carlasc.open(store).sequences()) == [SCANS]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.zarr"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_nothing_but_a_store_is_written_to(tmp_path: Path, overwrite: bool) -> None:
     (tmp_path / "photos.zarr").mkdir()
-    with pytest.raises(ConflictError, match="packed store to overwrite"):
-        ZarrSink(tmp_path / "photos.zarr", overwrite=True)
+    (tmp_path / "photos.zarr" / "a.jpg").write_bytes(b"1")
+    (tmp_path / "file.zarr").write_bytes(b"1")
+    zarr.create_group(tmp_path / "other.zarr")
+    before = files_of(tmp_path)
+    for name in ("photos", "file", "other"):
+        with pytest.raises(ConflictError, match=f"{name}.zarr: expected"):
+            ZarrSink(tmp_path / f"{name}.zarr", overwrite=overwrite)
+    assert files_of(tmp_path) == before
 
 
 @pytest.mark.parametrize("millimetres", [0, -1, float("nan"), 2000])

@@ -14,9 +14,10 @@ from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.folders.names import leads_outside
-from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source, identity_of
+from carlasc.storage.protocol import Sequence, Source, identity_of
+from carlasc.storage.sinks import SequenceWriter, Sink
 
-VERSION = 1  # of the format in docs/storage.md
+VERSION = 1  # of the format in docs/storage.md; zarr stores have a newer one
 STORE = "carlasc.store"
 
 
@@ -27,17 +28,21 @@ class Options:
     Attributes:
         small: PCodec for the points: smaller, but only readers with numcodecs' `pcodec` extension open it.
         lossy_mm: quantise points to this many millimetres; None keeps every bit.
+        block: number of frames in one file of a zarr store, which one task writes.
 
     Raises:
-        ArgumentError: `lossy_mm` is not above 0 and at most 1000.
+        ArgumentError: `lossy_mm` is not above 0 and at most 1000, or `block` is not from 1 to 1024.
     """
 
     small: bool = False
     lossy_mm: float | None = None
+    block: int = 16
 
     def __post_init__(self) -> None:
         if self.lossy_mm is not None and not 0 < self.lossy_mm <= 1000:
             raise ArgumentError("lossy_mm", expected="millimetres above 0, up to 1000", found=str(self.lossy_mm))
+        if not 1 <= self.block <= 1024:
+            raise ArgumentError("block", expected="1 to 1024 frames", found=str(self.block))
 
     @property
     def scale_m(self) -> float | None:
@@ -49,10 +54,14 @@ class PackedSource(Source):
     """A packed store.
 
     Attributes:
+        version: version of the store's format.
         nodes: the group (or folder) of each sequence in the store, by the sequence's path.
+        newest: the newest version that this class reads.
     """
 
+    version: int
     nodes: Mapping[str, str]
+    newest: int = VERSION
 
     def __init__(self, location: str, root: Mapping[str, Any] | None) -> None:
         """Check the attributes of the store's root.
@@ -61,20 +70,25 @@ class PackedSource(Source):
             FormatError: it is something else, unfinished, or of a newer version, or a name in it leads out of the store.
         """
         self.location = location
-        self.nodes = _check_root(root, location)
+        self.nodes = _check_root(root, location, self.newest)
+        self.version = (root or {}).get("version", VERSION)
+
+    def published_bytes(self) -> dict[str, int]:
+        """Return the bytes that the published files of each field have; empty where the store does not say it."""
+        return {}
 
     @abstractmethod
     def stored_bytes(self) -> dict[str, int]:
         """Return the bytes that each field takes in the store; "documents" for the text files, "index" for all the rest."""
 
 
-def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]:
+def _check_root(root: Mapping[str, Any] | None, where: str, newest: int) -> Mapping[str, str]:
     if root is None or root.get("type") != STORE:
         raise FormatError(where, expected="a store packed by carlasc", found=f"one without the type {STORE}")
-    if root.get("version", 0) > VERSION:
+    if root.get("version", 0) > newest:
         raise FormatError(
             where,
-            expected=f"a store of version {VERSION} or older",
+            expected=f"a store of version {newest} or older",
             found=f"version {root['version']}",
             advice="upgrade carlasc to read it",
         )
@@ -82,8 +96,8 @@ def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]
         raise FormatError(
             where,
             expected="a finished store",
-            found="one whose packing was interrupted",
-            advice="run the same command again to finish it",
+            found="one that is being written, or was interrupted",
+            advice="run the same command again to finish it, or `carlasc finish`",
         )
     nodes: dict[str, str] = dict(sorted(root["sequences"].items()))
     check_names([*nodes, *nodes.values()], where)
@@ -157,7 +171,7 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
 
 
 class PackedSink(Sink):
-    """Takes a packed store."""
+    """Writes a packed store by appending: one writer, which writes one sequence after the other."""
 
     @abstractmethod
     def finished(self, path: str) -> bool:

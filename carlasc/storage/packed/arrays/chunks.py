@@ -119,6 +119,10 @@ class StoredArray:
         """Return the file, the first byte and the end of each chunk."""
         raise NotImplementedError
 
+    def files(self, numbers: Sequence[int]) -> list[str]:
+        """Return the files that hold some chunks, each once."""
+        raise NotImplementedError
+
     def verify(self, data: memoryview, number: int) -> memoryview:
         """Return a chunk's encoded bytes without their checksum.
 
@@ -153,6 +157,15 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     return list(_pool(os.getpid()).map(function, items))
 
 
+def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
+    """Apply a function in other threads than this one.
+
+    In the main thread, Blosc compresses the blocks of a large chunk in threads of its own, and writes them in the order in which they are
+    done: the bytes would differ from run to run.
+    """
+    return list(_pool(os.getpid()).map(function, items))
+
+
 def crc32c(data: bytes | memoryview, extra: str) -> int:
     """Return the CRC-32C of some bytes: processors have an instruction for it, which makes it six times as fast as CRC-32."""
     source = data.obj if isinstance(data, memoryview) else data
@@ -180,4 +193,5 @@ _scratch = _Scratch()
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
     """Return the threads of this process: after a fork, the object exists in the child, but its threads do not."""
-    return ThreadPoolExecutor(min(8, count_workers(None)), thread_name_prefix="carlasc-decode")
+    threads = 1 if multiprocessing.parent_process() is not None else min(8, count_workers(None))
+    return ThreadPoolExecutor(threads, thread_name_prefix="carlasc-codec")

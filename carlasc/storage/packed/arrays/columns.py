@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,8 +22,11 @@ from carlasc.storage.packed.protocol import Options
 
 # Points per chunk: PCodec's bins fit the scene better than in a whole scan, and padding takes bits.
 _PCODEC_STEP = 8192
-_BOXES = 256  # boxes per chunk, at least
+LEAST = 1 << 14  # elements per chunk, at least
+FEW = 256  # the same of boxes, and of the distinct vectors of a flow
+WIDE = "_wide"  # ending of the name of a second column
 _GEOMETRY = tuple(name for name in BOXES_DTYPE.names or () if BOXES_DTYPE[name].kind == "f")
+_WIDE_CELLS = {"<u4": ("u1", "<u4"), "<f4": ("<u2", "<f4")}  # labels and counts of grids, by their published type
 Columns = dict[str, NDArray[Any]]
 
 
@@ -33,13 +36,15 @@ class Column:
 
     Attributes:
         name: name of the array.
-        dtype: type of the first frame; unsigned integers are widened when a later frame needs it.
+        dtype: type of its elements. In version 1, unsigned integers are widened when a later frame needs it.
         encoding: how its chunks are written.
         unit: unit of its values.
         rows: leading dimension of a (rows, N) column; None for a flat one.
         scratch: whether a decoded frame is copied at once, so that the next frame may be decoded into the same memory.
-        step: elements per chunk; None chooses it so that the first frame with any elements fills one chunk.
+        step: elements per chunk; None chooses it so that a typical frame fills one chunk.
         least: smallest value chosen for `step`: a first scan of three points must not lead to chunks of three.
+        types: in version 2, the type of the column and that of the column `<name>_wide`, which takes the frames that do not fit the
+            first; empty: `dtype`, and no second column.
     """
 
     name: str
@@ -49,7 +54,17 @@ class Column:
     rows: int | None = None
     scratch: bool = False
     step: int | None = None
-    least: int = 1 << 14
+    least: int = LEAST
+    types: tuple[str, ...] = ()
+
+    @property
+    def fixed(self) -> tuple[Column, ...]:
+        """The columns of version 2, whose types never change: this one, and the wide one if there is one."""
+        first, *wide = self.types or (self.dtype,)
+        return (
+            replace(self, dtype=first),
+            *(replace(self, name=f"{self.name}{WIDE}", dtype=dtype, least=LEAST) for dtype in wide),
+        )
 
 
 class Packing(ABC):
@@ -80,6 +95,13 @@ class Packing(ABC):
     @abstractmethod
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return a frame's array, written to `into` if that is given; columns that the frame did not need are empty."""
+
+    def published_bytes(self, counts: Mapping[str, int]) -> int:
+        """Return the bytes of the published files that have these numbers of elements in the columns, the wide ones included."""
+        main = self.columns[0].name
+        elements = counts.get(main, 0) + counts.get(f"{main}{WIDE}", 0)
+        row = np.dtype(self.entry.dtype or BOXES_DTYPE).itemsize * (self.entry.columns or 1)
+        return elements * row
 
     def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
         """Return an array for each frame of `counts` elements, for `join` to write to; None where `join` allocates it."""
@@ -140,7 +162,8 @@ class Values(Packing):
     def _columns(self, options: Options) -> tuple[Column, ...]:
         incompressible = self.entry.kind == "picture"
         encoding = Encoding(level=1) if incompressible else Encoding(shuffle=SHUFFLE)
-        return (Column("values", "u1", encoding, self.entry.unit),)
+        types = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype,)
+        return (Column("values", "u1", encoding, self.entry.unit, types=types),)
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Narrow the values."""
@@ -159,7 +182,9 @@ class Flow(Packing):
 
     def _columns(self, options: Options) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
-        return Column("index", "u1", encoding), Column("palette", "<f4", encoding, self.entry.unit, rows=3, least=256)
+        return Column("index", "u1", encoding, types=("u1", "<u4")), Column(
+            "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, types=("<f4", "<f4")
+        )
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Find the distinct vectors; most repeat the one before, so only the first of each run is compared."""
@@ -186,7 +211,8 @@ class Cells(Packing):
     def _columns(self, options: Options) -> tuple[Column, ...]:
         shuffle = BITSHUFFLE if self.entry.kind == "count" else NO_SHUFFLE
         dtype = self.entry.dtype if self.entry.kind == "probability" else "u1"
-        return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit),)
+        types = _WIDE_CELLS.get(self.entry.dtype, (self.entry.dtype,))
+        return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, types=types),)
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Narrow the values, except probabilities: they are whole numbers in few frames, and float32 would take more space."""
@@ -205,9 +231,15 @@ class Votes(Packing):
     def _columns(self, options: Options) -> tuple[Column, ...]:
         return (
             Column("voxel", "<i4", Encoding(shuffle=SHUFFLE), "index"),
-            Column("label", "u1", Encoding(), "class"),
+            Column("label", "u1", Encoding(), "class", types=("u1", "<u2")),
             Column("votes", "<u2", Encoding(shuffle=SHUFFLE), self.entry.unit),
         )
+
+    def published_bytes(self, counts: Mapping[str, int]) -> int:
+        """Return the bytes of tables with this many rows."""
+        wide = counts.get(f"label{WIDE}", 0)
+        narrow_rows = counts.get("voxel", 0) - wide
+        return narrow_rows * layout.VOTES_DTYPE.itemsize + wide * layout.WIDE_VOTES_DTYPE.itemsize
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Return the columns of the table."""
@@ -230,10 +262,10 @@ class BoxTable(Packing):
     def _columns(self, options: Options) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
         return (
-            Column("geometry", "<f8", encoding, self.entry.unit, rows=len(_GEOMETRY), least=_BOXES),
-            Column("track", "<u4", encoding, "object", least=_BOXES),
-            Column("label", "<u4", encoding, "class", least=_BOXES),
-            Column("annotated", "u1", encoding, least=_BOXES),
+            Column("geometry", "<f8", encoding, self.entry.unit, rows=len(_GEOMETRY), least=FEW),
+            Column("track", "<u4", encoding, "object", least=FEW),
+            Column("label", "<u4", encoding, "class", least=FEW),
+            Column("annotated", "u1", encoding, least=FEW),
         )
 
     def split(self, array: NDArray[Any]) -> Columns:

@@ -1,10 +1,10 @@
-"""Reading packed stores of arrays: what zarr and HDF5 have in common."""
+"""Reading packed stores of arrays: what zarr and HDF5, and both versions of the format, have in common."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.storage import layout
+from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.arrays.chunks import StoredArray, parallel, scratch
-from carlasc.storage.packed.arrays.columns import Column, Packing, Points, packing_of
+from carlasc.storage.packed.arrays.columns import WIDE, Column, Packing, Points
 from carlasc.storage.packed.protocol import PackedSequence, PackedSource
 from carlasc.storage.protocol import Sequence
 
@@ -29,9 +29,11 @@ class ArrayStore(ABC):
     Attributes:
         location: what to call it in errors.
         local: whether its bytes are on this machine.
+        tree: the tree of files that it is in.
     """
 
     location: str
+    tree: Tree
     local: bool
 
     @abstractmethod
@@ -65,7 +67,10 @@ class ArraySource(PackedSource):
 
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences that the store lists."""
-        return {path: ArraySequence(self.store, path, group) for path, group in self.nodes.items()}
+        return {path: self._sequence(path, group) for path, group in self.nodes.items()}
+
+    @abstractmethod
+    def _sequence(self, path: str, group: str) -> ArraySequence: ...
 
     def stored_bytes(self) -> dict[str, int]:
         """Return the bytes that each field takes."""
@@ -78,7 +83,7 @@ class ArraySource(PackedSource):
         return dict(sizes) | {"index": self.store.stored_bytes("") - sizes.total()}
 
 
-class ArraySequence(PackedSequence["_ArrayField"]):
+class ArraySequence(PackedSequence["ArrayField"]):
     """One sequence of a packed store of arrays."""
 
     def __init__(self, store: ArrayStore, path: str, group: str) -> None:
@@ -91,6 +96,7 @@ class ArraySequence(PackedSequence["_ArrayField"]):
                 location, expected="the sequence that the store lists", found="none", advice="the store is damaged"
             )
         super().__init__(path, location, attributes)
+        self.tree = store.tree
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame."""
@@ -106,60 +112,57 @@ class ArraySequence(PackedSequence["_ArrayField"]):
         """Read points as they are stored, as planes: the 4th column is not read, and no rows are put together."""
         return self._field("points").read_planes(list(frames), spare or [])
 
-    def read_document(self, name: str) -> bytes:
-        """Return a text file's bytes."""
-        self._check_document(name)
-        return self.store.read_small(f"{self.group}/{document_node(name)}").tobytes()
-
-    def _open_field(self, field: str) -> _ArrayField:
-        return _ArrayField(self.store, f"{self.group}/{field_node(field)}", field)
+    def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
+        """Return the files that hold a field of some frames: shards of a zarr store, the one file of an HDF5 store."""
+        return self._field(field).files_of(list(frames))
 
 
-class _ArrayField:
+class ArrayField:
     """A field of a sequence: its frames, and the columns that they are in."""
 
-    def __init__(self, store: ArrayStore, node: str, field: str) -> None:
-        self.store = store
-        self.node = node
-        self.where = f"{store.location}/{node}"
-        attributes = store.attributes(node)
-        if attributes is None:
-            raise FormatError(
-                self.where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
-            )
-        self.packing: Packing = packing_of(layout.field_named(field), attributes=attributes)
-        if attributes.get("kind") != self.packing.kind:
-            raise FormatError(
-                self.where, expected=f"a field of kind {self.packing.kind}", found=repr(attributes.get("kind"))
-            )
-        self.local = store.local
-        self.frames: NDArray[np.int64] = store.read_small(f"{node}/frames").astype(np.int64)
-        self._positions = {frame: position for position, frame in enumerate(self.frames.tolist())}
+    def __init__(
+        self,
+        where: str,
+        packing: Packing,
+        frames: NDArray[np.int64],
+        columns: Callable[[], dict[str, StoredColumn]],
+        local: bool,
+    ) -> None:
+        """Take what is known of the field.
+
+        Args:
+            where: its name in errors.
+            packing: how its columns become frames.
+            frames: the numbers of its frames, in rising order.
+            columns: opens the columns that are stored: those that some frame needed. Called once, when a frame is read.
+            local: whether its bytes are on this machine.
+        """
+        self.where = where
+        self.packing = packing
+        self.frames = frames
+        self.local = local
+        self._open_columns = columns
+        self._positions = {frame: position for position, frame in enumerate(frames.tolist())}
 
     @cached_property
-    def columns(self) -> dict[str, _StoredColumn]:
-        """The columns that are stored: those that some frame needed."""
-        nodes = {column: f"{self.node}/{column.name}" for column in self.packing.columns}
-        is_grid = self.packing.kind == "grid"
-        return {
-            column.name: _StoredColumn(self.store, node, column, len(self.frames), is_grid)
-            for column, node in nodes.items()
-            if self.store.attributes(node) is not None
-        }
+    def columns(self) -> dict[str, StoredColumn]:
+        """The columns that are stored."""
+        return self._open_columns()
 
     def read(self, frames: list[int]) -> list[NDArray[Any]]:
         """Read frames: from a remote store all their chunks are fetched at once; frames are decoded in parallel."""
         positions = [self._position(frame) for frame in frames]
         tasks = {name: self._tasks(column, frames) for name, column in self.columns.items()}
         main = self.columns.get(self.packing.columns[0].name)
-        outputs = self.packing.allocate([main.count(position) if main else 0 for position in positions])
+        outputs = self.packing.allocate([main.counts[position] if main else 0 for position in positions])
 
         def assemble(k: int) -> NDArray[Any]:
             with self._naming([frames[k]]):
-                parts = {name: column.decode(tasks[name][k]) for name, column in self.columns.items()}
-                return self.packing.join(
-                    {c.name: parts.get(c.name, _empty(c)) for c in self.packing.columns}, outputs[k]
-                )
+                parts = {}
+                for column in self.packing.columns:
+                    name = self._stored_in(column, positions[k])
+                    parts[column.name] = _empty(column) if name is None else self.columns[name].decode(tasks[name][k])
+                return self.packing.join(parts, outputs[k])
 
         return parallel(assemble, range(len(frames)))
 
@@ -177,7 +180,25 @@ class _ArrayField:
 
         return parallel(decode, range(len(frames)))
 
-    def _tasks(self, column: _StoredColumn, frames: list[int]) -> list[_Task]:
+    def published_bytes(self) -> int:
+        """Return the bytes of the field's published files, from the numbers of elements."""
+        return self.packing.published_bytes({name: sum(column.counts) for name, column in self.columns.items()})
+
+    def files_of(self, frames: list[int]) -> list[str]:
+        """Return the files that hold some frames, each once."""
+        positions = [self._position(frame) for frame in frames]
+        files = [
+            column.array.files([number for task in column.tasks(positions) for number in task.chunks])
+            for column in self.columns.values()
+        ]
+        return list(dict.fromkeys(file for found in files for file in found))
+
+    def _stored_in(self, column: Column, position: int) -> str | None:
+        """Return the name of the stored column that has a frame's elements: the column or its wide one."""
+        stored = [name for name in (column.name, f"{column.name}{WIDE}") if name in self.columns]
+        return next((name for name in stored if self.columns[name].counts[position]), stored[0] if stored else None)
+
+    def _tasks(self, column: StoredColumn, frames: list[int]) -> list[_Task]:
         """Return the parts of a column to read, already fetched if the store is remote."""
         tasks = column.tasks([self._position(frame) for frame in frames])
         if not self.local:
@@ -215,38 +236,33 @@ class _Task:
     fetched: list[memoryview] | None = None
 
 
-class _StoredColumn:
-    """One array of a field, and where each frame starts and ends in it: (F, 2)."""
+class StoredColumn:
+    """One array of a field, and which of its chunks each frame has.
 
-    def __init__(self, store: ArrayStore, node: str, column: Column, frames: int, is_grid: bool) -> None:
+    Attributes:
+        column: what is in it.
+        array: its chunks.
+        firsts: number of the first chunk of each frame.
+        counts: number of elements of each frame; for a grid, any number above 0 says that it is there.
+    """
+
+    def __init__(
+        self, column: Column, array: StoredArray, firsts: NDArray[np.int64], counts: NDArray[np.int64], is_grid: bool
+    ) -> None:
         self.column = column
-        self.array = store.array(node)
+        self.array = array
         self.is_grid = is_grid
-        array, step = self.array, self.array.step
-        if is_grid:
-            self.spans = np.stack([np.arange(frames), np.arange(frames) + 1], axis=1)
-        else:
-            self.spans = store.read_small(f"{node}_offsets").astype(np.int64)
-        fits = self.spans.shape == (frames, 2) and (self.spans[:, 0] % step == 0).all()
-        fits = fits and (self.spans[:, 0] <= self.spans[:, 1]).all()
-        if not fits or self.spans.min(initial=0) < 0 or self.spans.max(initial=0) > array.shape[array.axis]:
-            raise FormatError(
-                f"{store.location}/{node}_offsets",
-                expected=f"offsets of {frames} frames inside the array",
-                found="others",
-                advice="the store is damaged",
-            )
-
-    def count(self, position: int) -> int:
-        """Return how many elements a frame has."""
-        start, end = self.spans[position].tolist()
-        return end - start
+        self.firsts: list[int] = firsts.tolist()
+        self.counts: list[int] = counts.tolist()
 
     def tasks(self, positions: list[int]) -> list[_Task]:
         """Return the parts that hold some frames."""
-        spans = (self.spans[position].tolist() for position in positions)
-        step = self.array.step
-        return [_Task(range(start // step, -(-end // step)), end - start) for start, end in spans]
+        step, found = self.array.step, []
+        for position in positions:
+            first, count = self.firsts[position], self.counts[position]
+            chunks = min(count, 1) if self.is_grid else -(-count // step)
+            found.append(_Task(range(first, first + chunks), count))
+        return found
 
     def fetch(self, tasks: list[_Task]) -> None:
         """Fetch the chunks of all tasks at once."""

@@ -1,42 +1,43 @@
-"""Packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core specification.
+"""Reading packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core specification.
 
-zarr-python writes them, and any zarr v3 library reads them. Here, the shards' indices and chunks are read directly (zarr specification
-v3, "sharding_indexed" and "crc32c"), which takes a tenth of zarr-python's time per chunk.
+Any zarr v3 library reads them. Here, the shards' indices and chunks are read directly, which takes a tenth of zarr-python's time per chunk.
 """
 
 from __future__ import annotations
 
-import math
 import os
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
-from carlasc.storage.packed.arrays.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
-from carlasc.storage.packed.arrays.reading import SEQUENCE, ArraySource, ArrayStore
-from carlasc.storage.packed.arrays.writing import ArraySink, ArrayStoreWriter, ChunkWriter
-from carlasc.storage.packed.output import remove
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.folders.trees import RemoteTree, Tree
+from carlasc.storage.packed.arrays.fields import FieldLayout, open_field
+from carlasc.storage.packed.arrays.reading import (
+    ArrayField,
+    ArraySequence,
+    ArraySource,
+    ArrayStore,
+    document_node,
+    field_node,
+)
+from carlasc.storage.packed.arrays.shards import ZarrArray
+from carlasc.storage.packed.arrays.version1 import OffsetsSequence
+from carlasc.storage.packed.arrays.zarr_metadata import METADATA
 
-METADATA = "zarr.json"
-_SHARD = 32 << 20  # bytes of a shard before compression: they are kept in memory until it is full
-_MOST_CHUNKS = 256  # per shard, because the shard's index is read as a whole
-_CHECKSUM = 4  # bytes
-_RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c
-_SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}
+_T = TypeVar("_T")
 
 
 class ZarrSource(ArraySource):
     """A packed zarr store: a folder, a URL, or a zip of either."""
+
+    newest = 2
 
     def __init__(self, tree: Tree) -> None:
         """Read the store's metadata.
@@ -48,24 +49,32 @@ class ZarrSource(ArraySource):
         for module in ("numcodecs", "google_crc32c"):
             import_extra(module, "zarr")
         super().__init__(ZarrStore(tree))
+        self.block = (self.store.attributes("") or {}).get("block", 1)
+        if not isinstance(self.block, int) or self.block < 1:
+            raise FormatError(
+                tree.location,
+                expected="a number of frames in block",
+                found=repr(self.block),
+                advice="the store is damaged",
+            )
 
+    def published_bytes(self) -> dict[str, int]:
+        """Return the bytes that the published files of each field have, from the numbers of elements of the frames."""
+        sizes: Counter[str] = Counter()
+        for sequence in self.sequences().values():
+            if isinstance(sequence, ZarrSequence):
+                sizes["documents"] += sum(len(sequence.read_document(name)) for name in sequence.documents())
+                for field in sorted(sequence.fields()):
+                    sizes[field] += sequence.published_bytes(field)
+        return dict(sizes)
 
-class ZarrSink(ArraySink):
-    """Writes a packed zarr store."""
-
-    def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
-        """Start a store, or continue one whose packing was interrupted: its finished sequences are kept.
-
-        Raises:
-            ConflictError: something exists at `path`, and `overwrite` is not given.
-            DependencyError: zarr is not installed.
-        """
-        options = options or Options()
-        super().__init__(Path(path), lambda part: ZarrStoreWriter(part, options), options, overwrite)
+    def _sequence(self, path: str, group: str) -> ArraySequence:
+        kind = OffsetsSequence if self.version == 1 else ZarrSequence
+        return kind(self.store, path, group)
 
 
 class ZarrStore(ArrayStore):
-    """The nodes of a zarr store."""
+    """The nodes of a finished zarr store, whose metadata are all in its root."""
 
     def __init__(self, tree: Tree) -> None:
         self.tree = tree
@@ -75,6 +84,14 @@ class ZarrStore(ArrayStore):
     @cached_property
     def _root(self) -> dict[str, Any]:
         return parse_json(bytes(self.tree.read(METADATA)), self.tree.where(METADATA))
+
+    @cached_property
+    def _sizes(self) -> dict[str, int]:
+        return self.tree.sizes() if isinstance(self.tree, RemoteTree) else {}
+
+    def forget(self) -> None:
+        """Forget the metadata: they are read again."""
+        vars(self).pop("_root", None)
 
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""
@@ -104,7 +121,10 @@ class ZarrStore(ArrayStore):
         return ZarrArray.from_metadata(self.tree, node, metadata)
 
     def stored_bytes(self, node: str) -> int:
-        """Return the bytes of the files below a node; for a local folder only."""
+        """Return the bytes of the files below a node; for a folder only."""
+        if isinstance(self.tree, RemoteTree):
+            prefix = f"{node}/" if node else ""
+            return sum(size for path, size in self._sizes.items() if path.startswith(prefix))
         files = os.walk(f"{self.location}/{node}")
         return sum((Path(folder) / name).stat().st_size for folder, _, names in files for name in names)
 
@@ -118,261 +138,88 @@ class ZarrStore(ArrayStore):
         return parse_json(bytes(self.tree.read(path)), self.tree.where(path)) if self.tree.is_file(path) else None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_root"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_root", "_sizes")}
 
 
-class ZarrArray(StoredArray):
-    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, sharded or not."""
+class ZarrSequence(ArraySequence):
+    """One sequence of a zarr store of version 2: one table says how many elements each frame has in each column."""
 
-    per_shard: int | None = None
+    store: ZarrStore
 
-    @classmethod
-    def from_metadata(cls, tree: Tree, node: str, metadata: dict[str, Any]) -> ZarrArray:
-        """Read the metadata of an array.
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame."""
+        return self._read_again(lambda: super(ZarrSequence, self).read(field, frame))
 
-        Raises:
-            FormatError: its codecs or its chunks are not those that carlasc writes.
-        """
-        where = tree.where(node)
+    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
+        """Read several frames: fetched together, decoded in parallel."""
+        numbers = list(frames)
+        return self._read_again(lambda: super(ZarrSequence, self).read_many(field, numbers))
+
+    def read_xyz(
+        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Read points as they are stored, as planes: the 4th column is not read, and no rows are put together."""
+        numbers = list(frames)
+        return self._read_again(lambda: super(ZarrSequence, self).read_xyz(numbers, spare))
+
+    def _read_again(self, read: Callable[[], _T]) -> _T:
+        """Read once more, with what the store says now, where something does not fit: a store can grow while it is read."""
         try:
-            shape, dtype = tuple(metadata["shape"]), np.dtype(metadata["data_type"]).newbyteorder("<")
-            outer = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-            codecs, chunk = metadata["codecs"], outer
-            if sharded := codecs[0]["name"] == "sharding_indexed":
-                chunk, codecs = tuple(codecs[0]["configuration"]["chunk_shape"]), codecs[0]["configuration"]["codecs"]
-            encoding = _encoding_of(codecs)
-            axis = next(
-                (axis for axis in range(len(shape)) if chunk[axis] < outer[axis] or outer[axis] < shape[axis]),
-                len(shape) - 1,
-            )
-            array = cls(tree, node, dtype, shape, chunk, axis, encoding, metadata.get("attributes", {}))
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+            return read()
+        except FormatError:
+            self.store.forget()
+            self._readers = {}
+            vars(self).pop("_counts", None)
+            return read()
+
+    @cached_property
+    def _counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
+        """The frames of the sequence, and the number of elements of each in each column; -1 where the field lacks the frame."""
+        try:
+            return self._read_counts()
+        except FormatError:  # what was added to the store since its metadata were read may have replaced them
+            self.store.forget()
+            return self._read_counts()
+
+    def _read_counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
+        where = f"{self.location}/counts"
+        frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
+        counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
+        columns = list((self.store.attributes(f"{self.group}/counts") or {}).get("columns") or ())
+        if counts.shape != (len(frames), len(columns)) or (np.diff(frames, prepend=-1) <= 0).any():
             raise FormatError(
-                where, expected="the codecs and chunks that carlasc writes", found=f"others ({error})"
-            ) from error
-        array.per_shard = outer[axis] // chunk[axis] if sharded else None
-        array._indices = {}
-        return array
+                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, of rising frames", found="others",
+                advice="the store is damaged",
+            )  # fmt: skip
+        return frames, {column: counts[:, number] for number, column in enumerate(columns)}
 
-    _indices: dict[int, NDArray[np.uint64]]
-
-    def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Look up chunks in the indices of their shards, which are read once."""
-        if self.per_shard is None:
-            return [(self._file(number), 0, -1) for number in numbers]
-        places = []
-        for number in numbers:
-            shard, slot = divmod(number, self.per_shard)
-            offset, length = self._index(shard)[slot].tolist()
-            if offset == 2**64 - 1:
-                raise FormatError(
-                    self.tree.where(self._file(shard)),
-                    expected=f"chunk {number}",
-                    found="none",
-                    advice="the store is damaged",
-                )
-            places.append((self._file(shard), offset, offset + length))
-        return places
-
-    def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
-        """Read chunks as they are stored."""
+    def read_document(self, name: str) -> bytes:
+        """Return a text file's bytes."""
+        self._check_document(name)
+        path = f"{self.group}/{document_node(name)}"
         try:
-            if self.per_shard is None:
-                return [memoryview(data) for data in self.tree.read_many([self._file(number) for number in numbers])]
-            return super().fetch(numbers)
+            return bytes(self.store.tree.read(path))
         except MissingDataError as error:
             raise FormatError(
                 error.where, expected=error.expected, found=error.found, advice="the store is damaged"
             ) from error
 
-    def verify(self, data: memoryview, number: int) -> memoryview:
-        """Verify the crc32c at the end of a chunk."""
-        return _verified(data, f"chunk {number} of {self.name}")
+    def published_bytes(self, field: str) -> int:
+        """Return the bytes of a field's files in the published layout, from the numbers of elements."""
+        return self._field(field).published_bytes()
 
-    def _file(self, number: int) -> str:
-        key = ["0"] * len(self.shape)
-        key[self.axis] = str(number)
-        return f"{self.name}/c/{'/'.join(key)}"
-
-    def _index(self, shard: int) -> NDArray[np.uint64]:
-        if shard not in self._indices:
-            size = 16 * (self.per_shard or 1) + _CHECKSUM
-            data = memoryview(self.tree.read_range(self._file(shard), -size, 0))
-            self._indices[shard] = np.frombuffer(_verified(data, f"the index of {self._file(shard)}"), "<u8").reshape(
-                -1, 2
-            )
-        return self._indices[shard]
-
-
-class ZarrStoreWriter(ArrayStoreWriter):
-    """Writes a zarr store with zarr-python."""
-
-    def __init__(self, path: Path, options: Options) -> None:
-        self._zarr = import_extra("zarr", "zarr")
-        self.location = str(path)
-        self._path = path
-        self._tree = LocalTree(path)
-        run = {"type": "carlasc.unfinished", "small": options.small, "lossy_mm": options.lossy_mm}
-        if not self._belongs_to(run):
-            remove(path)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._zarr.create_group(path, attributes=run)
-        self._root = self._zarr.open_group(path, mode="r+", use_consolidated=False)
-
-    def _belongs_to(self, run: dict[str, Any]) -> bool:
-        """Whether what an interrupted run left was packed with the same options."""
-        try:
-            return ZarrStore(self._tree).attributes("") == run
-        except (FormatError, MissingDataError):
-            return False
-
-    def write_group(self, node: str, attributes: dict[str, Any]) -> None:
-        """Create a group."""
-        group = self._root.require_group(node)
-        group.attrs.put(attributes)
-
-    def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
-        """Write an array of one chunk."""
-        chunk = tuple(max(1, n) for n in array.shape)
-        with _quietly():
-            stored = self._root.create_array(
-                node, shape=array.shape, dtype=array.dtype, chunks=chunk, filters=None, attributes=attributes, overwrite=True,
-                config={"write_empty_chunks": True}, **_codecs(Encoding(shuffle=SHUFFLE), array.dtype),
-            )  # fmt: skip
-        if array.size:
-            stored[...] = array
-
-    def create(
-        self,
-        node: str,
-        dtype: np.dtype[Any],
-        chunk: tuple[int, ...],
-        axis: int,
-        encoding: Encoding,
-        attributes: dict[str, Any],
-    ) -> ChunkWriter:
-        """Start a sharded array."""
-        nbytes = dtype.itemsize * math.prod(chunk)
-        per_shard = min(max(1, _SHARD // nbytes), _MOST_CHUNKS)
-        shard = tuple(n * per_shard if a == axis else n for a, n in enumerate(chunk))
-        empty = tuple(0 if a == axis else n for a, n in enumerate(chunk))
-        with _quietly():
-            array = self._root.create_array(
-                node, shape=empty, dtype=dtype, chunks=chunk, shards=shard, filters=None, attributes=attributes, overwrite=True,
-                config={"write_empty_chunks": True}, **_codecs(encoding, dtype),
-            )  # fmt: skip
-        return _ZarrChunkWriter(array, axis, chunk[axis], per_shard)
-
-    def array(self, node: str) -> StoredArray:
-        """Return a closed array."""
-        return ZarrStore(self._tree).array(node)
-
-    def move(self, node: str, target: str) -> None:
-        """Rename an array's folder."""
-        remove(self._path / target)
-        (self._path / node).rename(self._path / target)
-
-    def remove(self, node: str) -> None:
-        """Remove a node's folder."""
-        remove(self._path / node)
-
-    def finished(self) -> dict[str, str]:
-        """Find the groups that are marked as complete."""
-        found = {}
-        for folder, _, files in os.walk(self._path):
-            if METADATA in files:
-                metadata = parse_json((Path(folder) / METADATA).read_bytes(), folder)
-                attributes = metadata.get("attributes", {})
-                if attributes.get("type") == SEQUENCE and attributes.get("complete"):
-                    found[attributes["path"]] = Path(folder).relative_to(self._path).as_posix()
-        return found
-
-    def close(self, attributes: dict[str, Any]) -> Path:
-        """Write the root's attributes and consolidate the metadata."""
-        self._root.attrs.put(attributes)
-        with _quietly():
-            self._zarr.consolidate_metadata(self._path)
-        return self._path
-
-
-class _ZarrChunkWriter(ChunkWriter):
-    """Keeps the chunks of a shard and writes them together, because a shard cannot be extended."""
-
-    def __init__(self, array: Any, axis: int, step: int, per_shard: int) -> None:
-        self.array = array
-        self.axis = axis
-        self.step = step
-        self.per_shard = per_shard
-        self.written = 0
-        self.held: list[NDArray[Any]] = []
-
-    def append(self, chunk: NDArray[Any]) -> None:
-        self.held.append(chunk)
-        if len(self.held) == self.per_shard:
-            self._flush()
-
-    def close(self) -> None:
-        if self.held:
-            self._flush()
-
-    def _flush(self) -> None:
-        block = np.concatenate(self.held, axis=self.axis)
-        self.held = []
-        end = self.written + block.shape[self.axis]
-        self.array.resize(tuple(end if a == self.axis else n for a, n in enumerate(block.shape)))
-        self.array[tuple(slice(self.written, end) if a == self.axis else slice(None) for a in range(block.ndim))] = (
-            block
+    def _open_field(self, field: str) -> ArrayField:
+        node = f"{self.group}/{field_node(field)}"
+        where = f"{self.store.location}/{node}"
+        block = (self.store.attributes("") or {}).get("block", 1)
+        found = FieldLayout.read(where, field, self.store.attributes(node), block)
+        frames, counts = self._counts
+        own = {name: counts[place] for name in found.columns if (place := f"{field_node(field)}/{name}") in counts}
+        return open_field(
+            where, found, frames, own, lambda name: self.store.array(f"{node}/{name}"), local=self.store.local
         )
-        self.written = end
 
-
-def _codecs(encoding: Encoding, dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Return zarr-python's arguments for an encoding with a crc32c after each chunk."""
-    codecs = import_extra("zarr.codecs", "zarr")
-    if encoding.codec == "pcodec":
-        import_extra("pcodec", "zarr")
-        serializer = import_extra("zarr.codecs.numcodecs", "zarr").PCodec(level=encoding.level)
-        return {"serializer": serializer, "compressors": [codecs.Crc32cCodec()]}
-    shuffle = next(name for name, number in _SHUFFLES.items() if number == encoding.shuffle)
-    blosc = codecs.BloscCodec(
-        cname="zstd", clevel=encoding.level, shuffle=shuffle, typesize=dtype.itemsize, blocksize=BLOCK
-    )
-    return {"compressors": [blosc, codecs.Crc32cCodec()]}
-
-
-def _encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
-    """Return the encoding that the (inner) codecs in an array's metadata describe.
-
-    Raises:
-        ValueError: they are not those of an `Encoding`.
-    """
-    names = [codec["name"] for codec in codecs]
-    if names == ["numcodecs.pcodec", "crc32c"]:
-        return Encoding("pcodec", codecs[0]["configuration"]["level"])
-    if names == ["bytes", "blosc", "crc32c"] and codecs[0].get("configuration", {}).get("endian", "little") == "little":
-        settings = codecs[1]["configuration"]
-        return Encoding("blosc", settings["clevel"], _SHUFFLES[settings["shuffle"]])
-    raise ValueError(f"codecs {', '.join(names)}")
-
-
-def _verified(data: memoryview, what: str) -> memoryview:
-    """Return bytes without the checksum at their end.
-
-    Raises:
-        FormatError: the checksum does not match.
-    """
-    if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
-        raise FormatError(
-            what, problem="the checksum does not match", advice="the store is corrupted: fetch or pack it again"
-        )
-    return data[:-_CHECKSUM]
-
-
-@contextmanager
-def _quietly() -> Iterator[None]:
-    """Suppress zarr-python's warnings that consolidated metadata and numcodecs' codecs are extensions of the specification."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message=".*(Consolidated metadata|Numcodecs codecs|not have a Zarr V3 spec).*"
-        )
-        yield
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        state.pop("_counts", None)  # a worker reads what it needs
+        return state

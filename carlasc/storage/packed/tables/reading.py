@@ -60,6 +60,8 @@ class ParquetSource(PackedSource):
 class ParquetSequence(PackedSequence["_Table"]):
     """One sequence of a store of tables."""
 
+    tree: Tree
+
     def __init__(self, tree: Tree, path: str, folder: str) -> None:
         self.tree = tree
         self.folder = folder

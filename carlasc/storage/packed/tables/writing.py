@@ -79,7 +79,7 @@ class ParquetSink(PackedSink):
         remove(self._part / folder)
         return ParquetWriter(self._part, path, folder, self.options, self._sequences)
 
-    def close(self) -> None:
+    def finish(self, *, incomplete: bool = False) -> None:
         """Mark the store as finished and give it its name."""
         root = {
             "type": STORE,

@@ -1,9 +1,9 @@
-"""Writing packed stores of arrays: what zarr and HDF5 have in common."""
+"""Writing packed stores in HDF5, by appending: one writer, frames in rising order."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+import json
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,123 +11,71 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError
+from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray
+from carlasc.storage.folders.trees import LocalTree
+from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c, in_threads
 from carlasc.storage.packed.arrays.columns import Column, packing_of
+from carlasc.storage.packed.arrays.hdf5_store import CRC, HDF5Array
 from carlasc.storage.packed.arrays.reading import COLUMN, DOCUMENT, FIELD, SEQUENCE, document_node, field_node
 from carlasc.storage.packed.numbers import common_type
-from carlasc.storage.packed.output import put_in_place, refuse_existing, unfinished
+from carlasc.storage.packed.output import put_in_place, refuse_existing, remove, unfinished
 from carlasc.storage.packed.protocol import STORE, VERSION, FieldWriter, Options, PackedSink, PackedWriter, node_of
 
 _HEADROOM = 1.125  # a chunk is this much larger than the first frame, so that later frames seldom need a second chunk
+_AHEAD = 16  # chunks that are encoded in parallel
 
 
-class ChunkWriter(ABC):
-    """An array that grows by chunks."""
+class HDF5Sink(PackedSink):
+    """Writes a packed HDF5 file, which gets its name when the sink is finished, and not before."""
 
-    @abstractmethod
-    def append(self, chunk: NDArray[Any]) -> None:
-        """Add a chunk."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Write the chunks that are held back; the array is whole then."""
-
-
-class ArrayStoreWriter(ABC):
-    """A tree of groups and arrays to write to.
-
-    Attributes:
-        location: where it is written, for errors.
-    """
-
-    location: str
-
-    @abstractmethod
-    def write_group(self, node: str, attributes: dict[str, Any]) -> None:
-        """Create a group, or replace its attributes."""
-
-    @abstractmethod
-    def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
-        """Write a whole array as one chunk; an older one is replaced."""
-
-    @abstractmethod
-    def create(
-        self,
-        node: str,
-        dtype: np.dtype[Any],
-        chunk: tuple[int, ...],
-        axis: int,
-        encoding: Encoding,
-        attributes: dict[str, Any],
-    ) -> ChunkWriter:
-        """Start an array that grows along `axis`."""
-
-    @abstractmethod
-    def array(self, node: str) -> StoredArray:
-        """Return a closed array, whose chunks can be read."""
-
-    @abstractmethod
-    def move(self, node: str, target: str) -> None:
-        """Rename an array; another one of that name is replaced."""
-
-    @abstractmethod
-    def remove(self, node: str) -> None:
-        """Remove a node and those below it, if it exists."""
-
-    @abstractmethod
-    def finished(self) -> dict[str, str]:
-        """Return the groups of the sequences that an interrupted run has finished, by path."""
-
-    @abstractmethod
-    def close(self, attributes: dict[str, Any]) -> Path:
-        """Write the root's attributes and return the file or folder, which is whole then."""
-
-
-class ArraySink(PackedSink):
-    """Writes a packed store of arrays, which gets its name when the sink is closed, and not before."""
-
-    def __init__(
-        self, path: Path, writer: Callable[[Path], ArrayStoreWriter], options: Options, overwrite: bool
-    ) -> None:
-        """Start a store, or continue one whose packing was interrupted.
+    def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
+        """Start a file; what an interrupted run left is removed.
 
         Raises:
+            ArgumentError: `small` is given, for which HDF5 has no filter.
             ConflictError: something exists at `path`, and `overwrite` is not given.
+            DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
         """
-        self.path = path
+        options = options or Options()
+        if options.small:
+            raise ArgumentError(
+                "small",
+                expected="a .zarr store",
+                found=f"{path}: HDF5 has no PCodec filter",
+                advice="leave `small` out",
+            )
+        self.path = Path(path)
         self.location = str(path)
         self.options = options
         self.overwrite = overwrite
-        refuse_existing(path, overwrite)
-        self._store = writer(unfinished(path))
-        self._sequences = dict(self._store.finished())
+        refuse_existing(self.path, overwrite)
+        self._file = _File(unfinished(self.path))
+        self._sequences: dict[str, str] = {}
 
     def finished(self, path: str) -> bool:
-        """Whether an earlier run that was interrupted has written this sequence whole."""
+        """Whether this run has written the sequence whole: what an interrupted run left is not continued."""
         return path in self._sequences
 
-    def sequence(self, path: str) -> ArrayWriter:
-        """Start a sequence; what an interrupted run left of it is removed."""
+    def sequence(self, path: str) -> HDF5Writer:
+        """Start a sequence."""
         group = node_of(path, self.location)
         self._sequences.pop(path, None)
-        self._store.remove(group)
-        return ArrayWriter(self._store, path, group, self.options, self._sequences)
+        self._file.remove(group)
+        return HDF5Writer(self._file, path, group, self.options, self._sequences)
 
-    def close(self) -> None:
+    def finish(self, *, incomplete: bool = False) -> None:
         """Finish the store and give it its name."""
         root = {"type": STORE, "version": VERSION, "complete": True, "sequences": self._sequences}
         root |= {"lossy_mm": self.options.lossy_mm} if self.options.lossy_mm else {}
-        put_in_place(self._store.close(root), self.path, self.overwrite)
+        self._file.close(root)
+        put_in_place(self._file.path, self.path, self.overwrite)
 
 
-class ArrayWriter(PackedWriter):
-    """Writes one sequence of a packed store of arrays."""
+class HDF5Writer(PackedWriter):
+    """Writes one sequence of a packed HDF5 file."""
 
-    def __init__(
-        self, store: ArrayStoreWriter, path: str, group: str, options: Options, finished: dict[str, str]
-    ) -> None:
+    def __init__(self, store: _File, path: str, group: str, options: Options, finished: dict[str, str]) -> None:
         super().__init__(f"{store.location}/{group}", path)
         self._store = store
         self._group = group
@@ -135,7 +83,7 @@ class ArrayWriter(PackedWriter):
         self._finished = finished
 
     def _start_field(self, field: str) -> FieldWriter:
-        return _ArrayFieldWriter(self._store, f"{self._group}/{field_node(field)}", field, self._options)
+        return _FieldWriter(self._store, f"{self._group}/{field_node(field)}", field, self._options)
 
     def close(self) -> None:
         """Write what is held back and mark the sequence as whole."""
@@ -167,10 +115,10 @@ class ArrayWriter(PackedWriter):
                 self._store.write_small(f"{self._group}/{name}", numbers, attributes)
 
 
-class _ArrayFieldWriter(FieldWriter):
+class _FieldWriter(FieldWriter):
     """Writes the columns of a field."""
 
-    def __init__(self, store: ArrayStoreWriter, node: str, field: str, options: Options) -> None:
+    def __init__(self, store: _File, node: str, field: str, options: Options) -> None:
         super().__init__(field)
         self.store = store
         self.node = node
@@ -204,7 +152,7 @@ class _ArrayFieldWriter(FieldWriter):
 class _ColumnWriter:
     """One array of a field, in chunks that start where a frame starts."""
 
-    def __init__(self, store: ArrayStoreWriter, node: str, column: Column, is_grid: bool) -> None:
+    def __init__(self, store: _File, node: str, column: Column, is_grid: bool) -> None:
         self.store = store
         self.node = node
         self.place = node  # the array's node until it is closed
@@ -214,7 +162,7 @@ class _ColumnWriter:
         self.step = column.step or 0  # elements per chunk; 0 until the first frame with any elements
         self.chunks = 0
         self.spans: list[tuple[int, int]] = []
-        self._writer: ChunkWriter | None = None
+        self._writer: _ChunkWriter | None = None
         self._shape: tuple[int, ...] | None = None  # of a grid
 
     def append(self, values: NDArray[Any] | None) -> None:
@@ -257,7 +205,7 @@ class _ColumnWriter:
         self._writer.append(chunk)
         self.chunks += 1
 
-    def _create(self, chunk: tuple[int, ...]) -> ChunkWriter:
+    def _create(self, chunk: tuple[int, ...]) -> _ChunkWriter:
         attributes = {"type": COLUMN, "version": VERSION, "dtype": self.dtype.name, "unit": self.column.unit}
         axis = 0 if self.is_grid else len(chunk) - 1
         return self.store.create(self.place, self.dtype, chunk, axis, self.column.encoding, attributes)
@@ -282,3 +230,122 @@ class _ColumnWriter:
 def _round_up(count: int) -> int:
     """Round the elements of a chunk up to a multiple of 256."""
     return -(-count // 256) * 256
+
+
+class _File:
+    """Writes an HDF5 file with h5py; chunks are encoded here, in parallel, as the Blosc filter would encode them."""
+
+    def __init__(self, path: Path) -> None:
+        h5py = import_extra("h5py", "hdf5")
+        self._filters = import_extra("hdf5plugin", "hdf5")
+        for module in ("numcodecs", "google_crc32c"):
+            import_extra(module, "hdf5")
+        self.location = str(path)
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove(path)
+        self._file = h5py.File(path, "w", libver=("v110", "v110"), track_order=False)
+
+    def write_group(self, node: str, attributes: dict[str, Any]) -> None:
+        """Create a group."""
+        _write_attributes(self._file.require_group(node), attributes)
+
+    def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
+        """Write a data set of one chunk."""
+        self.remove(node)
+        compact = (
+            {"chunks": array.shape, "shuffle": True, "compression": "gzip", "fletcher32": True} if array.size else {}
+        )
+        dataset = self._file.create_dataset(node, data=array, **compact)
+        _write_attributes(dataset, attributes)
+
+    def create(
+        self,
+        node: str,
+        dtype: np.dtype[Any],
+        chunk: tuple[int, ...],
+        axis: int,
+        encoding: Encoding,
+        attributes: dict[str, Any],
+    ) -> _ChunkWriter:
+        """Create a data set that grows along an axis."""
+        empty = tuple(0 if a == axis else n for a, n in enumerate(chunk))
+        most = tuple(None if a == axis else n for a, n in enumerate(chunk))
+        blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
+        dataset = self._file.create_dataset(node, empty, dtype, chunks=chunk, maxshape=most, **blosc)
+        _write_attributes(dataset, attributes)
+        return _ChunkWriter(self, node, dataset, axis, encoding)
+
+    def array(self, node: str) -> StoredArray:
+        """Return a closed data set."""
+        self._file.flush()
+        return HDF5Array.from_dataset(
+            LocalTree(self.path.parent), self.path.name, self._file[node], self._file[node + CRC][...]
+        )
+
+    def move(self, node: str, target: str) -> None:
+        """Rename a data set and its checksums."""
+        self.remove(target)
+        for ending in ("", CRC):
+            self._file.move(node + ending, target + ending)
+
+    def remove(self, node: str) -> None:
+        """Remove a node; the file uses its space again."""
+        for name in (node, node + CRC):
+            if name in self._file:
+                del self._file[name]
+
+    def close(self, attributes: dict[str, Any]) -> None:
+        """Write the root's attributes and close the file."""
+        _write_attributes(self._file, attributes)
+        self._file.close()
+
+
+class _ChunkWriter:
+    """A data set that grows by chunks."""
+
+    def __init__(self, store: _File, node: str, dataset: Any, axis: int, encoding: Encoding) -> None:
+        self.store = store
+        self.node = node
+        self.dataset = dataset
+        self.axis = axis
+        self.encoding = encoding
+        self.checksums: list[int] = []
+        self.held: list[NDArray[Any]] = []
+
+    def append(self, chunk: NDArray[Any]) -> None:
+        self.held.append(chunk)
+        if len(self.held) == _AHEAD:
+            self._flush()
+
+    def close(self) -> None:
+        self._flush()
+        attributes = {
+            "type": "carlasc.checksums",
+            "version": VERSION,
+            "dtype": "uint32",
+            "unit": "crc32c of a chunk's stored bytes",
+        }
+        self.store.write_small(self.node + CRC, np.array(self.checksums, np.uint32), attributes)
+
+    def _flush(self) -> None:
+        encoded = in_threads(lambda chunk: self.encoding.encode(chunk, "hdf5"), self.held)
+        step, shape = self.dataset.chunks[self.axis], list(self.dataset.shape)
+        for data in encoded:
+            start = len(self.checksums) * step
+            shape[self.axis] = start + step
+            self.dataset.resize(shape)
+            self.dataset.id.write_direct_chunk(tuple(start if a == self.axis else 0 for a in range(len(shape))), data)
+            self.checksums.append(crc32c(data, "hdf5"))
+        self.held = []
+
+
+def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
+    """Replace a node's attributes: text and numbers are written as they are, other values as JSON under `<name>:json`."""
+    for name in list(node.attrs):
+        del node.attrs[name]
+    for name, value in attributes.items():
+        if isinstance(value, str | int | float):
+            node.attrs[name] = value
+        else:
+            node.attrs[f"{name}:json"] = json.dumps(value)

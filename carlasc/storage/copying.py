@@ -1,0 +1,156 @@
+"""Copying frames from a source to a store, block by block, in any number of processes: what packing and unpacking share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from collections.abc import Sequence as Series
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ConflictError
+from carlasc.running.processes import Engine, count_workers, run_all
+from carlasc.storage import layout
+from carlasc.storage.folders.trees import is_url
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.remote import check_shared
+from carlasc.storage.sinks import SequenceWriter
+
+Progress = Callable[[int, int], None]
+_FEW = 4  # tasks for which it does not pay to start another process
+_SAMPLED = 5  # frames of which the largest says how large frames are
+
+
+@dataclass(frozen=True)
+class Block:
+    """Frames that one task copies.
+
+    Attributes:
+        sequence: where they are read.
+        writer: where they are written.
+        frames: their numbers, by field.
+    """
+
+    sequence: Sequence
+    writer: SequenceWriter
+    frames: dict[str, list[int]]
+
+    @property
+    def files(self) -> int:
+        """Number of published files that the frames are."""
+        return sum(map(len, self.frames.values()))
+
+    def missing(self) -> Block:
+        """Return the frames that the writer lacks."""
+        has = self.writer.has
+        lacking = {name: [frame for frame in frames if not has(name, frame)] for name, frames in self.frames.items()}
+        return Block(self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames})
+
+
+def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Block]:
+    """Return all frames of a sequence in blocks of `size` frame numbers."""
+    blocks: dict[int, dict[str, list[int]]] = {}
+    for name in sorted(sequence.fields()):
+        for frame in sequence.frames(name).tolist():
+            blocks.setdefault(frame // size, {}).setdefault(name, []).append(frame)
+    return [Block(sequence, writer, blocks[number]) for number in sorted(blocks)]
+
+
+def copy_blocks(
+    blocks: Series[Block], *, workers: int | None, executor: Engine | None, step: Callable[[int], None]
+) -> int:
+    """Copy blocks in parallel, and return the number of files that they are; `step` is called with that of each."""
+    todo = [block for block in blocks if block.files]
+    files, processes = 0, _processes(workers, executor, todo)
+    for place in {place for block in todo for place in (block.sequence.location, block.writer.location)}:
+        check_shared(place, processes if executor is None else 2)
+    with closing(run_all(_copy, todo, workers=processes, executor=executor)) as copied:
+        for count in copied:
+            step(count)
+            files += count
+    return files
+
+
+def _copy(block: Block) -> int:
+    found: dict[int, dict[str, NDArray[Any]]] = {}
+    for name, frames in block.frames.items():
+        for frame, array in zip(frames, block.sequence.read_many(name, frames), strict=True):
+            found.setdefault(frame, {})[name] = array
+    block.writer.write_frames(found)
+    return block.files
+
+
+def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
+    """Copy the text files of a sequence to where an interrupted run, or another part of this run, may have left the same ones.
+
+    Raises:
+        ConflictError: what is there belongs to another source.
+    """
+    for name in sequence.documents():
+        data = sequence.read_document(name)
+        if not writer.create_document(name, data) and writer.read_document(name) != data:
+            raise ConflictError(
+                f"{writer.location}/{name}",
+                expected="the text file of this source",
+                found="another",
+                advice="choose another name, or remove what is there",
+            )
+
+
+def typical_rows(sequence: Sequence) -> dict[str, int]:
+    """Return the largest number of elements of a few frames by field, for `SequenceWriter.expect`; always the same frames.
+
+    Fields with one row per point have as many as `points`; grids and boxes are left out, as their sizes are known.
+    """
+    found: dict[str, int] = {}
+    for name in sorted(sequence.fields()):
+        entry, frames = layout.field_named(name), sequence.frames(name)
+        if entry.per in ("voxel", "box") or (
+            entry.per == "point" and name != "points" and "points" in sequence.fields()
+        ):
+            continue
+        places = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED).astype(np.int64))
+        found[name] = max(len(sequence.read(name, frame)) for frame in frames[places].tolist())
+    return found
+
+
+def _processes(workers: int | None, executor: Engine | None, blocks: Series[Block]) -> int:
+    """Return the number of processes: as given, else one per core, and fewer where there are few blocks."""
+    if workers is not None or executor is not None:
+        return count_workers(workers)
+    return max(1, min(count_workers(None), len(blocks) // _FEW))
+
+
+def counter(progress: Progress | None, total: int) -> Callable[[int], None]:
+    """Return a function that counts files, and reports the count to `progress`."""
+    done = 0
+
+    def step(files: int) -> None:
+        nonlocal done
+        done += files
+        if progress is not None and files:
+            progress(done, total)
+
+    return step
+
+
+def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
+    """Refuse to write into the source, or over it.
+
+    Raises:
+        ConflictError: one is inside the other.
+    """
+    place: PurePath = PurePosixPath(os.fspath(out)) if is_url(out) else Path(out).resolve()
+    origin: PurePath = PurePosixPath(source.location) if is_url(source.location) else Path(source.location).resolve()
+    if place == origin or place.is_relative_to(origin) or origin.is_relative_to(place):
+        raise ConflictError(
+            out,
+            expected=f"a path outside of {source.location}",
+            found="one inside it or around it",
+            advice="choose another path",
+        )

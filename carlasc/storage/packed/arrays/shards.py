@@ -1,0 +1,202 @@
+"""The objects of a zarr store: shards of chunks, each with an index of its own (zarr specification v3, "sharding_indexed" and "crc32c")."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage.folders.trees import Tree
+from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
+from carlasc.storage.packed.arrays.zarr_metadata import encoding_of
+
+_CHECKSUM = 4  # bytes
+_RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c
+_ABSENT = 2**64 - 1  # offset and length of a chunk that does not exist
+
+
+class ZarrArray(StoredArray):
+    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, sharded or not.
+
+    Attributes:
+        per_shard: number of chunks of a shard; None if the array is not sharded.
+    """
+
+    per_shard: int | None = None
+
+    @classmethod
+    def from_metadata(cls, tree: Tree, node: str, metadata: Mapping[str, Any]) -> ZarrArray:
+        """Read the metadata of an array.
+
+        Raises:
+            FormatError: its codecs or its chunks are not those that carlasc writes.
+        """
+        where = tree.where(node)
+        try:
+            shape, dtype = tuple(metadata["shape"]), np.dtype(metadata["data_type"]).newbyteorder("<")
+            outer = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+            codecs, chunk = metadata["codecs"], outer
+            if sharded := codecs[0]["name"] == "sharding_indexed":
+                chunk, codecs = tuple(codecs[0]["configuration"]["chunk_shape"]), codecs[0]["configuration"]["codecs"]
+            encoding = encoding_of(codecs)
+            axis = next(
+                (axis for axis in range(len(shape)) if chunk[axis] < outer[axis] or outer[axis] < shape[axis]),
+                0
+                if len(shape) > 2
+                else len(shape) - 1,  # of a single chunk: a grid's frames, or the elements of a column
+            )
+            found = cls(tree, node, dtype, shape, chunk, axis, encoding, metadata.get("attributes", {}))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise FormatError(
+                where, expected="the codecs and chunks that carlasc writes", found=f"others ({error})"
+            ) from error
+        found.per_shard = outer[axis] // chunk[axis] if sharded else None
+        found._index_first = sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
+        found._indices = {}
+        return found
+
+    _index_first: bool
+    _indices: dict[int, ShardIndex]
+
+    def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
+        """Look up chunks in the indices of their shards, which are read once, those of one call together."""
+        per_shard = self.per_shard
+        if per_shard is None:
+            return [(self.file(number), 0, -1) for number in numbers]
+        if any(number // per_shard not in self._indices for number in numbers):
+            self._read_indices({number // per_shard for number in numbers})
+        places = []
+        for number in numbers:
+            shard, slot = divmod(number, per_shard)
+            place = self._indices[shard].place(slot)
+            if place is None:
+                raise FormatError(
+                    self.tree.where(self.file(shard)),
+                    expected=f"chunk {number}",
+                    found="none",
+                    advice="the store is damaged",
+                )
+            places.append((self.file(shard), *place))
+        return places
+
+    def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
+        """Read chunks as they are stored."""
+        try:
+            if self.per_shard is None:
+                return [memoryview(data) for data in self.tree.read_many([self.file(number) for number in numbers])]
+            return super().fetch(numbers)
+        except MissingDataError as error:
+            raise FormatError(
+                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+            ) from error
+
+    def files(self, numbers: Sequence[int]) -> list[str]:
+        """Return the shards that hold some chunks."""
+        return [self.file(shard) for shard in dict.fromkeys(number // (self.per_shard or 1) for number in numbers)]
+
+    def verify(self, data: memoryview, number: int) -> memoryview:
+        """Verify the crc32c at the end of a chunk."""
+        return without_checksum(data, f"chunk {number} of {self.name}")
+
+    def file(self, number: int) -> str:
+        """Return the path of a shard, or of a chunk of an array without shards."""
+        key = ["0"] * len(self.shape)
+        key[self.axis] = str(number)
+        return f"{self.name}/c/{'/'.join(key)}"
+
+    def _read_indices(self, shards: set[int]) -> None:
+        missing = sorted(shards - self._indices.keys())
+        if not missing:
+            return
+        size = index_bytes(self.per_shard or 1)
+        start, end = (0, size) if self._index_first else (-size, 0)
+        files = [self.file(shard) for shard in missing]
+        found = self.tree.read_ranges([(file, start, end) for file in files])
+        for shard, file, data in zip(missing, files, found, strict=True):
+            self._indices[shard] = ShardIndex(memoryview(data), f"the index of {file}")
+
+
+class ShardIndex:
+    """Where the chunks of a shard are in its file. Only those that exist take memory."""
+
+    def __init__(self, data: memoryview, what: str) -> None:
+        """Read an index.
+
+        Args:
+            data: the bytes of the index, with its checksum.
+            what: its name in errors.
+
+        Raises:
+            FormatError: the checksum does not match.
+        """
+        table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
+        slots = np.flatnonzero(table[:, 0] != _ABSENT)
+        self.slots = array("q", slots.astype("=i8").tobytes())  # looking up one number is faster than in NumPy's arrays
+        self._offsets, self._lengths = (array("Q", column.astype("=u8").tobytes()) for column in table[slots].T)
+
+    def place(self, slot: int) -> tuple[int, int] | None:
+        """Return the first byte and the end of a chunk in the file; None if the chunk does not exist."""
+        position = bisect_left(self.slots, slot)
+        if position == len(self.slots) or self.slots[position] != slot:
+            return None
+        offset = self._offsets[position]
+        return offset, offset + self._lengths[position]
+
+
+def encode_chunk(chunk: NDArray[Any], encoding: Encoding) -> bytes:
+    """Return a chunk as it is in a shard, with its checksum."""
+    return _with_checksum(encoding.encode(chunk, "zarr"))
+
+
+def join_shard(chunks: Mapping[int, bytes | memoryview], per_shard: int) -> bytes:
+    """Return the file of a shard: its index, then its chunks.
+
+    Args:
+        chunks: the chunks that exist, as `encode_chunk` returns them, by their number in the shard.
+        per_shard: number of chunks that the shard has room for.
+    """
+    table = np.full((per_shard, 2), _ABSENT, "<u8")
+    offset = index_bytes(per_shard)
+    for slot in sorted(chunks):
+        table[slot] = offset, len(chunks[slot])
+        offset += len(chunks[slot])
+    return b"".join([_with_checksum(table.tobytes()), *(chunks[slot] for slot in sorted(chunks))])
+
+
+def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int, memoryview]:
+    """Return the chunks of a shard, as they are in its file, by their number in it.
+
+    Raises:
+        FormatError: the index is damaged.
+    """
+    view = memoryview(data)
+    index = ShardIndex(view[: index_bytes(per_shard)], what)
+    found = {slot: index.place(slot) for slot in index.slots}
+    return {slot: view[place[0] : place[1]] for slot, place in found.items() if place is not None}
+
+
+def index_bytes(per_shard: int) -> int:
+    """Return the size of the index of a shard, with its checksum."""
+    return 16 * per_shard + _CHECKSUM
+
+
+def without_checksum(data: memoryview, what: str) -> memoryview:
+    """Return bytes without the checksum at their end.
+
+    Raises:
+        FormatError: the checksum does not match.
+    """
+    if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
+        raise FormatError(
+            what, problem="the checksum does not match", advice="the store is corrupted: fetch or pack it again"
+        )
+    return data[:-_CHECKSUM]
+
+
+def _with_checksum(data: bytes) -> bytes:
+    return data + crc32c(data, "zarr").to_bytes(_CHECKSUM, "little")

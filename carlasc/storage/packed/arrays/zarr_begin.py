@@ -1,0 +1,127 @@
+"""The root of a zarr store: it says how the store is packed, and whether it is finished. Exactly one of several processes creates it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
+from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.packed.arrays.fields import VERSION
+from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
+from carlasc.storage.packed.output import remove
+from carlasc.storage.packed.protocol import STORE, Options
+from carlasc.storage.targets import LocalTarget, Target
+
+_TRIES = 5  # other processes may begin, finish and replace the same store meanwhile
+_OPTIONS = ("block", "lossy_mm", "small")
+_REPLACES = "replaces"  # attribute of an unfinished store: whether an older one waits as `<name>.old`
+
+
+def begin(target: Target, options: Options, overwrite: bool) -> bool:
+    """Create the root of a store, or join a store that has the same options.
+
+    Returns:
+        Whether the store is finished.
+
+    Raises:
+        ArgumentError: the target has no name.
+        ConflictError: something else exists there, or a store with other options.
+    """
+    if isinstance(target, LocalTarget) and not target.folder.name:
+        raise ArgumentError("out", expected="the name of a store", found=f"{target.location!r}")
+    wanted = {"type": STORE, "version": VERSION, "complete": False, **options_of(options)}
+    replaced = False
+    for _ in range(_TRIES):
+        root = read_root(target)
+        if root is None:
+            _refuse_other(target)
+            about = wanted | ({_REPLACES: True} if replaced else {})
+            if target.put(METADATA, to_json(group_metadata(about)), create=True):
+                return False
+            continue  # another process was first
+        same = all(root.get(name) == wanted[name] for name in ("type", "version", *_OPTIONS))
+        finished = root.get("complete") is True
+        if same and not (overwrite and finished):
+            return finished
+        if root.get("type") not in (STORE, "carlasc.unfinished"):
+            raise ConflictError(
+                target.location, expected="a packed store to overwrite", found="another zarr store",
+                advice="choose another name",
+            )  # fmt: skip
+        if not overwrite:
+            differs = [f"{name} {root.get(name)}" for name in ("version", *_OPTIONS) if root.get(name) != wanted[name]]
+            raise ConflictError(
+                target.location,
+                expected="nothing there, or a store with the same options",
+                found=f"one with {', '.join(differs)}",
+                advice="choose another name, or give `overwrite=True`",
+            )
+        replaced = _move_away(target, finished=finished) or root.get(_REPLACES) is True
+    raise ConflictError(target.location, problem="other processes keep replacing it", advice="wait for them")
+
+
+def options_of(options: Options) -> dict[str, Any]:
+    """Return the options of a store as its root records them."""
+    return {name: getattr(options, name) for name in _OPTIONS}
+
+
+def existing_options(target: Target) -> Options | None:
+    """Return how a store of this version is packed; None if there is none."""
+    root = read_root(target)
+    if root is None or root.get("type") != STORE or root.get("version") != VERSION:
+        return None
+    return Options(**{name: root.get(name, getattr(Options, name)) for name in _OPTIONS})
+
+
+def read_root(target: Target) -> dict[str, Any] | None:
+    """Return the attributes of a zarr store's root, None if there is none."""
+    try:
+        metadata = parse_json(bytes(target.tree.read(METADATA)), target.tree.where(METADATA))
+    except MissingDataError:
+        return None
+    found = metadata.get("attributes")
+    return found if isinstance(found, dict) else {}
+
+
+def root_of(attributes: dict[str, Any]) -> tuple[dict[str, Any], bool]:
+    """Return the attributes of the root of a finished store, and whether it replaces an older one."""
+    kept = {name: value for name, value in attributes.items() if name != _REPLACES}
+    return kept | {"complete": True}, attributes.get(_REPLACES) is True
+
+
+def remove_replaced(target: Target) -> None:
+    """Remove the older store that a finished one replaces."""
+    if isinstance(target, LocalTarget):
+        remove(_old(target.folder))
+
+
+def _refuse_other(target: Target) -> None:
+    """Refuse a place where something is that is no zarr store."""
+    if isinstance(target, LocalTarget) and target.folder.exists() and not target.folder.is_dir():
+        found: str | None = "a file"
+    else:
+        found = next(iter(target.paths()), None)
+    if found is not None and read_root(target) is None:
+        raise ConflictError(
+            target.location, expected="nothing there, or a packed store", found=found, advice="choose another name"
+        )
+
+
+def _move_away(target: Target, *, finished: bool) -> bool:
+    """Move a finished local store to `<name>.old`; remove any other one, root first. Return whether it was moved."""
+    if not (isinstance(target, LocalTarget) and finished):
+        target.remove(METADATA)
+        target.remove("")
+        return False
+    old = _old(target.folder)
+    try:
+        remove(old)
+        target.folder.rename(old)
+    except OSError as error:
+        raise StorageError(target.location, problem=f"cannot be replaced: {error.strerror or error}") from error
+    return True
+
+
+def _old(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.old")
