@@ -11,14 +11,15 @@ if TYPE_CHECKING:
     from carlasc.captures.carla.server import ServerError as ServerError
     from carlasc.captures.lidar import Lidar as Lidar
     from carlasc.captures.raw import Capture as Capture
-    from carlasc.captures.raw import CaptureWriter as CaptureWriter
     from carlasc.captures.raw import Recording as Recording
     from carlasc.captures.raw import find_captures as find_captures
     from carlasc.captures.settings import TrafficLevel as TrafficLevel
     from carlasc.captures.town.actors import Actor as Actor
     from carlasc.captures.town.drive import Drive as Drive
+    from carlasc.captures.town.simulated import SimulatedCapture as SimulatedCapture
     from carlasc.captures.town.simulation import SimulationResult as SimulationResult
     from carlasc.captures.town.simulation import simulate as simulate
+    from carlasc.captures.writing import CaptureWriter as CaptureWriter
 else:
 
     def __getattr__(name: str) -> object:
@@ -32,11 +33,13 @@ _HOMES = {  # module -> its public names, which are loaded on first use
     "carla.recording": ("RecordResult", "record"),
     "carla.server": ("ServerError",),
     "lidar": ("Lidar",),
-    "raw": ("Capture", "CaptureWriter", "Recording", "find_captures"),
+    "raw": ("Capture", "Recording", "find_captures"),
     "settings": ("TrafficLevel",),
     "town.actors": ("Actor",),
     "town.drive": ("Drive",),
+    "town.simulated": ("SimulatedCapture",),
     "town.simulation": ("SimulationResult", "simulate"),
+    "writing": ("CaptureWriter",),
 }
 
 __all__ = [name for names in _HOMES.values() for name in names]

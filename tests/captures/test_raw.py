@@ -1,4 +1,5 @@
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,13 +7,14 @@ from helpers.captures import make_recording, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from carlasc.captures.raw import Capture, CaptureWriter, Recording, find_captures
+from carlasc.captures.raw import Capture, Recording, find_captures
+from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.scans import Scan
 from carlasc.errors import FormatError, MissingDataError, StorageError
 
 
 def _npy(capture, folder, frame=100):
-    return capture.raw / folder / f"{frame}.npy"
+    return Path(capture.location) / folder / f"{frame}.npy"
 
 
 def test_the_golden_capture_is_read_as_the_format_says(golden_capture):
@@ -37,7 +39,7 @@ def test_arrays_in_fortran_order_are_read(tmp_path):
 
 def test_raw_itself_is_taken_as_well_as_the_folder_that_holds_it(tmp_path):
     write_capture(tmp_path, frames=1)
-    assert Capture(tmp_path).raw == Capture(tmp_path / "raw").raw == tmp_path / "raw"
+    assert Capture(tmp_path).location == Capture(tmp_path / "raw").location == str(tmp_path / "raw")
 
 
 @given(st.integers(0, 50), st.integers(0, 4), st.integers(0, 99))
@@ -75,9 +77,9 @@ def test_a_frame_exists_only_with_all_its_files(tmp_path):
 
 
 def test_the_last_line_of_a_frame_in_a_times_file_is_valid(tmp_path):
-    writer = CaptureWriter(tmp_path)
     write_capture(tmp_path, frames=1)
-    writer.write_time(0, 100, 77.5)
+    with (tmp_path / "raw/times0.txt").open("a") as file:
+        file.write("100, Timestamp(frame=100,elapsed_seconds=77.5)\n")
     assert Capture(tmp_path).read_time(100) == 77.5
     with pytest.raises(MissingDataError, match=r"times0.txt: expected a line for frame 4"):
         Capture(tmp_path).read_time(4)
@@ -87,8 +89,8 @@ def test_the_last_line_of_a_frame_in_a_times_file_is_valid(tmp_path):
 
 
 def test_times_are_written_as_in_the_golden_capture(tmp_path, golden_capture):
-    for frame in (100, 101, 102):
-        CaptureWriter(tmp_path).write_time(0, frame, frame * 0.1)
+    for frame in (102, 100, 101):
+        CaptureWriter(tmp_path).write_times({frame: [frame * 0.1]})
     assert (tmp_path / "raw/times0.txt").read_bytes() == (golden_capture / "raw/times0.txt").read_bytes()
 
 
@@ -148,7 +150,7 @@ def test_a_missing_file_is_named(tmp_path):
 def test_a_sensor_without_points_is_listed_all_the_same(tmp_path):
     capture = write_capture(tmp_path, frames=1)
     _npy(capture, "velodyne1").unlink()
-    (capture.raw / "velodyne1").rmdir()
+    (tmp_path / "raw/velodyne1").rmdir()
     assert Capture(tmp_path).sensors == (0, 1)
 
 
@@ -216,7 +218,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(tmp_path):
     (tmp_path / "raw").write_text("a file in the way")
     for write in (
         lambda w: w.write(0, 1, make_recording()),
-        lambda w: w.write_time(0, 1, 0.1),
+        lambda w: w.write_settings("simulation.json", {}),
         lambda w: w.write_bev(1, b""),
     ):
         with pytest.raises(StorageError, match=r"raw/.*: cannot be written"):
@@ -238,23 +240,37 @@ def test_a_frame_exists_with_all_sensors_and_its_picture(tmp_path):
     assert writer.has_frame(100, sensors=2, bev=False) and not writer.has_frame(100, sensors=2, bev=True)
 
 
-def test_a_frame_is_timed_when_its_last_sensor_is(tmp_path):
+def test_a_frame_is_timed_when_all_its_sensors_are(tmp_path):
     writer = CaptureWriter(tmp_path)
     assert writer.timed_frames(2) == frozenset()
-    writer.write_time(0, 100, 10.0)
+    writer.write_times({100: [10.0]})
     assert writer.timed_frames(2) == frozenset()
-    writer.write_time(1, 100, 10.0)
+    writer.write_times({100: [10.0, 10.0]})
     assert writer.timed_frames(2) == {100}
 
 
 def test_times_of_each_sensor_are_its_own(tmp_path):
     writer = CaptureWriter(tmp_path)
     writer.write(0, 1, make_recording())
-    writer.write_time(0, 1, 0.1)
-    writer.write_time(1, 1, 0.3)
+    writer.write_times({1: [0.1, 0.3]})
     assert (Capture(tmp_path).read_time(1), Capture(tmp_path).read_time(1, 1)) == (0.1, 0.3)
     with pytest.raises(MissingDataError, match=r"times2\.txt: expected a file, found nothing"):
         Capture(tmp_path).read_time(1, 2)
+
+
+def test_times_files_are_in_the_order_of_frames_and_keep_the_lines_that_they_have(tmp_path):
+    (tmp_path / "raw").mkdir()
+    line = "7, Timestamp(frame=7,elapsed_seconds=0.7,delta_seconds=0.1,platform_timestamp=1e9)"
+    (tmp_path / "raw/times0.txt").write_text(f"{line}\n")
+    with pytest.raises(KeyboardInterrupt), TimesLog(CaptureWriter(tmp_path), every=3) as log:
+        for frame in (9, 8, 3):
+            log.add(frame, [frame / 10])
+        assert list(Capture(tmp_path / "raw").read_times()) == [3, 7, 8, 9]
+        log.add(4, [0.4])
+        raise KeyboardInterrupt
+    lines = (tmp_path / "raw/times0.txt").read_text().splitlines()
+    assert [int(text.partition(",")[0]) for text in lines] == [3, 4, 7, 8, 9]
+    assert lines[2] == line
 
 
 def test_a_pose_that_is_not_rigid_is_not_written(tmp_path):

@@ -28,7 +28,7 @@ def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 10
     for frame in range(first, first + frames):
         for sensor in range(sensors):
             writer.write(sensor, frame, make_recording(points, seed=1000 * sensor + frame))
-            writer.write_time(sensor, frame, frame * 0.1)
+        writer.write_times({frame: [frame * 0.1] * sensors})
         writer.write_bev(frame, f"picture {frame}".encode())
     return Capture(root)
 

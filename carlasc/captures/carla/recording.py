@@ -6,7 +6,6 @@ import dataclasses
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ from carlasc.captures.carla.sensors import ActorNumbers, SensorRig
 from carlasc.captures.carla.server import Server
 from carlasc.captures.carla.traffic import spawn_actors
 from carlasc.captures.lidar import Lidar, sensor_offsets
-from carlasc.captures.raw import Capture, CaptureWriter, Recording
+from carlasc.captures.raw import Capture, Recording
 from carlasc.captures.settings import TRAFFIC, TrafficLevel, check_at_least, check_traffic
+from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.errors import ConflictError, import_extra
 
 SETTINGS_FILE = "recording.json"
@@ -28,7 +28,7 @@ class RecordResult:
     """What a recording wrote.
 
     Attributes:
-        out: folder of the sequence, which holds raw/.
+        out: folder of the sequence, which holds raw/, or its URL.
         count: number of the requested frames that exist now.
         written: number of frames that this run wrote; the others existed.
         sensors: number of sensors.
@@ -37,7 +37,7 @@ class RecordResult:
         server_version: version of CARLA.
     """
 
-    out: Path
+    out: str
     count: int
     written: int
     sensors: int
@@ -84,7 +84,7 @@ def record(
     stops where the replay departs from the recorded drive.
 
     Args:
-        out: folder of the sequence. Files go to `<out>/raw`.
+        out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
         host: host of the server.
         port: RPC port of the server.
         traffic_port: port of the traffic manager.
@@ -122,7 +122,7 @@ def record(
         complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev)}
         missing = set(range(count)) - (complete & writer.timed_frames(sensors))
         if not missing:
-            return RecordResult(Path(out), count, 0, sensors, 0, 0, server.version)
+            return RecordResult(writer.out, count, 0, sensors, 0, 0, server.version)
 
         rng = np.random.default_rng(seed)
         offsets = sensor_offsets(sensors, rng)
@@ -133,37 +133,35 @@ def record(
         spawned = (int(actor.id) for actor in (actors.ego, *actors.vehicles, *actors.walkers))
         numbers = ActorNumbers([*server.initial_actors, *spawned])
         writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))  # the town is known to exist now
-        for frame in range(max(missing) + 1):
-            recordings, times_s, picture = rig.measure(server.tick(), frame, numbers)
-            if frame in missing:
-                _write_frame(writer, frame, recordings, times_s, picture)
-                written += 1
-            else:
-                _check_replay(writer, frame, recordings[0])
-            if progress is not None:
-                progress(frame + 1, count)
-    return RecordResult(Path(out), count, written, sensors, len(actors.vehicles), len(actors.walkers), server.version)
+        with TimesLog(writer) as log:
+            for frame in range(max(missing) + 1):
+                recordings, times_s, picture = rig.measure(server.tick(), frame, numbers)
+                if frame in missing:
+                    _write_frame(writer, frame, recordings, picture)
+                    log.add(frame, times_s)  # last: a frame without times is not complete
+                    written += 1
+                else:
+                    _check_replay(writer, frame, recordings[0])
+                if progress is not None:
+                    progress(frame + 1, count)
+    return RecordResult(writer.out, count, written, sensors, len(actors.vehicles), len(actors.walkers), server.version)
 
 
-def _write_frame(
-    writer: CaptureWriter, frame: int, recordings: list[Recording], times_s: list[float], picture: bytes | None
-) -> None:
-    """Write a frame. Its times are written last: a frame without times is not complete."""
+def _write_frame(writer: CaptureWriter, frame: int, recordings: list[Recording], picture: bytes | None) -> None:
+    """Write a frame without its times."""
     for sensor, recording in enumerate(recordings):
         writer.write(sensor, frame, recording)
     if picture is not None:
         writer.write_bev(frame, picture)
-    for sensor, elapsed_s in enumerate(times_s):
-        writer.write_time(sensor, frame, elapsed_s)
 
 
 def _check_replay(writer: CaptureWriter, frame: int, replayed: Recording) -> None:
     """Raise ConflictError where the ego sensor is not where it was when the frame was recorded."""
-    recorded = Capture(writer.raw).read_pose(0, frame)
+    recorded = Capture(writer.target.tree).read_pose(0, frame)
     distance_m = float(np.linalg.norm(recorded[:3, 3] - replayed.world_T_sensor[:3, 3]))
     if distance_m > _REPLAY_TOLERANCE_M:
         raise ConflictError(
-            f"{writer.raw}: frame {frame}",
+            f"{writer.location}: frame {frame}",
             expected="the replay to follow the recorded drive",
             found=f"the ego sensor {distance_m:.2f} m away from it",
             advice="the server's physics differ between runs: record to another folder",

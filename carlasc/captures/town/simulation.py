@@ -6,22 +6,22 @@ import dataclasses
 import os
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
 from carlasc.captures.lidar import Lidar
-from carlasc.captures.raw import CaptureWriter
 from carlasc.captures.settings import TrafficLevel, check_at_least, check_traffic
 from carlasc.captures.town.birdseye import render_birdseye
-from carlasc.captures.town.drive import Drive
+from carlasc.captures.town.simulated import drive_of
+from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
 from carlasc.errors import import_extra
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.parts import Part
+from carlasc.running.processes import Engine, count_workers, run_all
 from carlasc.storage.layout import FRAME_PERIOD_S
+from carlasc.storage.remote import check_shared
 
 SETTINGS_FILE = "simulation.json"
 
@@ -34,7 +34,7 @@ class SimulationResult:
     """What a simulation wrote.
 
     Attributes:
-        out: folder of the sequence, which holds raw/.
+        out: folder of the sequence, which holds raw/, or its URL.
         count: number of the requested frames that exist now.
         written: number of frames that this run wrote; the others existed.
         sensors: number of sensors.
@@ -42,7 +42,7 @@ class SimulationResult:
         classes: number of these points per class name.
     """
 
-    out: Path
+    out: str
     count: int
     written: int
     sensors: int
@@ -73,7 +73,8 @@ def simulate(
     lidar: Lidar | None = None,
     bev: bool = True,
     workers: int | None = None,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
+    part: Part = Part(),  # noqa: B008 (frozen)
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulationResult:
     """Record a drive through a simulated town as a raw capture. The same arguments write the same bytes.
@@ -81,7 +82,7 @@ def simulate(
     A second run with the same settings writes the frames that are missing, so it continues an interrupted run or adds frames.
 
     Args:
-        out: folder of the sequence. Files go to `<out>/raw`.
+        out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
         count: number of frames, 0.1 s apart.
         first_frame: number of the first frame. The drive starts with frame 0, at rest.
         sensors: number of LiDARs. The first is the ego sensor.
@@ -91,6 +92,8 @@ def simulate(
         bev: whether to write bird's-eye pictures.
         workers: number of processes. None: one per core.
         executor: runs the work instead of processes of its own.
+        part: writes only this part of the frames; other commands write the others. The part that finds that no frame is missing any more
+            writes the times.
         progress: called with (frames done, number of frames).
 
     Returns:
@@ -106,29 +109,46 @@ def simulate(
     check_at_least(1, count=count, sensors=sensors)
     check_at_least(0, first_frame=first_frame, seed=seed)
     check_traffic(traffic)
-    count_workers(workers)
+    check_shared(os.fspath(out), count_workers(workers))
     settings = _Settings(seed, traffic, sensors, bev, lidar or Lidar())
     check_dependencies(bev)
     writer = CaptureWriter(out)
     writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc simulate")
     writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))
 
-    wanted = range(first_frame, first_frame + count)
+    wanted = part.take(range(first_frame, first_frame + count))
     missing = [frame for frame in wanted if not writer.has_frame(frame, sensors, bev)]
     complete = set(wanted) - set(missing)
-    for frame in sorted(complete - writer.timed_frames(sensors)):  # the run was interrupted before it wrote their times
-        _write_times(writer, sensors, frame)
     if progress is not None:
-        progress(len(complete), count)
+        progress(len(complete), len(wanted))
     points: Counter[str] = Counter()
     recorded = run_all(partial(_record_frame, writer, settings), missing, workers=workers, executor=executor)
-    for done, (frame, points_of_frame) in enumerate(zip(missing, recorded, strict=True), len(complete) + 1):
-        points.update(points_of_frame)
-        _write_times(writer, sensors, frame)
-        if progress is not None:
-            progress(done, count)
+    with TimesLog(writer) as log:
+
+        def note(frame: int) -> None:
+            if part.count == 1:  # several parts that wrote one file would overwrite each other's lines
+                log.add(frame, [frame * FRAME_PERIOD_S] * sensors)
+
+        for frame in sorted(complete - writer.timed_frames(sensors)):  # a run was killed before it wrote their times
+            note(frame)
+        for done, (frame, points_of_frame) in enumerate(zip(missing, recorded, strict=True), len(complete) + 1):
+            points.update(points_of_frame)
+            note(frame)
+            if progress is not None:
+                progress(done, len(wanted))
+    if part.count > 1:
+        _write_times_of_all(writer, range(first_frame, first_frame + count), sensors, bev)
     classes = {name: points[name] for name in CARLA.names.values() if points[name]}
-    return SimulationResult(Path(out), count, len(missing), sensors, points.total(), classes)
+    return SimulationResult(writer.out, len(wanted), len(missing), sensors, points.total(), classes)
+
+
+def _write_times_of_all(writer: CaptureWriter, frames: range, sensors: int, bev: bool) -> None:
+    """Write the times of all frames if all exist."""
+    writer.target.tree.refresh()
+    if all(writer.has_frame(frame, sensors, bev) for frame in frames):
+        with TimesLog(writer) as log:
+            for frame in sorted(set(frames) - writer.timed_frames(sensors)):
+                log.add(frame, [frame * FRAME_PERIOD_S] * sensors)
 
 
 def check_dependencies(bev: bool = True) -> None:
@@ -147,7 +167,7 @@ def check_dependencies(bev: bool = True) -> None:
 
 def _record_frame(writer: CaptureWriter, settings: _Settings, frame: int) -> dict[str, int]:
     """Write the recordings of all sensors and the picture of a frame. Return the number of points per class name."""
-    drive = _cached_drive(settings.seed, settings.traffic, settings.lidar)
+    drive = drive_of(settings.seed, settings.traffic, settings.lidar)
     points = np.zeros(CARLA.num_channels, np.int64)
     for sensor in range(settings.sensors):
         recording = drive.record(frame, sensor)
@@ -157,14 +177,3 @@ def _record_frame(writer: CaptureWriter, settings: _Settings, frame: int) -> dic
     if settings.bev:
         writer.write_bev(frame, render_birdseye(drive.snapshot(frame)))
     return {CARLA.names[label]: int(number) for label, number in enumerate(points) if number}
-
-
-@lru_cache(maxsize=1)
-def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> Drive:
-    """Return the drive of this process: the town is built once."""
-    return Drive(seed, traffic, lidar)
-
-
-def _write_times(writer: CaptureWriter, sensors: int, frame: int) -> None:
-    for sensor in range(sensors):
-        writer.write_time(sensor, frame, frame * FRAME_PERIOD_S)

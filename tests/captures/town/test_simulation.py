@@ -222,3 +222,14 @@ def test_the_command_names_options_in_its_errors(tmp_path: Path) -> None:
         assert result.exit_code == 2
         assert message in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_that_was_killed_before_it_wrote_times_ends_with_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
+    """What `kill -9` leaves: frames without times, here the first and the last."""
+    shutil.copytree(recorded, tmp_path, dirs_exist_ok=True)
+    for sensor in range(SMALL["sensors"]):
+        file = tmp_path / f"raw/times{sensor}.txt"
+        file.write_text(file.read_text().splitlines(keepends=True)[1])
+    (tmp_path / "raw/pose0/2.npy").unlink()
+    simulate(tmp_path, **SMALL, workers=1)
+    assert digests(tmp_path) == digests(recorded)
