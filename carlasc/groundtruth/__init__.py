@@ -1,6 +1,7 @@
 """Ground truth: observations are turned into votes and votes into grids, and a run does so for a whole data set."""
 
 from carlasc.groundtruth.from_grid import resample
+from carlasc.groundtruth.jobs import FrameFailure
 from carlasc.groundtruth.options import (
     Complete,
     Dynamic,
@@ -12,7 +13,7 @@ from carlasc.groundtruth.options import (
     PoseSource,
     Voting,
 )
-from carlasc.groundtruth.run import FrameFailure, RegridResult, regrid
+from carlasc.groundtruth.run import RegridResult, regrid
 from carlasc.groundtruth.voting.ballot import Ballot, VoteRule, Votes, count_votes
 from carlasc.groundtruth.voting.evidence import Evidence
 from carlasc.groundtruth.voting.observations import Observation

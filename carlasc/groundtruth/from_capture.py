@@ -72,8 +72,11 @@ class CaptureSequence(SequenceInput):
         capture = self.capture
         numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
         # Frames hold another Capture: this one caches its listing, which would be pickled with every frame.
-        light = Capture(capture.raw, capture.classes)
+        light = capture.light()
         return tuple(CaptureFrame(light, capture.sensors, i, number) for i, number in enumerate(numbers))
+
+    def _count_points(self, source_frame: int) -> int:
+        return len(self.capture.read(0, source_frame).scan)
 
     def poses(self) -> NDArray[np.float64]:
         """Return inv(pose0[first]) @ pose0[f] for each frame f.
@@ -88,13 +91,9 @@ class CaptureSequence(SequenceInput):
         except (FormatError, MissingDataError) as error:
             error.advice = "the first frame's pose is the origin of poses.txt: fix it, or start with a later frame"
             raise
-        return relative_to(world_T_first, np.stack([self._read_pose(frame.source_frame) for frame in self.frames]))
-
-    def _read_pose(self, frame: int) -> NDArray[np.float64]:
-        try:
-            return self.capture.read_pose(0, frame)
-        except (FormatError, MissingDataError):
-            return np.full((4, 4), np.nan)  # reading the frame raises the same error, and that one is reported
+        # NaN where a pose cannot be read: reading that frame raises the same error, and that one is reported
+        poses = self.capture.read_poses(0, [frame.source_frame for frame in self.frames])
+        return relative_to(world_T_first, poses)
 
     def times(self) -> NDArray[np.float64]:
         """Return (f - first) * 0.1 for each frame f: see the format page, `docs/format.md#votes`."""
@@ -111,13 +110,15 @@ class CaptureSequence(SequenceInput):
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 
-def capture_sequences(source: str | os.PathLike[str] | Source, plan: Plan) -> list[SequenceInput]:
+def capture_sequences(source: str | os.PathLike[str] | Source | Capture, plan: Plan) -> list[SequenceInput]:
     """Find the captures in or below a folder.
 
     Raises:
         ArgumentError: the source is not a path.
         MissingDataError: there is no capture.
     """
+    if isinstance(source, Capture):
+        return [CaptureSequence(source, "", plan)]
     if isinstance(source, Source):
         raise ArgumentError("source", expected="a folder with a capture", found=repr(source))
     return [CaptureSequence(capture, path, plan) for path, capture in find_captures(source).items()]

@@ -10,7 +10,6 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, get_args
@@ -20,14 +19,16 @@ from numpy.typing import NDArray
 
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.evidence import Evidence
+from carlasc.running.processes import Engine
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.protocol import Sequence
+from carlasc.storage.sinks import SequenceWriter
 
 
 @dataclass(frozen=True)
@@ -186,12 +187,28 @@ class SequenceInput(ABC):
     def record(self) -> dict[str, Any]:
         """Return what params.json says about the source. A run with another record does not continue the grid."""
 
+    def most_points(self) -> int | None:
+        """Return the largest number of points of a few scans, which tells a store how much room a frame needs; None if none can be read."""
+        frames = self.frames
+        chosen = {frames[0].source_frame, frames[len(frames) // 2].source_frame, frames[-1].source_frame}
+        found = []
+        for frame in sorted(chosen):
+            try:
+                found.append(self._count_points(frame))
+            except CarlascError:
+                continue  # making the frame raises the same error, and that one is reported
+        return max(found, default=None)
+
+    @abstractmethod
+    def _count_points(self, source_frame: int) -> int:
+        """Return the number of points of a scan; 0 if the sequence has no scans."""
+
     def prepare(  # noqa: B027 (most sequences need nothing)
         self,
         writer: SequenceWriter,
         *,
         workers: int,
-        executor: Executor | None,
+        executor: Engine | None,
         progress: Callable[[int], None] | None,
     ) -> None:
         """Do what is done once per sequence before its frames are made.
@@ -228,6 +245,10 @@ class StoredSequence(SequenceInput):
         self.sequence, self.plan = sequence, plan
         self.path = parent_path(sequence)
         self.location, self.metadata = sequence.location, sequence.metadata
+
+    def _count_points(self, source_frame: int) -> int:
+        sequence = self.sequence
+        return len(sequence.read("points", source_frame)) if source_frame in sequence.frames("points") else 0
 
     def poses(self) -> NDArray[np.float64] | None:
         """Return the sequence's poses, one per line of poses.txt; None if it has none."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from carlasc.errors import CarlascError, ConflictError, MissingDataError, Storag
 from carlasc.groundtruth.inputs import FrameInput, Plan
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts
 from carlasc.storage import layout
-from carlasc.storage.protocol import SequenceWriter
 from carlasc.storage.resuming import check_scan
+from carlasc.storage.sinks import SequenceWriter
 
 Outputs = dict[str, NDArray[Any]]
 
@@ -27,7 +28,7 @@ class Done:
 
     Attributes:
         task: the task.
-        outputs: what it made, by field, if the writer cannot write in workers.
+        outputs: what it made, by field, until it is written.
         error: why it failed; None if it did not.
         facts: what the report needs to know of the frame.
     """
@@ -43,10 +44,10 @@ class Task(ABC):
     """One piece of the work of a run. It holds paths and settings.
 
     Attributes:
-        job: number of its sequence in the run.
+        number: frame number in the output.
     """
 
-    job: int
+    number: int
 
     @abstractmethod
     def run(self) -> Done:
@@ -55,41 +56,34 @@ class Task(ABC):
 
 @dataclass(frozen=True)
 class MakeFrame(Task):
-    """Makes one frame, and writes it in the worker if its writer can.
+    """Makes one frame.
 
     Attributes:
         frame: the frame.
         plan: what the run makes.
-        writer: where it is written.
         classes: class table of the grid.
         sampled: whether the frame is also made without a tenth of the scans.
     """
 
     frame: FrameInput
     plan: Plan
-    writer: SequenceWriter
     classes: ClassTable
     sampled: bool
 
     def run(self) -> Done:
-        """Make the frame."""
-        plan, number = self.plan, self.frame.number
+        """Make the frame. What it made is returned, and not written yet."""
+        plan, number = self.plan, self.number
         try:
             outputs, grid = _make(self.frame, plan)
             changes = _changes(self.frame, plan, grid) if self.sampled else None
             facts = FrameFacts.of(number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals())
-            if not self.writer.concurrent:
-                return Done(self, outputs, facts=facts)
-            write_frame(self.writer, number, outputs)
-        except (ConflictError, StorageError):
-            raise  # every other frame would raise the same
         except MemoryError as error:
             raise CarlascError(
                 str(plan.spec), problem="out of memory", advice="use a coarser grid, or fewer processes (`workers`)"
             ) from error
         except (CarlascError, OSError) as error:
             return Done(self, error=str(error))
-        return Done(self, facts=facts)
+        return Done(self, outputs, facts=facts)
 
 
 @dataclass(frozen=True)
@@ -97,7 +91,6 @@ class MeasureFrame(Task):
     """Measures one frame that exists already, for the report.
 
     Attributes:
-        number: frame number in the output.
         frame: the frame, if the run knows it.
         sampled: whether the frame is also made without a tenth of the scans.
         plan: what the run makes.
@@ -105,7 +98,6 @@ class MeasureFrame(Task):
         classes: class table of the grid.
     """
 
-    number: int
     frame: FrameInput | None
     plan: Plan
     writer: SequenceWriter
@@ -131,22 +123,72 @@ class MeasureFrame(Task):
         return Done(self, facts=facts)
 
 
-def run_task(task: Task) -> Done:
-    """Do the work of a task."""
-    return task.run()
+@dataclass(frozen=True)
+class Batch:
+    """Tasks that a worker does one after another: to make the frames that are stored together, or to measure a frame.
+
+    Attributes:
+        writer: where the frames are written.
+        tasks: the tasks.
+    """
+
+    writer: SequenceWriter
+    tasks: tuple[Task, ...]
 
 
-def write_frame(writer: SequenceWriter, frame: int, outputs: Outputs) -> None:
-    """Write a frame's files. Scan fields that exist already must be equal to this run's.
+def run_batch(batch: Batch) -> list[Done]:
+    """Do the work of a batch, and write what it made if the writer can be used in workers.
+
+    Raises:
+        ConflictError: a scan exists already, and differs from that of this run.
+        StorageError: nothing can be written, so every other batch would fail in the same way.
+    """
+    done = [task.run() for task in batch.tasks]
+    if not batch.writer.concurrent:
+        return done
+    try:
+        write_frames(batch.writer, done)
+    except (ConflictError, StorageError):
+        raise  # every other batch would raise the same
+    except (CarlascError, OSError) as error:
+        done = [replace(result, error=result.error or str(error), facts=None) for result in done]
+    return [replace(result, outputs={}) for result in done]
+
+
+def fail_batch(batch: Batch, message: str) -> list[Done]:
+    """Return the result of a batch that no worker could finish."""
+    return [Done(task, error=message) for task in batch.tasks]
+
+
+def write_frames(writer: SequenceWriter, results: Sequence[Done]) -> None:
+    """Write the frames that were made. Scan fields that exist already must be equal to this run's.
 
     Raises:
         ConflictError: they differ.
     """
-    for name, array in outputs.items():
-        if name in layout.SCAN_FIELDS and writer.has(name, frame):
-            check_scan(writer, name, frame, array)
-        else:
-            writer.write(name, frame, array)
+    frames: dict[int, Outputs] = {}
+    for done in results:
+        if isinstance(done.task, MakeFrame) and done.outputs:
+            number = done.task.number
+            frames[number] = {
+                name: array
+                for name, array in done.outputs.items()
+                if name not in layout.SCAN_FIELDS or not exists(writer, name, number, array)
+            }
+    if frames:
+        writer.write_frames(frames)
+
+
+def exists(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) -> bool:
+    """Whether a scan field of a frame exists already.
+
+    Raises:
+        ConflictError: it exists, and differs from `array`.
+    """
+    if not writer.has(field, frame):
+        return False
+    check_scan(writer, field, frame, array)
+    return True
 
 
 def _make(frame: FrameInput, plan: Plan) -> tuple[Outputs, Grid]:

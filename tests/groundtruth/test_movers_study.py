@@ -193,6 +193,7 @@ def test_rows_change_what_they_say(small):
     assert 0.1 < shifted[:, :3, 3].std() < 0.3 and not shifted[:, :3, :3].any()
 
 
+@pytest.mark.slow
 def test_a_run_makes_rows_once_and_the_tables_show_them(small, capsys):
     from movers import Setting, Task, held_out, run, tables
     from movers_tables import write_tables

@@ -1,18 +1,20 @@
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.captures import make_recording, read_tree, write_capture
 
-from carlasc.captures.raw import Capture, CaptureWriter
+from carlasc.captures.raw import Capture
+from carlasc.captures.writing import CaptureWriter
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.groundtruth import FromCapture, FromScans, Observation, Voting, count_votes, regrid
 from carlasc.storage import FolderSource, Sink, layout
-from carlasc.storage.protocol import SequenceWriter
+from carlasc.storage.sinks import SequenceWriter
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
 KEYS = ("grid_size", "min_bound", "max_bound", "num_channels", "coordinates")
@@ -97,10 +99,10 @@ def test_sensors_that_stand_turned_see_the_same_world(tmp_path):
     for writer, second in ((upright, other), (turned, rotated)):
         writer.write(0, 0, ego)
         writer.write(1, 0, second)
-        regrid(writer.raw, SMALL, voting=Voting(free_step_m=1000), workers=1)  # endpoints alone: rays start elsewhere
-    grids = [
-        FolderSource(w.raw.parent).sequences()["cartesian"].grid("evaluation_32x32x4", 0) for w in (upright, turned)
-    ]
+        regrid(
+            writer.location, SMALL, voting=Voting(free_step_m=1000), workers=1
+        )  # endpoints alone: rays start elsewhere
+    grids = [FolderSource(w.out).sequences()["cartesian"].grid("evaluation_32x32x4", 0) for w in (upright, turned)]
     assert grids[0].counts.sum() > 100
     assert np.mean(grids[0].labels == grids[1].labels) > 0.999  # float32 may move a point over a cell's edge
 
@@ -160,7 +162,7 @@ def test_frames_are_chosen_by_their_number_in_the_capture_and_renumbered(tmp_pat
 def test_frames_that_the_capture_skipped_keep_their_time(tmp_path):
     capture = write_capture(tmp_path, frames=4)
     for kind in ("velodyne", "labels", "instances", "velocities", "pose"):
-        (capture.raw / f"{kind}0" / "101.npy").unlink()
+        (Path(capture.location) / f"{kind}0" / "101.npy").unlink()
     regrid(tmp_path, SMALL, workers=1)
     (sequence,) = FolderSource(tmp_path).sequences().values()
     assert sequence.scan_frames().tolist() == [0, 1, 2]

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_a_bad_frame_is_named_the_others_are_made_and_a_fixed_one_is_added(tmp_p
     folder, spoil, message = BAD[bad]
     capture = write_capture(tmp_path)
     regrid(tmp_path, SMALL, tmp_path / "good", workers=1)
-    path = capture.raw / folder / "101.npy"
+    path = Path(capture.location) / folder / "101.npy"
     sound = path.read_bytes()
     spoil(path)
 
@@ -68,7 +69,7 @@ def test_a_bad_frame_is_named_the_others_are_made_and_a_fixed_one_is_added(tmp_p
 
 def test_the_first_pose_is_the_origin_without_which_nothing_is_written(tmp_path):
     capture = write_capture(tmp_path)
-    np.save(capture.raw / "pose0" / "100.npy", np.eye(4) * 3)
+    np.save(Path(capture.location) / "pose0" / "100.npy", np.eye(4) * 3)
     with pytest.raises(
         FormatError, match="pose0/100.npy: .*: the first frame's pose is the origin .*start with a later"
     ):

@@ -7,7 +7,7 @@ import pytest
 from helpers import passing
 from helpers.captures import make_recording, read_tree, write_capture
 
-from carlasc.captures.raw import CaptureWriter
+from carlasc.captures.writing import CaptureWriter
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError, FormatError
 from carlasc.groundtruth import Voting, regrid

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -36,7 +35,7 @@ from carlasc.motion import (
     seen_from,
     tracks_from_boxes,
 )
-from carlasc.running.processes import run_all
+from carlasc.running.processes import Engine, run_all
 from carlasc.storage import layout
 from carlasc.storage.folders.folder import FolderSequence
 
@@ -103,7 +102,7 @@ class _Pass:
 
     feed: ScanFeed
     workers: int
-    executor: Executor | None
+    executor: Engine | None
     progress: Callable[[int], None] | None
 
     def run(self) -> Actors:
@@ -183,7 +182,7 @@ def find_actors(
     feed: ScanFeed,
     *,
     workers: int = 1,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Actors:
     """Find the actors of a sequence.

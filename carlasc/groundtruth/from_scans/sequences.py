@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -35,8 +34,10 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.motion import LONGEST_M
+from carlasc.running.processes import Engine
 from carlasc.storage import as_source, layout
-from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.sinks import SequenceWriter
 
 TRACKS = "tracks.npz"
 """The document that keeps the actors of a sequence beside its grids. It may be deleted: the next run makes it again."""
@@ -144,7 +145,7 @@ class ScanSequence(StoredSequence):
         writer: SequenceWriter,
         *,
         workers: int,
-        executor: Executor | None,
+        executor: Engine | None,
         progress: Callable[[int], None] | None,
     ) -> None:
         """Find the actors of the sequence, or read those that an earlier run found."""
