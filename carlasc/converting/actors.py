@@ -7,7 +7,6 @@ for the result.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, field
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, rotate_vectors, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.running.processes import run_all
+from carlasc.running.processes import Engine, run_all
 
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
@@ -116,7 +115,7 @@ class ActorMotion:
         executor: runs the work instead of processes of our own.
     """
 
-    def __init__(self, classes: ClassTable, workers: int = 1, executor: Executor | None = None) -> None:
+    def __init__(self, classes: ClassTable, workers: int = 1, executor: Engine | None = None) -> None:
         self._estimate, self._workers, self._executor = _Estimate(classes), workers, executor
         self._chains: dict[int, _Chain] = {}
         self._ended: list[_Chain] = []

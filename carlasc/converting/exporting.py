@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,7 +21,8 @@ from carlasc.converting.records import ExportRecord
 from carlasc.converting.registry import load_exporter
 from carlasc.converting.results import Failure, Progress, Steps
 from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageError
-from carlasc.running.processes import count_workers, one_pool, run_all
+from carlasc.running.parts import Part
+from carlasc.running.processes import Engine, count_workers, one_pool, run_all
 from carlasc.storage.files import remove_stale, write_atomic
 
 
@@ -57,7 +57,8 @@ def export(
     sequences: Collection[str] | None = None,
     overwrite: bool = False,
     workers: int | None = None,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
+    part: Part = Part(),  # noqa: B008 (frozen)
     progress: Progress | None = None,
     **options: Any,
 ) -> ExportResult:
@@ -74,6 +75,8 @@ def export(
         overwrite: write frames again that exist.
         workers: number of frames that are made at the same time; None uses all cores.
         executor: runs the work instead of processes of our own; it is not shut down.
+        part: exports only this part of the frames, or of the sequences where each is one file; other commands export the others. The part
+            that finds that nothing is missing any more writes what the data set has once.
         progress: called with the number of finished frames and the number of all frames.
         **options: of the exporter: the arguments of its constructor, such as `grid`. Text is read as the type of the option.
 
@@ -104,18 +107,20 @@ def export(
         record.check(places, exporter.settings)
     record.write(places, exporter.settings)
     remove_stale(root)
-    steps = Steps(progress, sum(len(exported.frames) for exported in chosen))
+    ours = _deal(exporter, chosen, part)
+    steps = Steps(progress, sum(len(exported.frames) for exported in ours))
     with one_pool(workers, executor) as pool:
-        run = partial(run_all, workers=workers, executor=pool)
+        run = partial(run_all, workers=workers, executor=pool, lost=_fail)
         done = _Done([], 0, [])
-        for exported in chosen:
+        for exported in ours:
             folder = root / exported.folder
             remove_stale(folder)
             for document, data in exporter.documents(exported.sequence).items():
                 write_atomic(folder / document, data)
             done += _export_sequence(exporter, exported, folder, overwrite, run, steps)
-    for file, data in exporter.index(root, done.exported).items():
-        write_atomic(root / file, data)
+    if part.count == 1 or all(_is_whole(exporter, exported, root / exported.folder) for exported in chosen):
+        for file, data in exporter.index(root, done.exported if part.count == 1 else chosen).items():
+            write_atomic(root / file, data)
     written = sum(len(exported.frames) for exported in done.exported)
     return ExportResult(
         root,
@@ -157,21 +162,25 @@ def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
     """Return the sequences of a source by name: the Cartesian one where a sequence has both coordinates.
 
     Raises:
-        FormatError: two splits have a sequence of the same name, which would be written to the same place.
+        FormatError: two sequences have the same name, and would be written to the same place.
     """
     found: dict[str, storage.Sequence] = {}
     for sequence in source.sequences().values():
         other = found.get(sequence.name)
-        if other is not None and other.split != sequence.split:
+        if other is not None and (other.split, sequence.coordinates) != (sequence.split, _other_coordinates(other)):
             raise FormatError(
                 source.location,
                 expected="sequences of different names",
                 found=f"{other.path} and {sequence.path}",
-                advice="export one split at a time, each to a folder of its own",
+                advice="export them one after the other, each to a folder of its own",
             )
         if other is None or sequence.coordinates == "cartesian":
             found[sequence.name] = sequence
     return found
+
+
+def _other_coordinates(sequence: storage.Sequence) -> str:
+    return "cylindrical" if sequence.coordinates == "cartesian" else "cartesian"
 
 
 def _choose(
@@ -189,6 +198,29 @@ def _place(exporter: Exporter, exported: Exported) -> str:
     if isinstance(exporter, SequenceExporter):
         return PurePosixPath(exported.folder, exporter.file(exported.sequence)).as_posix()
     return exported.folder
+
+
+def _deal(exporter: Exporter, chosen: Sequence[Exported], part: Part) -> list[Exported]:
+    """Return the sequences of a part, each with its frames of that part: a sequence that is one file is in one part."""
+    if isinstance(exporter, SequenceExporter):
+        return list(part.take(chosen))
+    dealt = set(part.take([(n, frame) for n, exported in enumerate(chosen) for frame in exported.frames]))
+    ours = [
+        replace(exported, frames=tuple(frame for frame in exported.frames if (n, frame) in dealt))
+        for n, exported in enumerate(chosen)
+    ]
+    return [exported for exported in ours if exported.frames or part.count == 1]
+
+
+def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
+    """Whether all frames of a sequence are exported."""
+    sequence = exported.sequence
+    if isinstance(exporter, SequenceExporter):
+        path = folder / exporter.file(sequence)
+        return path.is_file() and set(exported.frames) <= set(exporter.frames_in(path, sequence))
+    assert isinstance(exporter, FrameExporter)
+    files = (file for frame in exported.frames for file in exporter.frame_files(sequence, frame))
+    return all((folder / file).is_file() for file in files)
 
 
 def _export_sequence(
@@ -220,6 +252,11 @@ def _export_frames(
     return _done(exported, len(exported.frames) - len(jobs), failures)
 
 
+def _fail(job: _Job, message: str) -> str:
+    """Return the result of a frame that no worker could finish."""
+    return message
+
+
 def _write_frame(job: _Job) -> str | None:
     """Write one frame's files; return the error message if it cannot be done."""
     assert isinstance(job.exporter, FrameExporter)
@@ -238,7 +275,7 @@ def _export_file(
 ) -> _Done:
     """Write the file of a sequence, unless it exists with all frames. A file that lacks frames is made anew."""
     sequence, path = exported.sequence, folder / exporter.file(exported.sequence)
-    if path.is_file() and not overwrite and set(exported.frames) <= set(exporter.frames_in(path, sequence)):
+    if not overwrite and _is_whole(exporter, exported, folder):
         steps(len(exported.frames))
         return _done(exported, len(exported.frames), [])
     part = path.with_name(f"{path.name}.part")

@@ -16,7 +16,7 @@ from carlasc.converting.actors import Velocity
 from carlasc.converting.assembling import Motion, Rig, assemble
 from carlasc.converting.axes import mirror_boxes, mirror_points
 from carlasc.converting.nearby import labels_nearby
-from carlasc.converting.outcomes import Fields, Outcome
+from carlasc.converting.outcomes import Fields, Outcome, write_outcomes
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.scans import make_fields
 from carlasc.converting.target import Target
@@ -25,7 +25,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
 from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
-from carlasc.storage.protocol import SequenceWriter
+from carlasc.storage.sinks import SequenceWriter
 
 _FAR_M = 100.0  # objects farther away than this are not filled in
 
@@ -76,13 +76,21 @@ class FinishBlock:
 
 def finish_block(block: FinishBlock) -> list[Outcome]:
     """Finish several frames, and write them if the writer can be used in workers."""
-    return [_finish(job, block) for job in block.jobs]
+    outcomes = [_finish(job, block) for job in block.jobs]
+    if block.writer.concurrent:
+        write_outcomes(block.writer, outcomes)
+    return outcomes
+
+
+def fail_finish_block(block: FinishBlock, message: str) -> list[Outcome]:
+    """Return the outcomes of a block that no worker could finish."""
+    return [Outcome(job.handle.number, failure=message) for job in block.jobs]
 
 
 def _finish(job: FinishJob, block: FinishBlock) -> Outcome:
     outcome = Outcome(job.handle.number)
     add = _by_instances if job.tracks is None else _by_boxes
-    outcome.take(lambda: add(_read_back(job, block), job, block), block.writer)
+    outcome.take(lambda: add(_read_back(job, block), job, block))
     return outcome
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -28,12 +29,12 @@ from carlasc.converting.trajectory import (
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ConflictError, FormatError, MissingDataError
+from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import SequenceWriter, Sink
 from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
+from carlasc.storage.sinks import SequenceWriter, Sink
 
 SplitName = Literal["train", "val", "test", "all"]
 _AROUND_S = 1.0  # of the trajectory that a frame needs: longer than a sweep
@@ -144,6 +145,11 @@ def choose_recordings(
     return chosen
 
 
+def sequence_path(recording: Recording) -> str:
+    """Return the path of the sequence that a recording becomes."""
+    return f"{recording.split}/{recording.name}/cartesian"
+
+
 def plan_recording(
     recording: Recording,
     converter: type[Converter],
@@ -154,7 +160,7 @@ def plan_recording(
     force: bool,
 ) -> RecordingPlan:
     """Read a recording's poses, times and boxes, check them, and find out which frames are missing. Nothing is written."""
-    writer = sink.sequence(f"{recording.split}/{recording.name}/cartesian")
+    writer = sink.sequence(sequence_path(recording))
     own_times = recording.times()
     times = frame_times(recording, own_times)
     trajectory = read_trajectory(recording, times, pose_source, force=force)
@@ -220,6 +226,17 @@ def check_voxel_grid(plan: RecordingPlan, target: Target) -> None:
         check_grid(plan.writer, layout.grid_folder(plan.recording.voxels), params, frames, overwrite=False)
 
 
+def _announce(plan: RecordingPlan) -> None:
+    """Say what is going to be written, to a store that needs to know: the scans, and the room that they take."""
+    if plan.writer.block == 1:
+        return
+    frames, points = plan.recording.frames, list[int]()
+    for handle in {frames[i].number: frames[i] for i in (0, len(frames) // 2, -1)}.values():
+        with suppress(CarlascError):  # reading the frame again raises the same error, and that one is reported
+            points.append(sum(len(cloud.points) for cloud in handle.read()))
+    plan.writer.expect({"points": [handle.number for handle in frames]}, {"points": max(points)} if points else None)
+
+
 def begin(plan: RecordingPlan, target: Target, metadata: Metadata) -> None:
     """Write carlasc.json, times and the voxel grid's params.json, and take over the poses that an earlier run estimated.
 
@@ -244,6 +261,7 @@ def begin(plan: RecordingPlan, target: Target, metadata: Metadata) -> None:
             found=str(before.extra.get("poses", "others")),
             advice="write to another place",
         )
+    _announce(plan)
     documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
     documents[layout.TIMES] = agree_times(writer, plan.times - plan.times[0])
     if target.voxels and plan.recording.voxels is not None:

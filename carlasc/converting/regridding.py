@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Executor
+from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from carlasc.converting.plans import sequence_path
+from carlasc.converting.protocol import Recording
 from carlasc.converting.results import Steps
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
+from carlasc.running.processes import Engine
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.sinks import Sink
 
 if TYPE_CHECKING:
     from carlasc.groundtruth import RegridResult
@@ -28,14 +31,13 @@ class Regridding:
     follow_ground: bool
     force: bool
     workers: int
-    executor: Executor | None
+    executor: Engine | None
     steps: Steps
 
-    def run(self, conversion: Conversion, spec: GridSpec) -> RegridResult:
-        """Make the grids of a converted recording, in the geometry that `fit` returned."""
+    def run(self, conversion: Conversion, spec: GridSpec, sink: Sink) -> RegridResult:
+        """Make the grids of a converted recording, in the geometry that `fit` returned, from what was written to the sink."""
         from carlasc.groundtruth import FromScans, Voting, regrid
 
-        folder = Path(conversion.plan.writer.location)
         last = 0
         self.steps.expect(len(conversion.plan.recording.frames))
 
@@ -45,9 +47,9 @@ class Regridding:
             last = done
 
         return regrid(
-            folder,
+            _Converted(sink.source(), conversion.plan.recording),
             spec,
-            folder.parent,
+            sink,
             observe=replace(self.observe or FromScans(), force=self.force),
             voting=self.voting or Voting(),
             workers=self.workers,
@@ -55,7 +57,7 @@ class Regridding:
             progress=advance,
         )
 
-    def fit(self, conversions: Sequence[Conversion], where: str) -> tuple[GridSpec, list[str]]:
+    def fit(self, conversions: Series[Conversion], where: str) -> tuple[GridSpec, list[str]]:
         """Return the grid, moved to where the ground is if that is asked for, and what users must know of it.
 
         It is the same for all recordings, so that one training set can hold them. `where` is the place that is written to.
@@ -71,6 +73,17 @@ class Regridding:
         ]
 
 
-def _heights(grounds: Sequence[Ground]) -> str:
+class _Converted(Source):
+    """The sequence that one recording was converted to."""
+
+    def __init__(self, source: Source, recording: Recording) -> None:
+        self.location = source.location
+        self._source, self._path = source, sequence_path(recording)
+
+    def sequences(self) -> dict[str, Sequence]:
+        return {self._path: self._source.sequences()[self._path]}
+
+
+def _heights(grounds: Series[Ground]) -> str:
     low, high = (f"{pick(ground.below_m for ground in grounds):.2f}" for pick in (min, max))
     return f"the sensor is {low} m" if low == high else f"the sensors are {low} to {high} m"

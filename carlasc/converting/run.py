@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Mapping
-from concurrent.futures import Executor
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
 
 from carlasc.converting.places import check_outside
 from carlasc.converting.plans import (
@@ -18,7 +19,7 @@ from carlasc.converting.plans import (
     choose_recordings,
     plan_recording,
 )
-from carlasc.converting.protocol import Converter
+from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import load_converter
 from carlasc.converting.regridding import Regridding
 from carlasc.converting.results import ConvertResult, Failure, Progress, Steps
@@ -27,10 +28,13 @@ from carlasc.converting.target import Target
 from carlasc.converting.trajectory import PoseSource
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.running.processes import count_workers, one_pool
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.running.parts import Part
+from carlasc.running.processes import Engine, count_workers, one_pool
 from carlasc.storage.metadata import Axes, Metadata
-from carlasc.storage.protocol import Sink
+from carlasc.storage.opening import as_sink
+from carlasc.storage.remote import check_shared
+from carlasc.storage.sinks import Sink
+from carlasc.storage.targets import LocalTarget
 
 if TYPE_CHECKING:
     from carlasc.groundtruth import RegridResult
@@ -60,7 +64,8 @@ def convert(
     allow_unknown: bool = False,
     force: bool = False,
     workers: int | None = None,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
+    part: Part = Part(),  # noqa: B008 (frozen)
     progress: Progress | None = None,
 ) -> ConvertResult:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes.
@@ -72,7 +77,8 @@ def convert(
         name: the converter: "kitti", "argoverse2", ..., or one of another distribution (see `converter_names`); or a class that
             inherits `Converter`.
         source: folder of the data set, or of one of its sequences.
-        out: folder to write to, or any Sink (then without grids).
+        out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or any Sink, with grids if it can be
+            read while it is written.
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids.
@@ -92,6 +98,8 @@ def convert(
         force: accept poses under which the scans do not overlap, or whose calibration is missing.
         workers: number of frames that are converted at the same time; None uses all cores.
         executor: runs the work instead of processes of our own; it is not shut down.
+        part: converts only this part of the recordings, whole ones, because poses and motion are found along each; other commands
+            convert the others. Grids then keep their height: the ground of the other recordings is not known.
         progress: called with the number of finished steps and the number of all steps.
 
     Returns:
@@ -108,11 +116,19 @@ def convert(
     converter = load_converter(name) if isinstance(name, str) else name
     _check(converter, classes=classes, axes=axes, grids=grids, split=split, poses=poses, flow=flow)
     root = Path(source)
-    sink = out if isinstance(out, Sink) else FolderSink(out)
+    sink = as_sink(out)
+    check_shared(sink.location, 1 if executor is None and workers == 1 else 2)
     _check_sink(root, sink, grids)
     if not root.exists():
         raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
+    if part.count > 1 and grids == "scans" and follow_ground:
+        raise ArgumentError(
+            "follow_ground",
+            expected='False, or grids="none", with `part`: the height of grids is found from the ground of all recordings',
+            found="True",
+        )
     recordings = choose_recordings(converter(root, **(options or {})).sequences(), root, sequences, split)
+    recordings = _deal(recordings, part)
     remap = converter.to_carla if classes == "carla" else None
     target = Target(converter.classes, remap, axes == "left", allow_unknown, voxels=grids == "voxels")
     metadata = Metadata(
@@ -141,11 +157,15 @@ def convert(
                 done[-1].run(metadata)
         failures = [failure for conversion in done for failure in conversion.failures]
         notes = [note for conversion in done for note in conversion.notes]
+        if sink is not out:
+            sink.finish(incomplete=True)  # what is missing could not be read, and is reported
         if grids == "scans":
             regridding = Regridding(spec, observe, voting, follow_ground, force, workers, pool, steps)
             fitted, remarks = regridding.fit(done, sink.location)
             notes += remarks
-            made = [regridding.run(conversion, fitted) for conversion in done]
+            made = [regridding.run(conversion, fitted, sink) for conversion in done]
+            if sink is not out:
+                sink.finish(incomplete=True)
     for result in made:
         notes += result.notes
         failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
@@ -158,6 +178,16 @@ def convert(
         tuple(notes),
         time.perf_counter() - start,
     )
+
+
+def _deal(recordings: Sequence[Recording], part: Part) -> list[Recording]:
+    """Return the recordings of a part: those whose middle frame is among its share of all frames."""
+    if part.count == 1:
+        return list(recordings)
+    ends = np.cumsum([len(recording.frames) for recording in recordings])
+    middles = ends - np.array([len(recording.frames) for recording in recordings]) / 2
+    shares = np.minimum(middles * part.count // max(ends[-1], 1), part.count - 1)
+    return [recording for recording, share in zip(recordings, shares, strict=True) if share == part.number - 1]
 
 
 def _check(converter: type[Converter], **given: str) -> None:
@@ -185,9 +215,13 @@ def _check_grids(plan: RecordingPlan, grids: Grids) -> None:
 
 
 def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
-    if isinstance(sink, FolderSink):
-        check_outside(sink.folder, str(source))
-    elif grids != "none":
+    target = getattr(sink, "target", None)
+    if isinstance(target, LocalTarget):
+        check_outside(target.folder, str(source))
+    if grids == "scans" and not sink.is_readable:
         raise ArgumentError(
-            "grids", expected=f"none with {sink.location}", found=grids, advice="convert to a folder, then pack it"
+            "grids",
+            expected=f"none with {sink.location}, which cannot be read while it is written",
+            found=grids,
+            advice="convert to a folder or a .zarr store",
         )

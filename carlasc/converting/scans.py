@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from carlasc.converting.actors import ActorSighting, find_actors
 from carlasc.converting.assembling import Assembled, Motion, Rig, assemble
 from carlasc.converting.axes import mirror_grid, mirror_points
-from carlasc.converting.outcomes import Fields, Outcome
+from carlasc.converting.outcomes import Fields, Outcome, write_outcomes
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.target import Target
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.motion.odometry import usable_points
 from carlasc.storage import layout
-from carlasc.storage.protocol import SequenceWriter
+from carlasc.storage.sinks import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"
 """Folder of a sequence that keeps the other data set's own voxel files unchanged, so that an export gives them back."""
@@ -79,12 +79,20 @@ class FrameResult(Outcome):
 
 def convert_block(block: Block) -> list[FrameResult]:
     """Read several frames, and write them if the writer can be used in workers."""
-    return [_convert(job, block) for job in block.jobs]
+    results = [_convert(job, block) for job in block.jobs]
+    if block.writer.concurrent:
+        write_outcomes(block.writer, results)
+    return results
+
+
+def fail_block(block: Block, message: str) -> list[FrameResult]:
+    """Return the results of a block that no worker could finish."""
+    return [FrameResult(job.handle.number, failure=message) for job in block.jobs]
 
 
 def _convert(job: FrameJob, block: Block) -> FrameResult:
     result = FrameResult(job.handle.number)
-    result.take(lambda: _read(job, block, result), block.writer)
+    result.take(lambda: _read(job, block, result))
     return result
 
 

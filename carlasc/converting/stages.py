@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from bisect import bisect
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 from typing import TypeVar
 
@@ -16,26 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.actors import ActorMotion, Velocity
-from carlasc.converting.finishing import FinishBlock, FinishJob, finish_block
-from carlasc.converting.outcomes import Outcome, write_fields
+from carlasc.converting.finishing import FinishBlock, FinishJob, fail_finish_block, finish_block
+from carlasc.converting.outcomes import Outcome, in_blocks, write_outcomes
 from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
 from carlasc.converting.protocol import Converter, FrameHandle
 from carlasc.converting.results import Failure, Steps
-from carlasc.converting.scans import Block, FrameJob, FrameResult, convert_block
+from carlasc.converting.scans import Block, FrameJob, FrameResult, convert_block, fail_block
 from carlasc.converting.target import Target
 from carlasc.converting.trajectory import estimate_poses, fill_gaps, jitter_note, odometry_range
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
-from carlasc.running.processes import run_all
+from carlasc.running.processes import Engine, run_all
 from carlasc.storage.metadata import Metadata
 
-_BLOCK = 8  # frames that a worker converts in one task
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
 _GROUND_REACH_M = 25.0
 _NEAR_M = 250.0  # boxes farther away from the sensor hold no points
 
-Item = TypeVar("Item")
+Item = TypeVar("Item", Block, FinishBlock)
 Result = TypeVar("Result", bound=Outcome)
 
 
@@ -59,7 +57,7 @@ class Conversion:
     converter: type[Converter]
     target: Target
     workers: int
-    pool: Executor | None
+    pool: Engine | None
     steps: Steps
     failures: list[Failure] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -110,12 +108,12 @@ class Conversion:
         jobs = [FrameJob(handle, handle.number in plan.missing, plan.motion(handle)) for handle in chosen]
         voxels = plan.recording.voxels if self.target.voxels else None
         blocks = [
-            Block(tuple(jobs[i : i + _BLOCK]), self.target, plan.writer, plan.rig, voxels, estimate, follow)
-            for i in range(0, len(jobs), _BLOCK)
+            Block(tuple(part), self.target, plan.writer, plan.rig, voxels, estimate, follow)
+            for part in in_blocks(jobs, lambda job: job.handle.number, plan.writer)
         ]
         actors = ActorMotion(converter.classes, self.workers, self.pool)
         found: dict[int, NDArray[np.float64]] = {}
-        for result, pose in self._placed(self._work(convert_block, blocks)):
+        for result, pose in self._placed(self._work(convert_block, blocks, fail_block)):
             if estimate:
                 found[result.number] = pose
             if follow:
@@ -147,12 +145,26 @@ class Conversion:
         for pose in follow_scans(scans(), min_range_m=nearest, max_range_m=farthest):
             yield waiting.popleft(), pose
 
-    def _work(self, function: Callable[[Item], list[Result]], blocks: list[Item]) -> Iterator[Result]:
+    def _work(
+        self,
+        function: Callable[[Item], list[Result]],
+        blocks: list[Item],
+        lost: Callable[[Item, str], list[Result]],
+    ) -> Iterator[Result]:
         """Yield what a function that works on blocks of frames returns for each frame; what workers cannot write is written here."""
-        with closing(run_all(function, blocks, workers=self.workers, executor=self.pool)) as results:
+        run = partial(run_all, function, workers=self.workers, executor=self.pool)
+
+        def one_by_one(block: Item, message: str) -> list[Result]:
+            """Work on the frames of a lost block again, each alone: one of them may have killed the workers."""
+            if len(block.jobs) == 1 or self.plan.writer.block > 1:
+                return lost(block, message)
+            singles = [replace(block, jobs=(job,)) for job in block.jobs]
+            return [result for frames in run(singles, lost=lost) for result in frames]
+
+        with closing(run(blocks, lost=one_by_one)) as results:
             for frames in results:
+                write_outcomes(self.plan.writer, frames)
                 for result in frames:
-                    write_fields(self.plan.writer, result.number, result.outputs)
                     if result.failure is not None:
                         self._fail(result.number, result.failure)
                     yield result
@@ -171,8 +183,7 @@ class Conversion:
         self.steps.expect(len(wanted))
         tracks, boxes = self._box_tracks()
         blocks = []
-        for begin_ in range(0, len(wanted), _BLOCK):
-            part = wanted[begin_ : begin_ + _BLOCK]
+        for part in in_blocks(wanted, attrgetter("number"), plan.writer):
             near = None if tracks is None else _near(tracks, part, plan.poses)
             jobs = [
                 FinishJob(
@@ -188,7 +199,7 @@ class Conversion:
                 for handle in part
             ]
             blocks.append(FinishBlock(tuple(jobs), self.target, plan.writer, plan.rig, plan.flow))
-        deque(self._work(finish_block, blocks), maxlen=0)  # frames are written; nothing is kept
+        deque(self._work(finish_block, blocks, fail_finish_block), maxlen=0)  # frames are written; nothing is kept
 
     def _labelled_around(self, handle: FrameHandle) -> tuple[FinishJob, ...]:
         """Return the labelled frames before and after one that has no labels although others have."""
@@ -269,7 +280,7 @@ class Conversion:
         return [f"{plan.writer.location}: {note}" for note in notes]
 
 
-def _near(tracks: list[Track], handles: list[FrameHandle], poses: NDArray[np.float64]) -> tuple[Track, ...]:
+def _near(tracks: list[Track], handles: Sequence[FrameHandle], poses: NDArray[np.float64]) -> tuple[Track, ...]:
     """Return the tracks that come near the sensor in some frames, cut to these frames: few enough to be sent to a worker."""
     here = poses[handles[0].number, :2, 3]
     near = []

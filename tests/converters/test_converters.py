@@ -14,7 +14,7 @@ import carlasc
 from carlasc.converting import convert, converter_names, load_converter
 from carlasc.errors import ArgumentError, DependencyError, MissingDataError
 from carlasc.storage import Sink
-from carlasc.storage.protocol import SequenceWriter
+from carlasc.storage.sinks import SequenceWriter
 
 PLAIN = {"grids": "none", "flow": "none", "workers": 1}
 
@@ -165,7 +165,7 @@ def test_any_sink_will_do(tmp_path):
         (name, frame) for name in ("points", "labels", "flow", "instances") for frame in range(3)
     }
     assert {"poses.txt", "times.txt", "carlasc.json"} == set(kept.texts)
-    with pytest.raises(ArgumentError, match="convert to a folder, then pack it"):
+    with pytest.raises(ArgumentError, match="convert to a folder or a .zarr store"):
         convert("kitti", tmp_path / "in", sink, grids="scans")
 
 

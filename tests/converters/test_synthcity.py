@@ -135,6 +135,7 @@ def test_the_temporary_folder_goes_with_the_frames(table: Path) -> None:
     assert not folder.exists()
 
 
+@pytest.mark.slow
 def test_the_temporary_folder_is_deleted_when_the_process_ends_early(table: Path, tmp_path: Path) -> None:
     code = "import sys; from pathlib import Path; from carlasc_converters.synthcity import SynthCity\n"
     code += "frames = SynthCity(Path(sys.argv[1])).sequences()[0].frames; print(len(frames)); raise KeyboardInterrupt"
