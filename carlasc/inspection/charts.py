@@ -11,7 +11,7 @@ import numpy as np
 
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.inspection.statistics import KINDS, Kind, Statistics
-from carlasc.metrics.scores import Evaluation
+from carlasc.metrics.results import Evaluation
 from carlasc.storage.files import write_atomic
 
 _SUFFIXES = (".png", ".svg", ".pdf")

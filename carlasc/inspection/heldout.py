@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import reduce
@@ -25,7 +24,7 @@ from carlasc.groundtruth.from_scans.others import feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import Plan, Steps
 from carlasc.inspection.heldout_scores import HeldOutScores
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.processes import Engine, count_workers, run_all
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 
@@ -97,7 +96,7 @@ def holdout(
     every: int = EVERY,
     frames: Frames = None,
     workers: int | None = None,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> HoldoutResult:
     """Leave every N-th scan out, make the grids at these frames from the other scans, and follow the rays of the scans through them.
@@ -134,7 +133,7 @@ def holdout(
     tasks = [task for drive in drives for task in drive.tasks(count_workers(workers), executor, steps)]
     scores: dict[str, HeldOutScores] = {}
     failures = []
-    with closing(run_all(_run_task, tasks, workers=workers, executor=executor)) as results:
+    with closing(run_all(_run_task, tasks, workers=workers, executor=executor, lost=_fail)) as results:
         for task, outcome in zip(tasks, results, strict=True):
             if isinstance(outcome, str):
                 failures.append(FrameFailure(task.whole.location, task.frame, outcome))
@@ -174,7 +173,7 @@ class _Drive:
         """Number of scans that the pass that finds the actors reads."""
         return self.feed.reads
 
-    def tasks(self, workers: int, executor: Executor | None, progress: Callable[[int], None]) -> list[_Task]:
+    def tasks(self, workers: int, executor: Engine | None, progress: Callable[[int], None]) -> list[_Task]:
         """Find the actors in the scans that are left, and return a task for each frame to measure."""
         feed, inputs = self.feed, self.inputs
         actors = Actors()
@@ -193,6 +192,11 @@ def _run_task(task: _Task) -> HeldOutScores | str:
         return _measure(task)
     except (CarlascError, OSError) as error:
         return str(error)
+
+
+def _fail(task: _Task, message: str) -> str:
+    """Return the result of a frame that no worker could measure."""
+    return message
 
 
 def _measure(task: _Task) -> HeldOutScores:

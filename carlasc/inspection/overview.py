@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.raw import Capture, find_captures
-from carlasc.errors import CarlascError, MissingDataError
+from carlasc.errors import CarlascError, MissingDataError, without_credentials
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.metadata import Metadata
@@ -156,7 +156,7 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
         sequences = {}
     if not sequences:
         found = tuple(_describe_capture(path, capture) for path, capture in captures.items())
-        return Overview(str(source), "capture", "folder", (), found, None)
+        return Overview(without_credentials(str(source)), "capture", "folder", (), found, None)
     location = Path(opened.location)
     return Overview(
         opened.location,
@@ -169,7 +169,7 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
 
 
 def _captures_in(source: str | os.PathLike[str] | Source) -> dict[str, Capture]:
-    if isinstance(source, Source) or not Path(source).is_dir():
+    if isinstance(source, Source):
         return {}
     try:
         return find_captures(source)

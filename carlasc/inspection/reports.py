@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
@@ -19,7 +18,7 @@ from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_fram
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.processes import Engine, count_workers, run_all
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence, FolderWriter
 from carlasc.storage.protocol import Sequence, Source
@@ -59,7 +58,7 @@ def report(
     holdout: bool = False,
     save: bool = False,
     workers: int | None = None,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ReportResult:
     """Return the report of each grid of a data set: the one that its run left, or one that is made from the files.
@@ -120,7 +119,7 @@ _Measured = FrameFacts | FrameFailure
 def _measure_all(
     makers: list[_Maker],
     workers: int | None,
-    executor: Executor | None,
+    executor: Engine | None,
     progress: Callable[[int, int], None] | None,
 ) -> list[list[_Measured]]:
     """Return what was measured of the frames of each report."""
@@ -129,7 +128,8 @@ def _measure_all(
         maker.find_actors(count_workers(workers), executor, steps)
     tasks = [(row, task) for row, maker in enumerate(makers) for task in maker.tasks()]
     measured: list[list[_Measured]] = [[] for _ in makers]
-    with closing(run_all(_measure, [task for _, task in tasks], workers=workers, executor=executor)) as results:
+    frames = [task for _, task in tasks]
+    with closing(run_all(_measure, frames, workers=workers, executor=executor, lost=_fail)) as results:
         for (row, _), result in zip(tasks, results, strict=True):
             measured[row].append(result)
             steps(1)
@@ -167,7 +167,7 @@ class _Maker:
         """Number of scans of the pass that finds the actors."""
         return 0 if self.inputs is None else self.inputs.steps_before
 
-    def find_actors(self, workers: int, executor: Executor | None, progress: Callable[[int], None]) -> None:
+    def find_actors(self, workers: int, executor: Engine | None, progress: Callable[[int], None]) -> None:
         """Find the actors, if the grid was made with them; the inputs are given up if a scan cannot be read."""
         if self.inputs is None or not self.inputs.feed.needs_actors:
             return
@@ -201,7 +201,7 @@ class _Maker:
         actors = None if self.inputs is None else self.inputs.summaries()
         return Report.make(self.grid, facts, params, classes, documents, actors=actors)
 
-    def held_out(self, workers: int | None, executor: Executor | None) -> Mapping[str, Any] | None:
+    def held_out(self, workers: int | None, executor: Engine | None) -> Mapping[str, Any] | None:
         """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans beside it."""
         spec = self.sequence.grids[self.grid]
         if self.inputs is None or spec.coordinates != "cartesian":
@@ -273,6 +273,11 @@ def _measure(task: _Frame) -> FrameFacts | FrameFailure:
         return FrameFacts.of(number, arrays, grid, spec, classes, changes, residuals)
     except (CarlascError, OSError) as error:
         return FrameFailure(sequence.location, number, str(error))
+
+
+def _fail(task: _Frame, message: str) -> FrameFailure:
+    """Return the result of a frame that no worker could measure."""
+    return FrameFailure(task.sequence.location, task.number, message)
 
 
 def _check_writable(sequence: Sequence, grid: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.processes import Engine, count_workers, run_all
 from carlasc.storage import as_source
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
@@ -158,7 +157,7 @@ def stats(
     remap: str | Remap | None = "auto",
     every: int = 1,
     workers: int | None = 1,
-    executor: Executor | None = None,
+    executor: Engine | None = None,
     progress: Progress | None = None,
 ) -> Statistics:
     """Count the classes of points and of a grid's known voxels, frame by frame.
@@ -193,7 +192,8 @@ def stats(
     total, done = sum(len(frames) for _, _, frames in tasks), 0
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
-    counted = run_all(partial(_count, classes=classes), tasks, workers=count_workers(workers), executor=executor)
+    count, lost = partial(_count, classes=classes), partial(_fail, classes=classes)
+    counted = run_all(count, tasks, workers=count_workers(workers), executor=executor, lost=lost)
     for (sequence, _, frames), (histogram, failed) in zip(tasks, counted, strict=True):
         histograms[sequence.path] += histogram
         failures += failed
@@ -228,6 +228,12 @@ def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str,
         except CarlascError as error:
             failures.append((f"{sequence.path} {field} {frame:06d}", str(error)))
     return histogram, failures
+
+
+def _fail(task: _Task, message: str, classes: ClassTable) -> tuple[Histogram, list[tuple[str, str]]]:
+    """Return the result of frames that no worker could count."""
+    sequence, field, frames = task
+    return Histogram.empty(classes), [(f"{sequence.path} {field} {frame:06d}", message) for frame in frames]
 
 
 def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable) -> Histogram:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
+from carlasc.running.processes import Engine, run_all
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
@@ -37,7 +38,12 @@ Progress = Callable[[int, int], None]
 
 
 def validate(
-    source: str | os.PathLike[str] | Source, *, every: int | None = None, progress: Progress | None = None
+    source: str | os.PathLike[str] | Source,
+    *,
+    every: int | None = None,
+    workers: int | None = 1,
+    executor: Engine | None = None,
+    progress: Progress | None = None,
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and grids.
 
@@ -47,6 +53,8 @@ def validate(
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
         every: read the contents of every N-th frame; 1 reads all, None about forty frames per sequence.
+        workers: number of sequences that are checked in parallel; None for one per core. With an executor: the number of its workers.
+        executor: checks instead of processes of our own; it is not shut down.
         progress: called with (steps done, steps in total).
 
     Returns:
@@ -63,18 +71,22 @@ def validate(
     total, done = sum(plan.steps for plan in plans), 0
     findings: list[Finding] = []
     reports = []
-    for plan in plans:
-        found: list[Finding] = []
-        examination = _examine(plan, found)
-        try:
-            while True:
-                next(examination)
-                done += 1
-                if progress is not None:
-                    progress(done, total)
-        except StopIteration as end:
-            reports.append(end.value)
+
+    def step(steps: int = 1) -> None:
+        nonlocal done
+        done += steps
+        if progress is not None:
+            progress(done, total)
+
+    if executor is None and workers == 1:
+        examined: Iterator[_Examined] = (_examine(plan, step) for plan in plans)
+    else:
+        examined = run_all(_examine, plans, workers=workers, executor=executor, lost=_fail)
+    for plan, (found, report) in zip(plans, examined, strict=True):
         findings += sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+        reports.append(report)
+        if executor is not None or workers != 1:
+            step(plan.steps)
     return ValidationResult(opened.location, tuple(findings), tuple(reports))
 
 
@@ -107,8 +119,18 @@ def _fields(sequence: Sequence) -> list[str]:
         return []
 
 
-def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, SequenceReport]:
-    """Run all checks of a sequence; yields after each step, and adds findings to `found`."""
+_Examined = tuple[list[Finding], SequenceReport]
+
+
+def _fail(plan: _Plan, message: str) -> _Examined:
+    """Return the result of a sequence that no worker could check."""
+    finding = Finding("error", "check", plan.sequence.path, plan.sequence.location, "a check that ends", message, "")
+    return [finding], SequenceReport(plan.sequence.path, len(plan.frames), 0, {}, None)
+
+
+def _examine(plan: _Plan, step: Callable[[], None] = lambda: None) -> _Examined:
+    """Run all checks of a sequence; `step` is called after each of its steps."""
+    found: list[Finding] = []
     sequence = plan.sequence
     found.extend(check_documents(sequence))
     described = _is_described(sequence)
@@ -117,7 +139,7 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
     found.extend(check_times(sequence))
     for frame in plan.opened:
         found.extend(check_shapes(sequence, frame, with_grids=described))
-        yield
+        step()
     evidence: dict[str, GridEvidence] = {}
     below: dict[str, GroundBelow] = {}
     freshness = Freshness(sequence) if described else None
@@ -126,7 +148,7 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
             found.extend(check_values(sequence, frame))
             _measure_grids(sequence, frame, evidence, below)
             freshness.compare(frame)
-        yield
+        step()
     if freshness is not None:
         found.extend(freshness.findings())
     diagnoses = {name: grid.diagnose() for name, grid in evidence.items()}
@@ -136,10 +158,10 @@ def _examine(plan: _Plan, found: list[Finding]) -> Generator[None, None, Sequenc
     poses = _diagnose_poses(sequence)
     if poses is not None:
         found.extend(_judge_poses(sequence, poses))
-    yield
+    step()
     shares = {name: diagnosis.share for name, diagnosis in diagnoses.items() if not math.isnan(diagnosis.share)}
     pose_share = poses.share if poses is not None and poses.pairs else None
-    return SequenceReport(sequence.path, len(plan.frames), len(plan.read), shares, pose_share)
+    return found, SequenceReport(sequence.path, len(plan.frames), len(plan.read), shares, pose_share)
 
 
 def _is_described(sequence: Sequence) -> bool:

@@ -10,8 +10,8 @@ from carlasc.metrics.masks import distance_band, field_of_view, known
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore
 from carlasc.metrics.rays import RayIoU, RayPQ, RayScore, ray_origins
 from carlasc.metrics.regions import Breakdown, distance_bands, height_bands, motion, visibility
+from carlasc.metrics.results import Evaluation, FrameScore, geometric_table, semantic_table
 from carlasc.metrics.sampling import Comparison, Interval, bootstrap, compare
-from carlasc.metrics.scores import Evaluation, FrameScore, geometric_table, semantic_table
 from carlasc.metrics.tables import Table
 from carlasc.metrics.temporal import Consistency, Forecasting, ForecastScore, moved_grid, shape_consistency
 from carlasc.metrics.truth import TruthScore, score_truth

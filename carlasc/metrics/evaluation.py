@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
-from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.grids import Grid, GridSpec
-from carlasc.core.tables import CARLA, table_named
-from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.metrics.confusion import ConfusionMatrix
-from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
-from carlasc.metrics.grids import SequenceGrid
+from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.metrics.conventions import CONVENTIONS, Convention
 from carlasc.metrics.pairs import Pair, Place, pair_grids
-from carlasc.metrics.rays import RayIoU, ray_origins
-from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_bands, motion, visibility
-from carlasc.metrics.scores import Evaluation, FrameScore
+from carlasc.metrics.results import Evaluation
+from carlasc.metrics.scorer import LabelPair, Options, Region, Scorer, Voxels
+from carlasc.running.processes import Engine, run_all
 
-Region = Callable[[GridSpec], NDArray[np.bool_]]
-Voxels = Literal["known", "all"]
-BREAKDOWNS = ("distance", "height", "visibility", "motion")
-_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
+_TOGETHER = 8  # frames that a worker scores in one task
 
 
 def evaluate(
@@ -42,6 +32,8 @@ def evaluate(
     rays: bool = False,
     frames: Frames = None,
     name: str | None = None,
+    workers: int | None = 1,
+    executor: Engine | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Score predicted grids against the ground truth, one frame in memory at a time.
@@ -63,6 +55,8 @@ def evaluate(
         rays: also compute RayIoU; this needs poses and a Cartesian grid.
         frames: the frames that are scored; None scores all frames of the ground truth.
         name: name of the predictions in tables.
+        workers: number of processes that score; None for one per core. `region` must then be a function that can be pickled.
+        executor: scores instead of processes of our own; it is not shut down.
         progress: called with (frames done, frames in total).
 
     Returns:
@@ -75,7 +69,7 @@ def evaluate(
     """
     (result,) = _score_all(
         [convention], source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
-        progress=progress, options=_Options(voxels, region, tuple(by), rays),
+        workers=workers, executor=executor, progress=progress, options=Options(voxels, region, tuple(by), rays),
     )  # fmt: skip
     if isinstance(result, CarlascError):
         raise result
@@ -91,6 +85,8 @@ def evaluate_by_all_conventions(
     source_classes: str | None = None,
     frames: Frames = None,
     name: str | None = None,
+    workers: int | None = 1,
+    executor: Engine | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Mapping[str, Evaluation | CarlascError]:
     """Score predictions by every convention. Each frame is read once.
@@ -103,6 +99,8 @@ def evaluate_by_all_conventions(
         source_classes: as for `evaluate`.
         frames: as for `evaluate`.
         name: as for `evaluate`.
+        workers: as for `evaluate`.
+        executor: as for `evaluate`.
         progress: as for `evaluate`.
 
     Returns:
@@ -110,25 +108,9 @@ def evaluate_by_all_conventions(
     """
     results = _score_all(
         list(CONVENTIONS), source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
-        progress=progress, options=_Options(),
+        workers=workers, executor=executor, progress=progress, options=Options(),
     )  # fmt: skip
     return dict(zip(CONVENTIONS, results, strict=True))
-
-
-@dataclass(frozen=True)
-class _Options:
-    """What is scored of each frame."""
-
-    voxels: Voxels = "known"
-    region: Region | None = None
-    by: tuple[str, ...] = ()
-    rays: bool = False
-
-    def __post_init__(self) -> None:
-        if self.voxels not in ("known", "all"):
-            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
-        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
-            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
 
 
 def _score_all(
@@ -141,8 +123,10 @@ def _score_all(
     source_classes: str | None,
     frames: Frames,
     name: str | None,
+    workers: int | None,
+    executor: Engine | None,
     progress: Callable[[int, int], None] | None,
-    options: _Options,
+    options: Options,
 ) -> list[Evaluation | CarlascError]:
     """Read each frame once and score it by each convention."""
     chosen = FrameRange.of(frames)
@@ -154,27 +138,57 @@ def _score_all(
             pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
         )
     label = name or getattr(source, "location", None) or str(source)
-    scorers = [_Scorer(convention, pairs, source_classes, options) for convention in conventions]
-    done = 0
-    for pair, numbers in jobs:
-        predicted = set(pair.prediction.frames().tolist())
-        for frame in numbers.tolist():
-            content: tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]] | CarlascError
-            try:
-                content = _read(pair, frame, predicted)
-            except CarlascError as error:
-                content = error
-            for scorer in scorers:
-                scorer.add(pair, frame, content)
-            done += 1
-            if progress:
-                progress(done, total)
+    scorers = [Scorer(convention, pairs, source_classes, options) for convention in conventions]
+    size = 1 if executor is None and workers == 1 else _TOGETHER
+    tasks = [
+        _Task(pair, tuple(numbers[first : first + size].tolist()))
+        for pair, numbers in jobs
+        for first in range(0, len(numbers), size)
+    ]
+    score, fail = partial(_score_task, scorers=scorers), partial(_fail_task, scorers=scorers)
+    steps, done = progress or (lambda done, total: None), 0
+    with closing(run_all(score, tasks, workers=workers, executor=executor, lost=fail)) as results:
+        for task, parts in zip(tasks, results, strict=True):
+            for scorer, part in zip(scorers, parts, strict=True):
+                scorer.merge(part)
+            done += len(task.frames)
+            steps(done, total)
     return [scorer.result(label, notes) for scorer in scorers]
 
 
-def _read(
-    pair: Pair, frame: int, predicted: set[int]
-) -> tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]:
+@dataclass(frozen=True)
+class _Task:
+    """Some frames to score. It pickles into a worker."""
+
+    pair: Pair
+    frames: tuple[int, ...]
+
+
+def _score_task(task: _Task, scorers: Sequence[Scorer]) -> list[Scorer]:
+    """Read frames and score them, in a worker: return what there is to add to each scorer."""
+    parts = [scorer.empty() for scorer in scorers]
+    predicted = set(task.pair.prediction.frames().tolist())
+    for frame in task.frames:
+        content: LabelPair | CarlascError
+        try:
+            content = _read(task.pair, frame, predicted)
+        except CarlascError as error:
+            content = error
+        for part in parts:
+            part.add(task.pair, frame, content)
+    return parts
+
+
+def _fail_task(task: _Task, message: str, scorers: Sequence[Scorer]) -> list[Scorer]:
+    """Return what there is to add for frames that no worker could score."""
+    parts = [scorer.empty() for scorer in scorers]
+    for frame in task.frames:
+        for part in parts:
+            part.add(task.pair, frame, CarlascError("", problem=message))
+    return parts
+
+
+def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
     """Return a frame's predicted and true labels, of one shape."""
     if frame not in predicted:
         raise MissingDataError(
@@ -185,180 +199,3 @@ def _read(
         where = f"{pair.prediction.location}: frame {pair.truth.name_of(frame)}"
         raise FormatError(where, expected=f"the truth's shape {truth.shape}", found=str(prediction.shape))
     return prediction.reshape(truth.shape), truth
-
-
-class _Scorer:
-    """Adds up the frames of all sequences by one convention."""
-
-    def __init__(
-        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, options: _Options
-    ) -> None:
-        self.options = options
-        self.impossible: CarlascError | None = None
-        self.convention = _resolve(convention, pairs)
-        given = None if source_classes is None else table_named(source_classes)
-        self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
-        self.matrices: dict[str, ConfusionMatrix] = {}
-        self.failures: list[tuple[str, str]] = []
-        self.frames: list[FrameScore] = []
-        self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
-        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if options.rays else None
-        try:
-            for pair in pairs:
-                self.tables[pair.truth.path] = self._check(pair, given)
-                self.matrices[pair.truth.path] = self._matrix()
-        except CarlascError as error:
-            self.impossible = error
-
-    def add(
-        self,
-        pair: Pair,
-        frame: int,
-        content: tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]] | CarlascError,
-    ) -> None:
-        """Score a frame, or record the reason why it cannot be scored."""
-        if self.impossible is not None:
-            return
-        path, frame_name = pair.truth.path, pair.truth.name_of(frame)
-        try:
-            if isinstance(content, CarlascError):
-                raise content
-            matrix = self._score(pair, frame, *content)
-        except ArgumentError:
-            raise  # the error is the same in every frame
-        except CarlascError as error:
-            self.failures.append((f"{path}:{frame_name}", str(error)))
-            return
-        self.matrices[path] += matrix
-        self.frames.append(FrameScore(path, frame_name, self.convention.score(matrix)))
-
-    def result(self, name: str, notes: tuple[str, ...]) -> Evaluation | CarlascError:
-        """Return the scores of all frames that were added, or the error that prevented them."""
-        if self.impossible is not None:
-            return self.impossible
-        summed = sum(self.matrices.values(), self._matrix())
-        return Evaluation(
-            name, self.convention, summed, self.matrices, len(self.frames), self.options.voxels, self.failures, tuple(self.frames), notes,
-            self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
-        )  # fmt: skip
-
-    def _matrix(self) -> ConfusionMatrix:
-        return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
-
-    def _check(self, pair: Pair, given: ClassTable | None) -> tuple[ClassTable, ClassTable]:
-        """Return the class tables of a pair's sides, after checking that the convention can score them."""
-        truth = pair.truth.classes or self.convention.usual_truth
-        prediction = given or pair.prediction.classes or self.convention.usual_prediction
-        self.convention.check(truth, pair.truth.location)
-        self.convention.check(prediction, pair.prediction.location)
-        if self.convention.seen_by == "camera" and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
-            raise MissingDataError(
-                pair.truth.location,
-                expected="which voxels a camera observed",
-                found="data without cameras",
-                advice=f"score by another convention than {self.convention.name}",
-            )
-        true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
-        if true_spec and predicted_spec and true_spec != predicted_spec:
-            raise FormatError(
-                pair.prediction.location,
-                expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
-                found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
-            )
-        for argument, asked in (("region", self.options.region), ("by", self.options.by), ("rays", self.options.rays)):
-            if asked and _spec_of(pair) is None:
-                raise ArgumentError(
-                    argument,
-                    expected="None for grids without geometry",
-                    found="a region" if argument == "region" else str(asked),
-                    advice=f"add params.json to {pair.truth.location}",
-                )
-        if (self.options.rays or "motion" in self.options.by) and not isinstance(pair.truth, SequenceGrid):
-            raise ArgumentError(
-                "rays" if self.options.rays else "by",
-                expected="a data set with poses and scans as the truth",
-                found="files of grids",
-            )
-        return prediction, truth
-
-    def _score(
-        self, pair: Pair, frame: int, prediction: NDArray[np.unsignedinteger], truth: NDArray[np.unsignedinteger]
-    ) -> ConfusionMatrix:
-        tables = self.tables[pair.truth.path]
-        known, spec = self._known(pair, frame, truth.shape), _spec_of(pair)
-        region = None
-        if self.options.region is not None and spec is not None:
-            region = self.options.region(spec).reshape(truth.shape)
-        try:
-            matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
-            if (self.options.by or self.rays is not None) and spec is not None:
-                pred, true, counted = self.convention.prepare(
-                    (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
-                )
-                for masks in self._masks(pair, frame, spec, true, known, tables[1]):
-                    self.breakdown.update(pred, true, masks, counted)
-                if self.rays is not None and isinstance(pair.truth, SequenceGrid):
-                    self.rays.update(pred, true, spec, _origins(pair.truth, frame, spec))
-        except FormatError as error:  # the message must name the side
-            side = pair.prediction if error.where == "prediction" else pair.truth
-            raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
-        return matrix
-
-    def _known(self, pair: Pair, frame: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-        """Return which voxels the truth evaluated; None: all of them."""
-        if self.options.voxels == "all":
-            return None
-        known = pair.truth.known(frame, self.convention.seen_by)
-        if known is not None:
-            return known.reshape(shape)
-        if self.convention.unknown == "left out":
-            raise MissingDataError(
-                f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
-                expected="counts or a mask, which say what is known",
-                found="none",
-                advice="give `voxels=all` to score all voxels",
-            )
-        return None
-
-    def _masks(
-        self,
-        pair: Pair,
-        frame: int,
-        spec: GridSpec,
-        truth: NDArray[np.unsignedinteger],
-        known: NDArray[np.bool_] | None,
-        table: ClassTable,
-    ) -> Iterator[Masks]:
-        """Yield the masks of each breakdown that was asked for."""
-        counts = None if known is None else known.astype(np.float32).reshape(spec.size)
-        if "distance" in self.options.by:
-            yield distance_bands(spec, _DISTANCES_M)
-        if "height" in self.options.by:
-            yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
-        if "visibility" in self.options.by:
-            yield visibility(Grid(spec, truth, counts), free=self.convention.free)
-        if "motion" in self.options.by and isinstance(pair.truth, SequenceGrid):
-            labels = pair.truth.labels(frame).reshape(spec.size)
-            yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))
-
-
-def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Convention:
-    if isinstance(convention, Convention):
-        return convention
-    tables = [side.classes for pair in pairs for side in (pair.truth, pair.prediction) if side.classes is not None]
-    table = tables[0] if tables else CARLA
-    if convention is None:
-        usual = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
-        convention = pairs[0].truth.benchmark or usual
-    return own_convention(table) if convention == "own" else convention_named(convention)
-
-
-def _spec_of(pair: Pair) -> GridSpec | None:
-    return pair.truth.spec or pair.prediction.spec
-
-
-def _origins(truth: SequenceGrid, frame: int, spec: GridSpec) -> NDArray[np.float64]:
-    """Return the origins of the rays of a frame: the positions of the sensor in the frames that have a true grid."""
-    numbers = truth.frames().tolist()
-    poses = np.stack([truth.sequence.read_pose(number) for number in numbers])
-    return ray_origins(poses, numbers.index(frame), spec)

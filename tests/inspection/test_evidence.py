@@ -33,7 +33,7 @@ def writer(tmp_path):
 
 
 def findings(check, writer, *arguments):
-    (sequence,) = FolderSource(writer.folder.parent).sequences().values()
+    (sequence,) = FolderSource(writer.target.folder.parent).sequences().values()
     return [(f.severity, f.check, str(f)) for f in check(sequence, *arguments)]
 
 
@@ -75,5 +75,5 @@ def test_a_frame_without_one_of_the_fields_is_an_error_where_others_have_it(writ
 
 
 def test_info_names_the_fields(writer):
-    (sequence,) = carlasc.info(writer.folder.parent).sequences
+    (sequence,) = carlasc.info(writer.target.folder.parent).sequences
     assert sequence.grids[0].parts == ("labels", "counts", "occupied", "classes", "flags", "views")

@@ -94,6 +94,7 @@ def test_poses_of_other_frames_are_told(winding, late):
     assert misfit == Misfit(late_frames=late)
 
 
+@pytest.mark.slow
 def test_a_straight_drive_shows_no_lever_arm():
     class Straight(Winding):
         bends = False

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
-from carlasc.running.processes import run_all
+from carlasc.running.processes import Engine, run_all
 from carlasc.viewing.colors import merge_legends
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.rendering.cameras import Viewpoint
@@ -69,6 +69,7 @@ def render(
     still: bool = False,
     fps: float | None = None,
     workers: int | None = 1,
+    executor: Engine | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RenderResult:
@@ -90,7 +91,8 @@ def render(
         orbit: whether the camera circles the scene once: while the frames follow each other, or around a single frame.
         still: whether the camera stays in one place of the world while the vehicle drives; needs poses.
         fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
-        workers: number of processes; None takes all cores.
+        workers: number of processes; None takes all cores. With an executor: the number of its workers.
+        executor: draws instead of processes of our own; it is not shut down.
         overwrite: whether an existing file is replaced.
         progress: called with (pictures done, pictures in all).
 
@@ -124,7 +126,7 @@ def render(
     tasks = _plan(renderer, viewpoint or Viewpoint())
     if fps is None:
         fps = _ORBIT_FPS if orbit and len(reader.frames) == 1 else _DRIVE_FPS
-    with closing(run_all(_render_task, tasks, workers=workers)) as pictures:
+    with closing(run_all(_render_task, tasks, workers=workers, executor=executor)) as pictures:
         write_pictures(target, _reported(pictures, len(tasks), progress), fps)
     notes = list(reader.notes)
     if len(tasks) == 1:

@@ -1,0 +1,238 @@
+"""Adding up the scores of frames by one convention."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLA, table_named
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
+from carlasc.metrics.grids import SequenceGrid
+from carlasc.metrics.pairs import Pair
+from carlasc.metrics.rays import RayIoU, ray_origins
+from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_bands, motion, visibility
+from carlasc.metrics.results import Evaluation, FrameScore
+
+Region = Callable[[GridSpec], NDArray[np.bool_]]
+Voxels = Literal["known", "all"]
+LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]  # of a prediction and of the truth
+BREAKDOWNS = ("distance", "height", "visibility", "motion")
+_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is scored of each frame."""
+
+    voxels: Voxels = "known"
+    region: Region | None = None
+    by: tuple[str, ...] = ()
+    rays: bool = False
+
+    def __post_init__(self) -> None:
+        if self.voxels not in ("known", "all"):
+            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
+        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
+            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
+
+
+class Scorer:
+    """Adds up the frames of all sequences by one convention."""
+
+    def __init__(
+        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, options: Options
+    ) -> None:
+        self.options = options
+        self.impossible: CarlascError | None = None
+        self.convention = _resolve(convention, pairs)
+        given = None if source_classes is None else table_named(source_classes)
+        self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
+        self.matrices: dict[str, ConfusionMatrix] = {}
+        self.failures: list[tuple[str, str]] = []
+        self.frames: list[FrameScore] = []
+        self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
+        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if options.rays else None
+        try:
+            for pair in pairs:
+                self.tables[pair.truth.path] = self._check(pair, given)
+                self.matrices[pair.truth.path] = self._matrix()
+        except CarlascError as error:
+            self.impossible = error
+
+    def empty(self) -> Scorer:
+        """Return a scorer by the same rules to which nothing was added."""
+        other = copy(self)
+        other.matrices = {path: self._matrix() for path in self.matrices}
+        other.failures, other.frames = [], []
+        other.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
+        other.rays = copy(self.rays)
+        if other.rays is not None:
+            other.rays.reset()
+        return other
+
+    def merge(self, other: Scorer) -> None:
+        """Add what another scorer by the same rules has added up."""
+        for path, matrix in other.matrices.items():
+            self.matrices[path] += matrix
+        self.failures += other.failures
+        self.frames += other.frames
+        self.breakdown.merge(other.breakdown)
+        if self.rays is not None and other.rays is not None:
+            self.rays.merge(other.rays)
+
+    def add(self, pair: Pair, frame: int, content: LabelPair | CarlascError) -> None:
+        """Score a frame, or record the reason why it cannot be scored."""
+        if self.impossible is not None:
+            return
+        path, frame_name = pair.truth.path, pair.truth.name_of(frame)
+        try:
+            if isinstance(content, CarlascError):
+                raise content
+            matrix = self._score(pair, frame, *content)
+        except ArgumentError:
+            raise  # the error is the same in every frame
+        except CarlascError as error:
+            self.failures.append((f"{path}:{frame_name}", str(error)))
+            return
+        self.matrices[path] += matrix
+        self.frames.append(FrameScore(path, frame_name, self.convention.score(matrix)))
+
+    def result(self, name: str, notes: tuple[str, ...]) -> Evaluation | CarlascError:
+        """Return the scores of all frames that were added, or the error that prevented them."""
+        if self.impossible is not None:
+            return self.impossible
+        summed = sum(self.matrices.values(), self._matrix())
+        return Evaluation(
+            name, self.convention, summed, self.matrices, len(self.frames), self.options.voxels, self.failures, tuple(self.frames), notes,
+            self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
+        )  # fmt: skip
+
+    def _matrix(self) -> ConfusionMatrix:
+        return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
+
+    def _check(self, pair: Pair, given: ClassTable | None) -> tuple[ClassTable, ClassTable]:
+        """Return the class tables of a pair's sides, after checking that the convention can score them."""
+        truth = pair.truth.classes or self.convention.usual_truth
+        prediction = given or pair.prediction.classes or self.convention.usual_prediction
+        self.convention.check(truth, pair.truth.location)
+        self.convention.check(prediction, pair.prediction.location)
+        if self.convention.seen_by == "camera" and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
+            raise MissingDataError(
+                pair.truth.location,
+                expected="which voxels a camera observed",
+                found="data without cameras",
+                advice=f"score by another convention than {self.convention.name}",
+            )
+        true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
+        if true_spec and predicted_spec and true_spec != predicted_spec:
+            raise FormatError(
+                pair.prediction.location,
+                expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
+                found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
+            )
+        for argument, asked in (("region", self.options.region), ("by", self.options.by), ("rays", self.options.rays)):
+            if asked and _spec_of(pair) is None:
+                raise ArgumentError(
+                    argument,
+                    expected="None for grids without geometry",
+                    found="a region" if argument == "region" else str(asked),
+                    advice=f"add params.json to {pair.truth.location}",
+                )
+        if (self.options.rays or "motion" in self.options.by) and not isinstance(pair.truth, SequenceGrid):
+            raise ArgumentError(
+                "rays" if self.options.rays else "by",
+                expected="a data set with poses and scans as the truth",
+                found="files of grids",
+            )
+        return prediction, truth
+
+    def _score(
+        self, pair: Pair, frame: int, prediction: NDArray[np.unsignedinteger], truth: NDArray[np.unsignedinteger]
+    ) -> ConfusionMatrix:
+        tables = self.tables[pair.truth.path]
+        known, spec = self._known(pair, frame, truth.shape), _spec_of(pair)
+        region = None
+        if self.options.region is not None and spec is not None:
+            region = self.options.region(spec).reshape(truth.shape)
+        try:
+            matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
+            if (self.options.by or self.rays is not None) and spec is not None:
+                pred, true, counted = self.convention.prepare(
+                    (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
+                )
+                for masks in self._masks(pair, frame, spec, true, known, tables[1]):
+                    self.breakdown.update(pred, true, masks, counted)
+                if self.rays is not None and isinstance(pair.truth, SequenceGrid):
+                    self.rays.update(pred, true, spec, _origins(pair.truth, frame, spec))
+        except FormatError as error:  # the message must name the side
+            side = pair.prediction if error.where == "prediction" else pair.truth
+            raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
+        return matrix
+
+    def _known(self, pair: Pair, frame: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """Return which voxels the truth evaluated; None: all of them."""
+        if self.options.voxels == "all":
+            return None
+        known = pair.truth.known(frame, self.convention.seen_by)
+        if known is not None:
+            return known.reshape(shape)
+        if self.convention.unknown == "left out":
+            raise MissingDataError(
+                f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
+                expected="counts or a mask, which say what is known",
+                found="none",
+                advice="give `voxels=all` to score all voxels",
+            )
+        return None
+
+    def _masks(
+        self,
+        pair: Pair,
+        frame: int,
+        spec: GridSpec,
+        truth: NDArray[np.unsignedinteger],
+        known: NDArray[np.bool_] | None,
+        table: ClassTable,
+    ) -> Iterator[Masks]:
+        """Yield the masks of each breakdown that was asked for."""
+        counts = None if known is None else known.astype(np.float32).reshape(spec.size)
+        if "distance" in self.options.by:
+            yield distance_bands(spec, _DISTANCES_M)
+        if "height" in self.options.by:
+            yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
+        if "visibility" in self.options.by:
+            yield visibility(Grid(spec, truth, counts), free=self.convention.free)
+        if "motion" in self.options.by and isinstance(pair.truth, SequenceGrid):
+            labels = pair.truth.labels(frame).reshape(spec.size)
+            yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))
+
+
+def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Convention:
+    if isinstance(convention, Convention):
+        return convention
+    tables = [side.classes for pair in pairs for side in (pair.truth, pair.prediction) if side.classes is not None]
+    table = tables[0] if tables else CARLA
+    if convention is None:
+        usual = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
+        convention = pairs[0].truth.benchmark or usual
+    return own_convention(table) if convention == "own" else convention_named(convention)
+
+
+def _spec_of(pair: Pair) -> GridSpec | None:
+    return pair.truth.spec or pair.prediction.spec
+
+
+def _origins(truth: SequenceGrid, frame: int, spec: GridSpec) -> NDArray[np.float64]:
+    """Return the origins of the rays of a frame: the positions of the sensor in the frames that have a true grid."""
+    numbers = truth.frames().tolist()
+    poses = np.stack([truth.sequence.read_pose(number) for number in numbers])
+    return ray_origins(poses, numbers.index(frame), spec)
