@@ -31,15 +31,28 @@ from carlasc.dataset.selection import (
 from carlasc.dataset.transforms import Sample
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, import_extra
 from carlasc.storage import Sequence, Source, as_source, layout
+from carlasc.storage.caching import CachedTree
 from carlasc.storage.metadata import Axes
 
-FIELDS = ("occupancy", "density", "labels", "known", "counts", "points", "point_labels", "flow", "remission", "poses")
+FIELDS = (
+    "occupancy",
+    "density",
+    "visibility",
+    "labels",
+    "known",
+    "counts",
+    "points",
+    "point_labels",
+    "flow",
+    "remission",
+    "poses",
+)
 """Fields that samples of published data may have."""
 EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
 """Fields of grids that say how certain each voxel is, which published grids do not."""
 ALWAYS = ("valid", "sequence", "frame")
 RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
-_STACKS = frozenset({"occupancy", "density"})
+_STACKS = frozenset({"occupancy", "density", "visibility"})
 _OF_SCAN = {
     "points": "points",
     "point_labels": "labels",
@@ -62,6 +75,7 @@ class Dataset(_MapStyle):
 
         occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the frame's own scan last
         density       (T, X, Y, Z) uint16, number of points per voxel
+        visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed, 0 where it saw nothing
         labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also unknown
         known         (X, Y, Z) bool, voxels that have a vote: leave the others out of losses and metrics
         counts        (X, Y, Z) float32, number of votes per voxel
@@ -209,6 +223,30 @@ class Dataset(_MapStyle):
         sample = {name: sample[name] for name in (*self.fields, *ALWAYS)}
         return sample if self.transform is None else self.transform(sample)
 
+    @property
+    def frames(self) -> tuple[NDArray[np.int64], ...]:
+        """Numbers of the frames of each of `sequences`: samples are in this order."""
+        return tuple(part.frames for part in self._parts)
+
+    @property
+    def is_cached(self) -> bool:
+        """Whether some of the data are remote, and were opened with a cache."""
+        return any(isinstance(sequence.tree, CachedTree) for part in self._parts for sequence, _ in part.fields)
+
+    def cached_files(self, indices: Iterable[int]) -> list[tuple[CachedTree, str]]:
+        """Return the files that samples are read from, each once, where they are read through a cache."""
+        frames: dict[Part, list[int]] = {}
+        for index in indices:
+            part, frame = self._frame_at(index)
+            frames.setdefault(part, []).append(frame)
+        files: dict[tuple[CachedTree, str], None] = {}
+        for part, numbers in frames.items():
+            for sequence, field in part.fields:
+                if isinstance(tree := sequence.tree, CachedTree):
+                    read = part.with_history(numbers, self.history) if field == "points" else numbers
+                    files |= dict.fromkeys((tree, path) for path in sequence.files_of(field, read))
+        return list(files)
+
     def index_of(self, sequence: str, frame: int) -> int:
         """Return the index of the sample of a sequence's frame.
 
@@ -247,7 +285,9 @@ class Dataset(_MapStyle):
         if grids is not None:
             parts = self._grid_fields.parts(grids, grid)
             wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
-        part = Part(scans, grids, grid, common_frames(wanted), frozenset(scans.frames("points").tolist()))
+        part = Part(
+            scans, grids, grid, common_frames(wanted), frozenset(scans.frames("points").tolist()), tuple(wanted)
+        )
         if self._needs_poses:
             part.check_poses()
         return part
@@ -287,12 +327,20 @@ class Dataset(_MapStyle):
         moves = poses if self.align and poses is not None else np.tile(np.eye(4), (self.history, 1, 1))
         scans = self._recent.read(part.scans, past)
         ranges = (part.scans.metadata.min_range_m, part.scans.metadata.max_range_m)
-        if "density" not in self.fields:
-            return {"occupancy": stack_scans(scans, moves, spec, "occupancy", *ranges)}
-        density = stack_scans(scans, moves, spec, "density", *ranges)
-        return {"density": density} | (
-            {"occupancy": (density > 0).view(np.uint8)} if "occupancy" in self.fields else {}
-        )
+        stacks: Sample = {}
+        if "density" in self.fields:
+            stacks["density"] = stack_scans(scans, moves, spec, "density", *ranges)
+        if "visibility" in self.fields:
+            from carlasc.dataset.visibility import stack_visibility
+
+            stacks["visibility"] = stack_visibility(scans, moves, spec, *ranges)
+        if "occupancy" in self.fields:
+            stacks["occupancy"] = (
+                (stacks["density"] > 0).view(np.uint8)
+                if "density" in stacks
+                else stack_scans(scans, moves, spec, "occupancy", *ranges)
+            )
+        return stacks
 
     def _scan(self, part: Part, frame: int) -> Sample:
         sample: Sample = {}

@@ -32,6 +32,7 @@ class Part:
         grid: name of the grid in `grids`.
         frames: numbers of the frames that are samples, increasing.
         scanned: numbers of the frames that have a scan.
+        fields: the fields that samples are read from, each with its sequence.
     """
 
     scans: Sequence
@@ -39,6 +40,7 @@ class Part:
     grid: str
     frames: NDArray[np.int64]
     scanned: frozenset[int]
+    fields: tuple[tuple[Sequence, str], ...]
 
     def history(self, frame: int, length: int) -> list[int | None]:
         """Return the frame numbers of a stack, oldest first; None before the start of the sequence and before a gap."""
@@ -48,6 +50,10 @@ class Part:
                 break
             past[length - 1 - back] = frame - back
         return past
+
+    def with_history(self, frames: Iterable[int], length: int) -> list[int]:
+        """Return the frames whose scans are in the stacks of some frames, in rising order."""
+        return sorted({past for frame in frames for past in self.history(frame, length) if past is not None})
 
     def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
         """Return (T, 4, 4) transforms from past sensor frames to that of `frame`; the identity for `frame` itself and for None."""

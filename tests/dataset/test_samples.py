@@ -58,6 +58,7 @@ def test_every_field_has_the_documented_shape_and_type(world):
     assert found == {
         "occupancy": ("uint8", (3, 16, 16, 4)),
         "density": ("uint16", (3, 16, 16, 4)),
+        "visibility": ("uint8", (3, 16, 16, 4)),
         "labels": ("uint8", (16, 16, 4)),
         "known": ("bool", (16, 16, 4)),
         "counts": ("float32", (16, 16, 4)),

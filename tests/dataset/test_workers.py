@@ -48,6 +48,7 @@ def test_default_collate_takes_every_dense_field_as_it_is(world):
     assert {name: value.dtype for name, value in batch.items() if isinstance(value, torch.Tensor)} == {
         "occupancy": torch.uint8,
         "density": torch.uint16,
+        "visibility": torch.uint8,
         "labels": torch.uint8,
         "known": torch.bool,
         "counts": torch.float32,
@@ -103,7 +104,7 @@ def test_distributed_ranks_share_the_samples(world):
     assert len(seen) == len(set(seen)) == len(dataset)
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_seeded_flips_are_those_of_one_process_and_follow_the_epoch_into_persistent_workers(world, method):
     dataset = Dataset(world, history=2, fields=(*DENSE, "points", "flow"))
     dataset.transform = transform = Flip(dataset.spec, seed=5)

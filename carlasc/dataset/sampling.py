@@ -1,0 +1,200 @@
+"""The order in which training reads a data set: shards in random order, and frames at random within a window of shards.
+
+Frames that are stored together are read at about the same time, so that files of an object store are fetched once, ahead of their use.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.dataset.reading_ahead import ReadAhead
+from carlasc.dataset.samples import Dataset
+from carlasc.errors import ArgumentError
+
+_STORED_TOGETHER = 16  # frames of a file in packed zarr stores
+_READ_AGAIN = 4  # a shard is at least so many times as long as what is read before it for the histories
+
+if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
+    from torch.utils.data import Sampler as TorchSampler
+
+    _Sampler = TorchSampler[int]
+else:
+    _Sampler = object
+
+
+class ShardSampler(_Sampler):
+    """Gives the indices of a Dataset's samples in random order, as the `sampler` of a torch DataLoader.
+
+    A shard is a run of consecutive frames of one sequence. Shards are put in random order, and each frame moves to a random place among
+    those of the next `window` shards, so that frames of at most `window` shards are mixed at any time. The order depends only on the
+    data, the seed and the epoch, and on `shard` and `window`: not on the number of processes, and not on that of a loader's workers.
+    Process r of n takes every n-th sample, beginning with the r-th: with batches of B / n samples in each process, step s uses the same B
+    samples whatever n is. If n does not divide the number of samples, the first of them are given twice, so that all processes make
+    equally many steps (as torch's DistributedSampler does).
+
+    If the data are opened with a cache (`carlasc.open(url, cache=folder)`), a thread fetches the files of the next shards into it while
+    an epoch is iterated. It ends with the iteration.
+
+        dataset = Dataset(carlasc.open("s3://bucket/carlasc.zarr", cache="/scratch/cache"), "train", history=16)
+        sampler = ShardSampler(dataset, seed=0)
+        loader = torch.utils.data.DataLoader(dataset, batch_size=4, sampler=sampler, num_workers=2)
+        for epoch in range(epochs):
+            sampler.set_epoch(epoch)
+            for batch in loader: ...
+
+    Attributes:
+        seed: seed of the order.
+        epoch: the epoch that is iterated now or next.
+        shard: number of frames of a shard.
+        window: number of shards whose frames are mixed.
+        rank: number of this process.
+        world: number of processes.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        *,
+        seed: int = 0,
+        shard: int | None = None,
+        window: int = 8,
+        rank: int = 0,
+        world: int = 1,
+        read_ahead: int = 2,
+    ) -> None:
+        """Number the shards. Nothing is read.
+
+        Args:
+            dataset: the samples. A sampler of a part of them is made by a Dataset of this part.
+            seed: 0 or more.
+            shard: number of frames of a shard, a multiple of 16 where files of a store hold 16 frames. None takes 16 if samples have
+                one scan; else 64 or more, because each shard also needs the frames before it for the histories of its first samples.
+            window: number of shards whose frames are mixed: more mix better, and need a larger cache.
+            rank: number of this process, from 0.
+            world: number of processes that train together.
+            read_ahead: number of shards that are fetched before their first sample is drawn; 0 fetches none.
+
+        Raises:
+            ArgumentError: an argument has a wrong value.
+        """
+        least = {"seed": 0, "shard": 1, "window": 1, "rank": 0, "world": 1, "read_ahead": 0}
+        given = {"seed": seed, "shard": shard, "window": window, "rank": rank, "world": world, "read_ahead": read_ahead}
+        for name, value in given.items():
+            if value is not None and value < least[name]:
+                raise ArgumentError(name, expected=f"{least[name]} or more", found=str(value))
+        if rank >= world:
+            raise ArgumentError("rank", expected=f"0 to {world - 1}, for {world} processes", found=str(rank))
+        self.dataset = dataset
+        self.seed = seed
+        self.epoch = 0
+        self.shard = _default_shard(dataset.history) if shard is None else shard
+        self.window = window
+        self.rank = rank
+        self.world = world
+        self.read_ahead = read_ahead
+        self._shards = _number_shards(dataset, self.shard)
+        self._next = 0  # the sample that the next iteration begins with
+        self._begun = 0  # that which the current one began with
+        self._drawn = 0  # samples drawn so far, by all processes
+
+    def __len__(self) -> int:
+        """Return the number of samples that this process takes of a whole epoch."""
+        return math.ceil(len(self._shards) / self.world)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch that is iterated next. After `load_state_dict`, its epoch goes on where it was left."""
+        if epoch != self.epoch:
+            self._next = self._begun = self._drawn = 0
+        self.epoch = epoch
+
+    def order(self, epoch: int) -> NDArray[np.int64]:
+        """Return the indices of all samples, for all processes together, in the order of an epoch."""
+        drawn = np.random.default_rng([self.seed, epoch])
+        place = np.argsort(np.argsort(drawn.random(int(self._shards[-1]) + 1), kind="stable"), kind="stable")
+        return np.argsort(place[self._shards] + self.window * drawn.random(len(self._shards)), kind="stable")
+
+    def __iter__(self) -> Iterator[int]:
+        """Iterate over an epoch, or over what is left of it after `load_state_dict`."""
+        epoch, start = self.epoch, self._next
+        self._next = self._begun = self._drawn = 0
+        if start == len(
+            self._shards
+        ):  # the state of a finished epoch was loaded: nothing is left, and the next one follows
+            self.epoch += 1
+        else:
+            self._begun = self._drawn = start
+        return self._iterate(epoch, start)
+
+    def _iterate(self, epoch: int, start: int) -> Iterator[int]:
+        order = self.order(epoch)
+        left = order[start:]
+        mine = np.resize(left, -(-len(left) // self.world) * self.world)[self.rank :: self.world]
+        with ReadAhead(self.dataset, order, self._shards, start, self.read_ahead) as ahead:
+            for count, index in enumerate(mine.tolist(), 1):
+                self._drawn = min(start + count * self.world, len(order))
+                ahead.draw(self._drawn)
+                yield index
+
+    def state_dict(self, trained: int | None = None) -> dict[str, int]:
+        """Return the position in the epoch, to be loaded by a sampler of the same data in any number of processes.
+
+        A DataLoader with workers draws samples before they are trained on. Say how many were trained on:
+
+            for step, batch in enumerate(loader):
+                ...
+                torch.save({"sampler": sampler.state_dict(trained=(step + 1) * batch_size), ...}, path)
+
+        Args:
+            trained: number of samples that were trained on since the iteration began, by all processes together. None takes all that
+                were drawn, as torchdata's StatefulDataLoader needs it, which counts by itself.
+        """
+        position = self._drawn if trained is None else min(self._begun + trained, len(self._shards))
+        return {"seed": self.seed, "epoch": self.epoch, "position": position} | self._about()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue at a position: the next iteration gives what is left of its epoch, and those after it give whole epochs.
+
+        Raises:
+            ArgumentError: the state is not one of a sampler of the same data with the same `shard` and `window`.
+        """
+        different = [name for name, value in self._about().items() if state.get(name) != value]
+        if different or not 0 <= state.get("position", -1) <= len(self._shards):
+            raise ArgumentError(
+                "state",
+                expected=f"that of a ShardSampler with {self._about()}",
+                found=str({name: state.get(name) for name in different or ("position",)}),
+                advice="the data and the arguments `shard` and `window` must be the same",
+            )
+        self.seed, self.epoch = int(state["seed"]), int(state["epoch"])
+        self._next = self._begun = self._drawn = int(state["position"])
+
+    def _about(self) -> dict[str, int]:
+        """Return what the order depends on besides the seed and the epoch."""
+        places = zip(self.dataset.sequences, self.dataset.frames, strict=True)
+        digest = 0
+        for sequence, frames in places:
+            digest = zlib.crc32(np.asarray(frames, "<i8").tobytes(), zlib.crc32(sequence.name.encode(), digest))
+        return {"samples": len(self._shards), "data": digest, "shard": self.shard, "window": self.window}
+
+
+def _default_shard(history: int) -> int:
+    before = -(-(history - 1) // _STORED_TOGETHER) * _STORED_TOGETHER
+    return max(_STORED_TOGETHER, _READ_AGAIN * before)
+
+
+def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
+    """Return the number of each sample's shard; all numbers up to the largest exist."""
+    numbers: list[NDArray[np.int64]] = []
+    first = 0
+    for frames in dataset.frames:
+        if len(frames):
+            _, number = np.unique(frames // length, return_inverse=True)
+            numbers.append(number.reshape(-1) + first)
+            first = int(numbers[-1][-1]) + 1
+    return np.concatenate(numbers)
