@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.core import VoxelFlag as VoxelFlag
     from carlasc.dataset import Dataset as Dataset
     from carlasc.dataset import Flip as Flip
+    from carlasc.dataset import ShardSampler as ShardSampler
     from carlasc.dataset import collate as collate
     from carlasc.groundtruth import FromCapture as FromCapture
     from carlasc.groundtruth import FromGrid as FromGrid
@@ -49,9 +50,11 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.inspection import validate as validate
     from carlasc.metrics import evaluate as evaluate
     from carlasc.metrics import scores as scores
+    from carlasc.storage import Cache as Cache
     from carlasc.storage import Sink as Sink
     from carlasc.storage import Source as Source
     from carlasc.storage import download as download
+    from carlasc.storage import finish as finish
     from carlasc.storage import open as open
     from carlasc.storage import pack as pack
     from carlasc.storage import unpack as unpack
@@ -95,9 +98,11 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
         "VoxelFlag",
     ),
     "storage": (
+        "Cache",
         "Sink",
         "Source",
         "download",
+        "finish",
         "open",
         "pack",
         "unpack",
@@ -116,6 +121,7 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
     "dataset": (
         "Dataset",
         "Flip",
+        "ShardSampler",
         "collate",
     ),
     "metrics": ("evaluate", "scores"),

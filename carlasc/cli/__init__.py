@@ -19,6 +19,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "export",
     "pack",
     "unpack",
+    "finish",
     "info",
     "stats",
     "validate",

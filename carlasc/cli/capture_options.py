@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-OutArgument = Annotated[Path, typer.Argument(help="Folder of the sequence. The capture is written to OUT/raw.")]
+from carlasc.cli.common import place_argument
+
+OutArgument = Annotated[
+    str, place_argument("Folder of the sequence, or its URL: the capture is written to OUT/raw.", "OUT")
+]
 CountOption = Annotated[int, typer.Option(help="Number of frames, 0.1 s apart.", min=1)]
 SensorsOption = Annotated[int, typer.Option(help="Number of LiDARs. The first is the ego sensor.", min=1)]
 SeedOption = Annotated[int, typer.Option(help="Seed of all random choices: traffic, sensor positions, noise.", min=0)]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from carlasc.core.frames import FrameRange
+    from carlasc.running import Engine, Part
 else:
     FrameRange = object  # only an annotation here: importing it loads NumPy, for which `--help` would wait
 
@@ -30,9 +31,83 @@ FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
 _ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
 
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also one that lost a slash; a drive has one letter
+
+
+def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
+    """Return a path with `~` replaced, or a URL as it is.
+
+    Raises:
+        ArgumentError: the place is empty, or is a URL with one slash, as shells and `Path` leave it.
+    """
+    if place is None:
+        return None
+    name = parameter.name or "source"
+    if not place:
+        raise ArgumentError(name, expected="a path or a URL", found="nothing")
+    if "://" in place:
+        return place
+    if _URL.match(place) and not Path(place).exists():
+        raise ArgumentError(name, expected="a path, or a URL such as s3://bucket/folder", found=place)
+    return str(Path(place).expanduser()) if place.startswith("~") else place
+
+
+def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
+    """Return the path of a file on this machine.
+
+    Raises:
+        ArgumentError: it is a URL.
+    """
+    if file is None or not _URL.match(str(file)):
+        return None if file is None else file.expanduser()
+    raise ArgumentError(
+        parameter.name or "out",
+        expected="a path on this machine",
+        found=f"the URL {str(file).replace(':/', '://', 1)}",
+        advice="write it here, then upload it",
+    )
+
+
+def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
+    """Return an argument for a path or a URL. `text` is its help, `name` what it is called there."""
+    return typer.Argument(metavar=name, help=text, callback=_read_place, show_default=default or True)
+
+
+def place_option(*flags: str, text: str) -> Any:
+    """Return an option for a path or a URL."""
+    return typer.Option(*flags, help=text, callback=_read_place)
+
+
+def file_argument(text: str, name: str = "OUT") -> Any:
+    """Return an argument for a path on this machine, where files of other formats are written."""
+    return typer.Argument(metavar=name, help=text, callback=_read_file)
+
+
+def file_option(*flags: str, text: str, **settings: Any) -> Any:
+    """Return an option for a path on this machine."""
+    return typer.Option(*flags, help=text, callback=_read_file, **settings)
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 Workers = Annotated[
     int | None, typer.Option(help="Processes that work side by side; if not given, one per core.", min=1)
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="WHERE",
+        help="Work on a Dask cluster: local or local:N (processes here), tcp://HOST:PORT (a scheduler), slurm (with --workers jobs),"
+        " or the dotted path of a class that starts one.",
+    ),
+]
+PartOption = Annotated[
+    str | None,
+    typer.Option(
+        "--part",
+        metavar="I/N",
+        help="Do only the I-th of N parts; other commands do the others, on any machine that reaches the output.",
+    ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
 
@@ -63,6 +138,17 @@ class CommandGroup(TyperGroup):
         """Return what a user types for each parameter of the command that runs, by its name."""
         command = self.commands.get(ctx.invoked_subcommand or "")
         return {} if command is None else {p.name: _typed(p) for p in command.params if p.name}
+
+
+def parse_part(text: str | None) -> Part:
+    """Return the part that `--part` names, or the whole.
+
+    Raises:
+        ArgumentError: it is not of the form I/N.
+    """
+    from carlasc.running import Part
+
+    return Part() if text is None else Part.parse(text)
 
 
 def _typed(parameter: Any) -> str:
@@ -108,6 +194,18 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
     if failures:
         summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
         raise _BatchError(summary, [message for _, message in failures])
+
+
+@contextmanager
+def engine(cluster: str | None, workers: int | None) -> Iterator[Engine | None]:
+    """Yield what does the work: the cluster of the option `--cluster`, or None for processes on this machine."""
+    if cluster is None:
+        yield None
+    else:
+        from carlasc.running import open_cluster
+
+        with open_cluster(cluster, workers=workers) as opened:
+            yield opened
 
 
 @contextmanager

@@ -8,7 +8,20 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import Json, Workers, parse_options, print_json, progress_bar, report_failures
+from carlasc.cli.common import (
+    Cluster,
+    Json,
+    PartOption,
+    Workers,
+    engine,
+    file_argument,
+    parse_options,
+    parse_part,
+    place_argument,
+    print_json,
+    progress_bar,
+    report_failures,
+)
 from carlasc.cli.grid_options import (
     BoundsOption,
     Coordinates,
@@ -78,10 +91,8 @@ def _print_list(wanted: bool) -> None:
 
 def convert(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The data set: kitti, argoverse2, ... (see --list).")],
-    source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="Folder of the data set, or of one of its sequences.")
-    ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
+    source: Annotated[Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")],
+    out: Annotated[str, place_argument("Folder to write to, or its URL.", "OUT")],
     sequences: Annotated[
         str | None,
         typer.Option(help="Names of sequences or the last parts of them, separated by commas: 00,08. Default: all."),
@@ -142,6 +153,8 @@ def convert(
         ),
     ] = None,
     workers: Workers = None,
+    cluster: Cluster = None,
+    part: PartOption = None,
     json: Json = False,
     _list: Annotated[
         bool,
@@ -159,10 +172,16 @@ def convert(
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, observe))
     if asked and grids is not Grids.scans:
         raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids.value)
+    if part is not None and grids is Grids.scans and bounds is None:
+        raise ArgumentError(
+            "--part",
+            expected="--bounds or --grids none with it, because the height of grids is found from the ground of all sequences",
+            found="neither",
+        )
     if preset is None and res is None and size is None:
         preset = Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse
     spec = parse_grid(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
-    with progress_bar(f"convert {name}") as progress:
+    with progress_bar(f"convert {name}") as progress, engine(cluster, workers) as executor:
         result = convert_recordings(
             name,
             source,
@@ -181,6 +200,8 @@ def convert(
             allow_unknown=allow_unknown,
             force=force,
             workers=workers,
+            executor=executor,
+            part=parse_part(part),
             progress=progress,
             options=parse_options(option),
         )

@@ -9,13 +9,13 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import FAILED, Workers, progress_bar
+from carlasc.cli.common import FAILED, Workers, file_argument, progress_bar
 from carlasc.cli.stats import print_statistics
 from carlasc.cli.validate import print_result
 
 
 def demo(
-    out: Annotated[Path, typer.Argument(help="Folder to write to.")] = Path("carlasc-demo"),
+    out: Annotated[Path, file_argument("Folder to write to.")] = Path("carlasc-demo"),
     count: Annotated[int, typer.Option(help="Number of frames.", min=1)] = 4,
     sensors: Annotated[int, typer.Option(help="Number of LiDARs.", min=1)] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,

@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Json, print_json, progress_bar
+from carlasc.cli.common import Json, file_argument, print_json, progress_bar
 
 
 def download(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder that the zips are written to.")],
+    out: Annotated[Path, file_argument("Folder that the zips are written to.")],
     split: Annotated[
         list[str] | None, typer.Option(help="train (two zips), val, test or all; can be given several times.")
     ] = None,

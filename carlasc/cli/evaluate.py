@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from carlasc.cli.common import FramesOption, Json, console, print_json, progress_bar, report_failures
+from carlasc.cli.common import (
+    Cluster,
+    FramesOption,
+    Json,
+    console,
+    engine,
+    file_option,
+    place_argument,
+    place_option,
+    print_json,
+    progress_bar,
+    report_failures,
+)
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
@@ -29,12 +42,12 @@ _OUTPUT, _PART = "Output", "Part of the grid"
 def evaluate(
     source: Annotated[
         str,
-        typer.Argument(
-            help="Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, or files of SemanticKITTI,"
+        place_argument(
+            "Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, or files of SemanticKITTI,"
             " SSCBench, Occ3D or OpenOccupancy."
         ),
     ],
-    truth: Annotated[str, typer.Argument(help="Ground truth: likewise.")],
+    truth: Annotated[str, place_argument("Ground truth: likewise.", "TRUTH")],
     convention: Annotated[
         str | None,
         typer.Option(
@@ -58,7 +71,9 @@ def evaluate(
     ] = None,
     compare: Annotated[
         str | None,
-        typer.Option(help="Other predictions of the same sequences: compare SOURCE with them by a paired test."),
+        place_option(
+            "--compare", text="Other predictions of the same sequences: compare SOURCE with them by a paired test."
+        ),
     ] = None,
     voxels: Annotated[
         Literal["known", "all"],
@@ -86,6 +101,10 @@ def evaluate(
         ),
     ] = 360.0,
     frames: FramesOption = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)
+    ] = None,
+    cluster: Cluster = None,
     by: Annotated[
         list[Part] | None,
         typer.Option(help="Also score parts of the grid; may be given several times.", rich_help_panel=_PART),
@@ -100,10 +119,12 @@ def evaluate(
         ),
     ] = None,
     per_frame: Annotated[
-        Path | None, typer.Option(help="Write the scores of each frame to this CSV file.", rich_help_panel=_OUTPUT)
+        Path | None,
+        file_option("--per-frame", text="Write the scores of each frame to this CSV file.", rich_help_panel=_OUTPUT),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Draw the scores of each frame to this PNG file.", rich_help_panel=_OUTPUT)
+        Path | None,
+        file_option("--plot", text="Draw the scores of each frame to this PNG file.", rich_help_panel=_OUTPUT),
     ] = None,
     as_json: Json = False,
     latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX.", rich_help_panel=_OUTPUT)] = False,
@@ -114,10 +135,8 @@ def evaluate(
     Benchmarks differ in the voxels that count, in the classes, and in the classes of the mean: scores by different conventions cannot be
     compared. Intersections and unions are summed over all frames before they are divided.
     """
-    import math
-
-    from carlasc.metrics import distance_band, evaluate_by_all_conventions, field_of_view
     from carlasc.metrics import evaluate as score
+    from carlasc.metrics import evaluate_by_all_conventions
 
     if plot is not None:
         from carlasc.inspection.charts import check_plot
@@ -125,26 +144,23 @@ def evaluate(
         check_plot(plot)  # before anything is counted
     common: dict[str, Any] = {
         "grid": grid, "truth_grid": truth_grid, "source_classes": source_classes, "frames": frames,
+        "workers": workers or 1,
     }  # fmt: skip
     name = name or Path(source).name
     if all_conventions:
-        with progress_bar("Scoring") as progress:
+        with progress_bar("Scoring") as progress, engine(cluster, workers) as common["executor"]:
             found = evaluate_by_all_conventions(source, truth, name=name, progress=progress, **common)
         _print_conventions(found, as_json)
         return
 
-    def region(spec: Any) -> Any:
-        band = distance_band(spec, near_m, math.inf if far_m is None else far_m)
-        return band & field_of_view(spec, math.radians(fov))
-
     common |= {"convention": convention, "voxels": voxels}
-    common["region"] = None if (near_m, far_m, fov) == (0.0, None, 360.0) else region
-    with progress_bar("Scoring") as progress:
+    common["region"] = None if (near_m, far_m, fov) == (0.0, None, 360.0) else _Region(near_m, far_m, fov)
+    with progress_bar("Scoring") as progress, engine(cluster, workers) as common["executor"]:
         parts = [part.value for part in by or ()]
         result = score(source, truth, by=parts, rays=rays, name=name, progress=progress, **common)
     other = None
     if compare is not None:
-        with progress_bar("Scoring the other") as progress:
+        with progress_bar("Scoring the other") as progress, engine(cluster, workers) as common["executor"]:
             other = score(compare, truth, name=Path(compare).name, progress=progress, **common)
     if per_frame is not None:
         from carlasc.storage.files import write_atomic
@@ -156,6 +172,23 @@ def evaluate(
         draw_frame_scores(result, plot)
     _print(result, other, as_json=as_json, latex=latex, csv=csv)
     report_failures(result.failures, result.frames + len(result.failures))
+
+
+@dataclass(frozen=True)
+class _Region:
+    """The voxels between two distances, metres, and within an angle about the forward axis, degrees. It pickles into workers."""
+
+    near_m: float
+    far_m: float | None
+    fov: float
+
+    def __call__(self, spec: Any) -> Any:
+        import math
+
+        from carlasc.metrics import distance_band, field_of_view
+
+        band = distance_band(spec, self.near_m, math.inf if self.far_m is None else self.far_m)
+        return band & field_of_view(spec, math.radians(self.fov))
 
 
 def _print(result: Evaluation, other: Evaluation | None, *, as_json: bool, latex: bool, csv: bool) -> None:

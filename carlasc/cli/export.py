@@ -7,7 +7,20 @@ from typing import Annotated, Any
 
 import typer
 
-from carlasc.cli.common import Json, Workers, parse_options, print_json, progress_bar, report_failures
+from carlasc.cli.common import (
+    Cluster,
+    Json,
+    PartOption,
+    Workers,
+    engine,
+    file_argument,
+    parse_options,
+    parse_part,
+    place_argument,
+    print_json,
+    progress_bar,
+    report_failures,
+)
 
 
 def _print_list(wanted: bool) -> None:
@@ -23,10 +36,8 @@ def _print_list(wanted: bool) -> None:
 
 def export(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The other data set: kitti, occ3d, ... (see --list).")],
-    source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="Folder, zip, store or URL of one or more sequences.")
-    ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
+    source: Annotated[str, place_argument("Folder, zip, store or URL of one or more sequences.")],
+    out: Annotated[Path, file_argument("Folder to write to.")],
     sequences: Annotated[
         str | None, typer.Option(help="Names of sequences, separated by commas. Default: all.")
     ] = None,
@@ -48,6 +59,8 @@ def export(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write frames again that exist.")] = False,
     workers: Workers = None,
+    cluster: Cluster = None,
+    part: PartOption = None,
     json: Json = False,
     _list: Annotated[
         bool,
@@ -63,7 +76,7 @@ def export(
     options: dict[str, Any] = {**parse_options(option)}
     options |= {} if grid is None else {"grid": grid}
     options |= {"predictions": True} if predictions else {}
-    with progress_bar(f"export {name}") as progress:
+    with progress_bar(f"export {name}") as progress, engine(cluster, workers) as executor:
         result = export_sequences(
             name,
             source,
@@ -71,6 +84,8 @@ def export(
             sequences=None if sequences is None else sequences.split(","),
             overwrite=overwrite,
             workers=workers,
+            executor=executor,
+            part=parse_part(part),
             progress=progress,
             **options,
         )

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from carlasc.cli.common import Json, console, print_json
+from carlasc.cli.common import Json, console, place_argument, print_json
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview
@@ -14,7 +12,7 @@ if TYPE_CHECKING:
 
 def info(
     source: Annotated[
-        str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, a capture, or a URL.")
+        str, place_argument("A data set, a split, a sequence, a zip, a packed store, a capture, or a URL.")
     ] = ".",
     as_json: Json = False,
 ) -> None:

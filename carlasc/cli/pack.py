@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from carlasc.cli.common import Json, console, print_json, progress_bar
+from carlasc.cli.common import (
+    Cluster,
+    Json,
+    PartOption,
+    Workers,
+    console,
+    engine,
+    parse_part,
+    place_argument,
+    print_json,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from carlasc.storage.packing import PackResult
 
 
 def pack(
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Folder, zip or URL with one or more sequences.")],
-    out: Annotated[
-        Path, typer.Argument(metavar="OUT", help="Store to write; its ending says which kind: .zarr, .h5 or .parquet.")
-    ],
+    source: Annotated[str, place_argument("Folder, zip or URL with one or more sequences.")],
+    out: Annotated[str, place_argument("Store to write; its ending says which kind: .zarr, .h5 or .parquet.", "OUT")],
     small: Annotated[
         bool,
         typer.Option("--small", help="Pack points with PCodec (zarr only): smaller, but fewer programs can read it."),
@@ -25,7 +33,9 @@ def pack(
     lossy_mm: Annotated[
         float | None, typer.Option(help="Quantise points to this many millimetres. Without it, every bit is kept.")
     ] = None,
-    threads: Annotated[int, typer.Option(help="Number of threads that read ahead.", min=1)] = 2,
+    workers: Workers = None,
+    cluster: Cluster = None,
+    part: PartOption = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a store that exists at OUT.")] = False,
     json: Json = False,
 ) -> None:
@@ -35,14 +45,24 @@ def pack(
     """
     from carlasc.storage.packing import pack as pack_sequences
 
-    with progress_bar("Packing", "files") as progress:
+    with progress_bar("Packing", "files") as progress, engine(cluster, workers) as executor:
         result = pack_sequences(
-            source, out, small=small, lossy_mm=lossy_mm, overwrite=overwrite, threads=threads, progress=progress
+            source,
+            out,
+            small=small,
+            lossy_mm=lossy_mm,
+            overwrite=overwrite,
+            workers=workers,
+            executor=executor,
+            part=parse_part(part),
+            progress=progress,
         )
     if json:
         print_json(result)
-    else:
+    elif result.is_finished:
         _print(result)
+    else:
+        typer.echo(f"{result.out}: part {part} is packed; the last part finishes the store")
 
 
 def _print(result: PackResult) -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from carlasc.cli.common import (
+    Cluster,
     FramesOption,
     Json,
     Overwrite,
+    PartOption,
     Workers,
+    engine,
+    parse_part,
+    place_argument,
+    place_option,
     print_json,
     progress_bar,
     report_failures,
@@ -58,17 +63,18 @@ class Poses(StrEnum):
 
 def regrid(
     source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SOURCE",
-            help="A sequence's folder, with a raw capture or with scans, or a folder of such sequences.",
-            show_default="current folder",
+        str,
+        place_argument(
+            "A sequence's folder, with a raw capture or with scans, or a folder of such sequences, or its URL.",
+            default="current folder",
         ),
-    ] = Path(),
+    ] = ".",
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", help="Folder to write to, each sequence at its path below SOURCE; default: SOURCE itself."
+        str | None,
+        place_option(
+            "-o",
+            "--out",
+            text="Folder or URL to write to, each sequence at its path below SOURCE; default: SOURCE itself.",
         ),
     ] = None,
     res: ResOption = None,
@@ -80,6 +86,8 @@ def regrid(
     rule: RuleOption = None,
     frames: FramesOption = None,
     workers: Workers = None,
+    cluster: Cluster = None,
+    part: PartOption = None,
     keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False,
     keep_evidence: Annotated[
         bool,
@@ -153,7 +161,7 @@ def regrid(
         poses=None if poses is None else poses.value,
         force=force or None,
     )
-    with progress_bar("regrid") as progress:
+    with progress_bar("regrid") as progress, engine(cluster, workers) as executor:
         result = regrid_sequences(
             source,
             spec,
@@ -164,6 +172,8 @@ def regrid(
             name=name,
             overwrite=overwrite,
             workers=workers,
+            executor=executor,
+            part=parse_part(part),
             progress=progress,
         )
     if json:

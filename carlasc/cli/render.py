@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import FramesOption, Json, print_json, progress_bar
+from carlasc.cli.common import (
+    Cluster,
+    FramesOption,
+    Json,
+    engine,
+    file_option,
+    print_json,
+    progress_bar,
+)
 from carlasc.cli.scene_options import (
     ClassesOption,
     EveryOption,
@@ -26,7 +34,7 @@ from carlasc.errors import ArgumentError
 def render(
     source: SourceArgument,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="A .png, .gif or .mp4. Default: named after the sequence.")
+        Path | None, file_option("-o", "--out", text="A .png, .gif or .mp4. Default: named after the sequence.")
     ] = None,
     frames: FramesOption = None,
     every: EveryOption = 1,
@@ -67,6 +75,7 @@ def render(
     workers: Annotated[
         int | None, typer.Option(help="Processes that draw the pictures of a film. Default: all cores.", min=1)
     ] = None,
+    cluster: Cluster = None,
     overwrite: OverwriteOption = False,
     as_json: Json = False,
 ) -> None:
@@ -89,7 +98,7 @@ def render(
         source_classes=source_classes,
         palette=palette,
     )
-    with progress_bar("Rendering", "pictures") as progress:
+    with progress_bar("Rendering", "pictures") as progress, engine(cluster, workers) as executor:
         result = viewing.render(
             scene,
             out,
@@ -103,6 +112,7 @@ def render(
             still=still,
             fps=fps,
             workers=workers,
+            executor=executor,
             overwrite=overwrite,
             progress=progress,
         )

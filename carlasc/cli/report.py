@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from carlasc.cli.common import Json, Workers, console, print_json, progress_bar, report_failures
+from carlasc.cli.common import (
+    Cluster,
+    Json,
+    Workers,
+    console,
+    engine,
+    file_option,
+    place_argument,
+    print_json,
+    progress_bar,
+    report_failures,
+)
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.reporting.actors import Actor
@@ -17,12 +28,11 @@ _SHOWN = 12
 
 
 def report(
-    source: Annotated[
-        str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     grid: Annotated[str | None, typer.Option(help="Only the grid of this name; default: all grids.")] = None,
     html: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Also write the reports as one page for a browser.")
+        Path | None,
+        file_option("--html", metavar="FILE", text="Also write the reports as one page for a browser."),
     ] = None,
     remake: Annotated[
         bool, typer.Option("--remake", help="Make the reports from the files, also where a run left some.")
@@ -35,6 +45,7 @@ def report(
     ] = False,
     everything: Annotated[bool, typer.Option("--all", help="Print all actors, not only the first twelve.")] = False,
     workers: Workers = None,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Print the report of each grid: what is in it, how it was made, how well actors were tracked, how it changes with fewer scans.
@@ -44,9 +55,16 @@ def report(
     from carlasc.inspection.report_page import write_report_page
     from carlasc.inspection.reports import report as read_reports
 
-    with progress_bar("report", unit="steps") as progress:
+    with progress_bar("report", unit="steps") as progress, engine(cluster, workers) as executor:
         result = read_reports(
-            source, grid=grid, remake=remake, holdout=holdout, save=save, workers=workers, progress=progress
+            source,
+            grid=grid,
+            remake=remake,
+            holdout=holdout,
+            save=save,
+            workers=workers,
+            executor=executor,
+            progress=progress,
         )
     if html is not None:
         write_report_page(result, html)

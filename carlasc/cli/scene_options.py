@@ -6,10 +6,12 @@ from typing import Annotated
 
 import typer
 
+from carlasc.cli.common import place_argument, place_option
+
 SourceArgument = Annotated[
     str,
-    typer.Argument(
-        help="A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame."
+    place_argument(
+        "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame."
     ),
 ]
 SequenceOption = Annotated[
@@ -21,7 +23,7 @@ GridOption = Annotated[
 ]
 TruthOption = Annotated[
     str | None,
-    typer.Option("--truth", help="Ground truth: SOURCE is then a prediction, shown with it and with its errors."),
+    place_option("--truth", text="Ground truth: SOURCE is then a prediction, shown with it and with its errors."),
 ]
 TruthGridOption = Annotated[
     str | None, typer.Option("--truth-grid", help="Name of the ground truth's grid. Default: as for --grid.")

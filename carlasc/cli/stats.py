@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Json, console, print_json, progress_bar, report_failures
+from carlasc.cli.common import (
+    Cluster,
+    Json,
+    console,
+    engine,
+    file_option,
+    place_argument,
+    print_json,
+    progress_bar,
+    report_failures,
+)
 
 if TYPE_CHECKING:
     from carlasc.core import ClassTable
@@ -17,9 +27,7 @@ _KINDS: tuple[Kind, ...] = ("points", "voxels")
 
 
 def stats(
-    source: Annotated[
-        str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
         typer.Option(help="Print the shares of the whole, of each split too, or of each sequence too."),
@@ -31,8 +39,13 @@ def stats(
         str, typer.Option(help="Remap to the classes of the second table: auto, none, carlasc11, semantickitti19, ...")
     ] = "auto",
     every: Annotated[int, typer.Option(metavar="N", help="Count every N-th frame.")] = 1,
-    plot: Annotated[Path | None, typer.Option(help="Draw the histograms to a .png, .svg or .pdf file.")] = None,
-    workers: Annotated[int, typer.Option(help="Processes that work side by side.", min=1)] = 1,
+    plot: Annotated[
+        Path | None, file_option("--plot", text="Draw the histograms to a .png, .svg or .pdf file.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)
+    ] = None,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Count the classes of points and of known voxels, and compute class weights: as tables, a plot or JSON."""
@@ -41,13 +54,14 @@ def stats(
 
     if plot is not None:  # counting may take hours: a mistake in this option is reported before
         check_plot(plot)
-    with progress_bar("Counting") as progress:
+    with progress_bar("Counting") as progress, engine(cluster, workers) as executor:
         result = count(
             source,
             grid=grid,
             remap=None if remap == "none" else remap,
             every=every,
-            workers=workers,
+            workers=workers or 1,
+            executor=executor,
             progress=progress,
         )
     if plot is not None:

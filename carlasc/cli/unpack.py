@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import Json, print_json, progress_bar
+from carlasc.cli.common import (
+    Cluster,
+    Json,
+    PartOption,
+    Workers,
+    engine,
+    parse_part,
+    place_argument,
+    print_json,
+    progress_bar,
+)
 
 
 def unpack(
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Packed store, zip or URL.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
-    threads: Annotated[int, typer.Option(help="Number of threads that read ahead.", min=1)] = 2,
+    source: Annotated[str, place_argument("Packed store, zip or URL.")],
+    out: Annotated[str, place_argument("Folder to write.", "OUT")],
+    workers: Workers = None,
+    cluster: Cluster = None,
+    part: PartOption = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that exists, and replace files of the same names.")
     ] = False,
@@ -23,10 +34,18 @@ def unpack(
 
     If it is interrupted, run the same command again to finish it.
     """
-    from carlasc.storage.packing import unpack as unpack_sequences
+    from carlasc.storage.unpacking import unpack as unpack_sequences
 
-    with progress_bar("Unpacking", "files") as progress:
-        result = unpack_sequences(source, out, overwrite=overwrite, threads=threads, progress=progress)
+    with progress_bar("Unpacking", "files") as progress, engine(cluster, workers) as executor:
+        result = unpack_sequences(
+            source,
+            out,
+            overwrite=overwrite,
+            workers=workers,
+            executor=executor,
+            part=parse_part(part),
+            progress=progress,
+        )
     if json:
         print_json(result)
     else:

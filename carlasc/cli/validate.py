@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from carlasc.cli.common import FAILED, Json, Workers, console, print_json, progress_bar, report_failures
+from carlasc.cli.common import (
+    FAILED,
+    Cluster,
+    Json,
+    console,
+    engine,
+    place_argument,
+    print_json,
+    progress_bar,
+    report_failures,
+)
 from carlasc.cli.grid_options import (
     BoundsOption,
     DynamicOption,
@@ -31,9 +41,7 @@ _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 
 def validate(
-    source: Annotated[
-        str, typer.Argument(help="A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     every: Annotated[
         int | None,
         typer.Option(
@@ -63,7 +71,13 @@ def validate(
     window: WindowOption = None,
     dynamic: DynamicOption = None,
     motion: MotionOption = None,
-    workers: Workers = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            help="Processes that work side by side; if not given, one, and one per core for held-out rays.", min=1
+        ),
+    ] = None,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids. The exit code is 1 if there is an error.
@@ -79,19 +93,28 @@ def validate(
 
     if full and every is not None:
         raise ArgumentError("every", expected="only one of --every and --full", found="both")
-    grid, others = (res, size, preset, bounds), (holdout_every, window, dynamic, motion, workers)
+    grid, others = (res, size, preset, bounds), (holdout_every, window, dynamic, motion)
     if not holdout and any(value is not None for value in (*grid, *others)):
         raise ArgumentError("holdout", expected="given with the options of held-out rays", found="not given")
     spec = parse_grid(res, size, preset, None, bounds) if any(grid) else GridSpec.published()
     scans = scans_of(window=window, dynamic=dynamic, motion=motion) or FromScans()
-    with progress_bar("Validating", unit="steps") as progress:
-        result = examine(source, every=1 if full else every, progress=progress)
     rays = None
-    if holdout:
-        with progress_bar("Leaving scans out") as progress:
-            rays = hold_out(
-                source, spec, observe=scans, every=holdout_every or EVERY, workers=workers, progress=progress
+    with engine(cluster, workers) as executor:
+        with progress_bar("Validating", unit="steps") as progress:
+            result = examine(
+                source, every=1 if full else every, workers=workers or 1, executor=executor, progress=progress
             )
+        if holdout:
+            with progress_bar("Leaving scans out") as progress:
+                rays = hold_out(
+                    source,
+                    spec,
+                    observe=scans,
+                    every=holdout_every or EVERY,
+                    workers=workers,
+                    executor=executor,
+                    progress=progress,
+                )
     if as_json:
         print_json(result.to_dict() | ({} if rays is None else {"holdout": rays.to_dict()}))
     else:

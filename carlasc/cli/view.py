@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import FramesOption, Json, print_json, progress_bar
+from carlasc.cli.common import FramesOption, Json, file_option, print_json, progress_bar
 from carlasc.cli.scene_options import (
     ClassesOption,
     EveryOption,
@@ -27,8 +27,8 @@ def view(
     source: SourceArgument,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--out", help="Write a self-contained .html page for any browser, instead of opening a window."
+        file_option(
+            "-o", "--out", text="Write a self-contained .html page for any browser, instead of opening a window."
         ),
     ] = None,
     frames: FramesOption = None,

@@ -52,7 +52,6 @@ def test_dynamic_changes_what_is_measured(street):
     [
         ("--res", "0.4"),
         ("--window=-3:3",),
-        ("--workers", "2"),
         ("--holdout", "--holdout-every", "1"),
         ("--holdout", "--res", "0.4", "--size", "1,1,1"),
         ("--holdout", "--window", "3:1"),

@@ -25,6 +25,7 @@ def test_a_picture_of_the_golden_grids(golden_capture, tmp_path, grid):
     assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 500
 
 
+@pytest.mark.slow
 def test_frames_become_a_film_and_figures_are_json(golden_capture, tmp_path):
     result = call(
         golden_capture / "cartesian", "--frames", "0:2", "-o", tmp_path / "drive.mp4", "--size", "321x180",

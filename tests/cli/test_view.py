@@ -54,6 +54,7 @@ def test_an_existing_page_is_replaced_only_with_overwrite(tmp_path):
     assert (tmp_path / "a.html").read_text() != "mine"
 
 
+@pytest.mark.slow
 def test_without_a_screen_the_window_says_what_to_do(tmp_path, monkeypatch):
     pytest.importorskip("open3d", exc_type=ImportError)
     if sys.platform != "linux":

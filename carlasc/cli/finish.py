@@ -1,0 +1,34 @@
+"""`carlasc finish`: close a store that was written in parts."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from carlasc.cli.common import Json, place_argument, print_json
+
+
+def finish(
+    out: Annotated[str, place_argument("The .zarr store.", "OUT")],
+    incomplete: Annotated[
+        bool, typer.Option("--incomplete", help="Finish it although frames are missing that a run was to write.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Finish a .zarr store that was written in parts, so that it can be opened.
+
+    The last part of a run does this by itself. It is needed where a part failed, or was never run.
+    """
+    from carlasc.storage import finish as finish_store
+
+    result = finish_store(out, incomplete=incomplete)
+    if json:
+        print_json(result)
+        return
+    for path, fields in result.sequences.items():
+        listed = ", ".join(f"{name} {count}" for name, count in fields.items())
+        typer.echo(f"{path or '.'}: {listed or 'no frames'}")
+    missing = sum(sum(fields.values()) for fields in result.missing.values())
+    left_out = f", without {missing} files that are missing" if missing else ""
+    typer.echo(f"{result.location}: {len(result.sequences)} sequences{left_out}")
