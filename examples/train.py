@@ -14,6 +14,8 @@ from completion.config import Config
 from completion.processes import join_processes
 from completion.training import BEST, train
 
+import carlasc
+
 
 def main(
     config: Annotated[Path, typer.Argument(help="Settings: a YAML file.")],
@@ -27,12 +29,17 @@ def main(
         typer.Option("--soft-labels", help="Train on probabilities instead of labels; the same as soft_labels=true."),
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint of the run.")] = False,
+    cache: Annotated[
+        Path | None,
+        typer.Option(help="Folder on a local disk for files of a remote data set, each of which is fetched once."),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
     """Train a network on a data set. The weights with the best mIoU on the validation split are kept."""
     with join_processes(device) as processes:
         overrides = [*(settings or ()), *(["soft_labels=true"] if soft_labels else [])]
-        progress = train(data, Config.read(config, overrides), out, processes, resume=resume)
+        source = carlasc.open(data, cache=cache)
+        progress = train(source, Config.read(config, overrides), out, processes, resume=resume)
         if processes.first:
             print(f"best mIoU {100 * progress.best_miou:.2f} after epoch {progress.best_epoch}: {out / BEST}")
 

@@ -21,7 +21,11 @@ NETWORKS = (
     "js3cnet",
     "js3cnet_exact",
     "js3cnet_kitti",
+    "baseline",
+    "baseline_hits",
 )
+STACKED = ("motionsc", "baseline", "baseline_hits")
+"""The networks that take more than one scan."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Config:
 
     Attributes:
         network: one of `NETWORKS`.
-        history: T, number of scans in a stack; more than 1 for MotionSC only.
+        history: T, number of scans in a stack; more than 1 for `STACKED` networks only.
         align: move past scans into the newest one's frame by their poses.
         shuffle_history: put the past scans of each stack in random order (to measure what their order contributes).
         grid: which grid of the data to predict.
@@ -41,6 +45,8 @@ class Config:
         flips: directions in which samples are mirrored at random: "x", "y", "xy" or "".
         class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the training split), "none", or the file
             that `carlasc stats --json` wrote.
+        weighting: how much more a rare class weighs: "log" (the paper's 1 / ln of the count) or "root" (the cube root of how many times
+            rarer it is than the most frequent one, as for JS3C-Net); None is the network's own.
         soft_labels: train on the probability of each class instead of labels; the grid must be made with `keep_evidence=True`.
         free_ratio: number of free voxels in the loss per occupied one, drawn at random for each batch; 0 takes all (SSCNet: 2).
         epochs: passes over the training split.
@@ -53,11 +59,22 @@ class Config:
         precision: "float32", or "bf16" for mixed precision.
         compile: compile the network with torch.compile.
         workers: number of processes that load data, for each training process.
+        save_every: number of steps after which last.pt is written within an epoch; 0 writes it after each epoch only.
+        keep_samples: keep all samples in memory after the first epoch, for data that are small.
         seed: of weights, order, flips and draws.
     """
 
     network: Literal[
-        "motionsc", "lmscnet_ss", "lmscnet", "sscnet", "sscnet_full", "js3cnet", "js3cnet_exact", "js3cnet_kitti"
+        "motionsc",
+        "lmscnet_ss",
+        "lmscnet",
+        "sscnet",
+        "sscnet_full",
+        "js3cnet",
+        "js3cnet_exact",
+        "js3cnet_kitti",
+        "baseline",
+        "baseline_hits",
     ]
     history: int = 1
     align: bool = True
@@ -69,6 +86,7 @@ class Config:
     test: str | list[str] = "test"
     flips: str = "xy"
     class_weights: str = "table"
+    weighting: Literal["log", "root"] | None = None
     soft_labels: bool = False
     free_ratio: float = 0.0
     epochs: int = 10
@@ -81,6 +99,8 @@ class Config:
     precision: Literal["float32", "bf16"] = "float32"
     compile: bool = False
     workers: int = 4
+    save_every: int = 0
+    keep_samples: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -93,10 +113,11 @@ class Config:
         for name in ("history", "epochs", "batch_size", "decay_every"):
             if getattr(self, name) < 1:
                 raise ArgumentError(name, expected="1 or more", found=str(getattr(self, name)))
-        if self.history > 1 and self.network != "motionsc":
-            raise ArgumentError(
-                "history", expected=f"1 for {self.network}", found=str(self.history), advice="only motionsc takes more"
-            )
+        if self.save_every < 0:
+            raise ArgumentError("save_every", expected="0 or more", found=str(self.save_every))
+        if self.history > 1 and self.network not in STACKED:
+            advice = f"only {', '.join(STACKED)} take more"
+            raise ArgumentError("history", expected=f"1 for {self.network}", found=str(self.history), advice=advice)
         if self.soft_labels and self.remap == "semantickitti19":
             raise ArgumentError(
                 "soft_labels",
@@ -145,7 +166,7 @@ def _fits(value: Any, kind: Any) -> bool:
     origin = typing.get_origin(kind)
     if origin is Literal:
         return value in typing.get_args(kind)
-    if origin is types.UnionType:
+    if origin in (types.UnionType, typing.Union):  # the second is what a Literal or None is
         return any(_fits(value, part) for part in typing.get_args(kind))
     if origin is list:
         return isinstance(value, list) and all(_fits(item, typing.get_args(kind)[0]) for item in value)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +15,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, DistributedSampler, Subset
+from torch.utils.data import Dataset as TorchDataset
 
-from carlasc import Dataset, Flip, collate
+from carlasc import Dataset, Flip, ShardSampler, Source, collate
 from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS, Remap
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics import CONVENTIONS
 from completion.config import Config
 from completion.losses import FREE, IGNORE
 from completion.networks import KINDS
+from completion.tasks import WEIGHTINGS
 
 Sample = dict[str, Any]
 
@@ -32,9 +37,9 @@ class ShuffleHistory:
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample with its history shuffled."""
-        stack = sample["occupancy"]
-        order = np.random.default_rng([self.seed, sample["frame"]]).permutation(len(stack) - 1)
-        return sample | {"occupancy": stack[[*order, len(stack) - 1]]}
+        last = len(sample["valid"]) - 1
+        order = [*np.random.default_rng([self.seed, sample["frame"]]).permutation(last), last]
+        return sample | {name: sample[name][order] for name in ("occupancy", "visibility") if name in sample}
 
 
 class SemanticKittiRule:
@@ -75,7 +80,9 @@ class Compose:
                 transform.set_epoch(epoch)
 
 
-def open_split(source: str | Path, split: str | list[str], config: Config, *, training: bool = False) -> Dataset:
+def open_split(
+    source: str | Path | Source, split: str | list[str], config: Config, *, training: bool = False
+) -> Dataset:
     """Open a split of a data set with the settings of a run.
 
     Raises:
@@ -119,8 +126,50 @@ def open_split(source: str | Path, split: str | list[str], config: Config, *, tr
     return data
 
 
+class EpochSampler(DistributedSampler[int]):
+    """A DistributedSampler that can go on in the middle of an epoch, as `carlasc.ShardSampler` can."""
+
+    _trained = 0
+
+    def __iter__(self) -> Iterator[int]:
+        """Iterate over what is left of the epoch."""
+        left = islice(super().__iter__(), self._trained // self.num_replicas, None)
+        self._trained = 0
+        return left
+
+    def state_dict(self, trained: int) -> dict[str, int]:
+        """Return the position in the epoch."""
+        return {"epoch": self.epoch, "position": trained}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Let the next iteration begin at a position."""
+        self.epoch, self._trained = state["epoch"], state["position"]
+
+
+class Kept(TorchDataset[Sample]):
+    """Keeps the samples of a data set in memory, as they are before they are transformed."""
+
+    def __init__(self, data: Dataset) -> None:
+        self.data, self.transform = copy.copy(data), data.transform
+        self.data.transform = None
+        self._samples: dict[int, Sample] = {}
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> Sample:
+        """Return a sample; it is read once."""
+        if index not in self._samples:
+            self._samples[index] = self.data[index]
+        sample = self._samples[index]
+        return sample if self.transform is None else self.transform(sample)
+
+
 class TrainLoader:
     """Batches of the training split. Order and flips differ between epochs, and depend only on the seed and the epoch.
+
+    If the data are a store that keeps many frames in a file, the files are read one after another (`carlasc.ShardSampler`): from an
+    object store, each is fetched once.
 
     Args:
         data: the split.
@@ -139,23 +188,38 @@ class TrainLoader:
                 "training split", expected=f"a sample for each of the {world} processes", found=str(len(data))
             )
         self.data = data
-        self.sampler: DistributedSampler[Sample] = DistributedSampler(data, world, rank, shuffle=True, seed=config.seed)
-        self.loader = _loader(data, config, config.batch_size // world, sampler=self.sampler)
+        self.batch_size = config.batch_size
+        self.sampler: EpochSampler | ShardSampler
+        if _share_files(data):
+            self.sampler = ShardSampler(data, seed=config.seed, rank=rank, world=world)
+        else:
+            self.sampler = EpochSampler(data, world, rank, shuffle=True, seed=config.seed)
+        samples: Any = Kept(data) if config.keep_samples else data
+        self.loader = _loader(samples, config, config.batch_size // world, sampler=self.sampler)
 
     def __len__(self) -> int:
         return len(self.loader)
 
-    def epoch(self, number: int) -> Any:
-        """Return an iterator over the batches of an epoch."""
+    def epoch(self, number: int, first: int = 0) -> Any:
+        """Return an iterator over the batches of an epoch, from the step `first` on."""
         self.sampler.set_epoch(number)
+        self.sampler.load_state_dict(self.sampler.state_dict(trained=first * self.batch_size))
         if isinstance(self.data.transform, Compose):
             self.data.transform.set_epoch(number)
         return iter(self.loader)
 
 
+def _share_files(data: Dataset) -> bool:
+    """Whether the scans of successive frames are in the same files."""
+    frames, sequence = max(zip(data.frames, data.sequences, strict=True), key=lambda pair: len(pair[0]))
+    files = [sequence.files_of("points", [frame]) for frame in frames[:3].tolist()]
+    return any(before and before == after for before, after in pairwise(files))
+
+
 def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Sample]:
     """Return a loader that gives each sample once, in order. Each process takes every `world`-th sample."""
-    mine: Any = data if world == 1 else Subset(data, range(rank, len(data), world))
+    samples: Any = Kept(data) if config.keep_samples else data
+    mine: Any = samples if world == 1 else Subset(samples, range(rank, len(data), world))
     return _loader(mine, config, max(1, config.batch_size // world))
 
 
@@ -183,7 +247,7 @@ def soft_target(batch: Sample, target: Tensor) -> Tensor:
     return posterior.masked_fill((target == IGNORE).unsqueeze(1), 0)
 
 
-def class_weights(source: str | Path, data: Dataset, config: Config) -> NDArray[np.float32]:
+def class_weights(source: str | Path | Source, data: Dataset, config: Config) -> NDArray[np.float32]:
     """Return the (K,) class weights of the loss for the training split `data` of `source`.
 
     Raises:
@@ -191,7 +255,7 @@ def class_weights(source: str | Path, data: Dataset, config: Config) -> NDArray[
         FormatError: the file of `carlasc stats` does not hold counts.
     """
     num_classes = max(data.classes.names) + 1
-    weights_of = KINDS[config.network].task.class_weights
+    weights_of = WEIGHTINGS[config.weighting or KINDS[config.network].task.weighting]
     if config.class_weights == "none":
         return np.ones(num_classes, np.float32)
     if config.class_weights == "train":
@@ -221,7 +285,7 @@ def _merge(counts: NDArray[np.integer], remap: Remap | None, num_classes: int) -
     return merged
 
 
-def _count_voxels(source: str | Path, config: Config, num_classes: int) -> NDArray[np.int64]:
+def _count_voxels(source: str | Path | Source, config: Config, num_classes: int) -> NDArray[np.int64]:
     """Count the known voxels of each class over the training split."""
     data = open_split(source, config.train, replace(config, history=1, shuffle_history=False))
     counts = np.zeros(num_classes, np.int64)

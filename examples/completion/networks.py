@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from baseline.model import Baseline
+from baseline.task import Seen
 from js3cnet.model import JS3CNet
 from js3cnet.task import PointsAndVoxels
 from lmscnet.model import LMSCNet
@@ -45,6 +47,10 @@ KINDS: Mapping[str, Kind] = {
         lambda classes, spec, _: JS3CNet(classes, spec, channels=(3,), residual=True),
         PointsAndVoxels(voxel_m=0.05, extent=4096, remission=True),
     ),
+    "baseline": Kind(lambda classes, spec, frames: Baseline(classes, spec.size[2], frames), Seen(), history=True),
+    "baseline_hits": Kind(
+        lambda classes, spec, frames: Baseline(classes, spec.size[2], frames), Seen(rays=False), history=True
+    ),
 }
 
 
@@ -64,7 +70,8 @@ def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1)
         raise ArgumentError("network", expected=f"one of {', '.join(KINDS)}", found=repr(name))
     kind = KINDS[name]
     if history > 1 and not kind.history:
-        raise ArgumentError("history", expected=f"1 for {name}", found=str(history), advice="only motionsc takes more")
+        stacked = ", ".join(other for other, its in KINDS.items() if its.history)
+        raise ArgumentError("history", expected=f"1 for {name}", found=str(history), advice=f"only {stacked} take more")
     network = kind.build(num_classes, spec, history)
     check_size(network, name, spec.size)
     network.task = kind.task  # type: ignore[assignment]

@@ -9,11 +9,32 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from carlasc.metrics import ConfusionMatrix
+from carlasc.metrics import ConfusionMatrix, Uncertainty
 from completion.data import target_of
 from completion.losses import IGNORE
 from completion.processes import Processes
 from completion.tasks import Batch, task_of
+
+
+@torch.no_grad()
+def score_with_certainty(
+    network: nn.Module, loader: DataLoader[dict[str, Any]], num_classes: int, processes: Processes
+) -> tuple[ConfusionMatrix, Uncertainty]:
+    """Return the confusion matrix of a network over the known voxels of a split, and how well its probabilities are calibrated."""
+    network.eval()
+    task, matrix, certainty = task_of(network), ConfusionMatrix(num_classes), Uncertainty(num_classes)
+    for batch in loader:
+        target = target_of(batch, processes.device)
+        outputs = network(*task.arguments(task.prepare(batch, processes.device)))
+        logits = task.logits(outputs).float()
+        matrix.update(logits.argmax(-1), target, target != IGNORE)
+        for probabilities, truth in zip(logits.softmax(-1).cpu(), target.cpu(), strict=True):
+            certainty.update(probabilities, truth, truth != IGNORE)
+    for name in ("sums", "nll", "ece"):
+        total = processes.sum(torch.from_numpy(getattr(certainty, name)).to(processes.device))
+        setattr(certainty, name, total.cpu().numpy())
+    counts = processes.sum(torch.from_numpy(matrix.counts).to(processes.device))
+    return ConfusionMatrix(num_classes, counts=counts.cpu().numpy().astype(np.int64)), certainty
 
 
 @torch.no_grad()

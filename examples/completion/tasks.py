@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,17 +17,29 @@ from completion.losses import completion_loss
 Batch = dict[str, Any]
 
 
+def root_weights(counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+    """Return the cube root of how many times rarer each class is than the most frequent one; 0 for classes that never occur."""
+    counts = np.asarray(counts, np.float64)
+    return np.where(counts > 0, np.cbrt(counts.max() / np.maximum(counts, 1)), 0)
+
+
+WEIGHTINGS: Mapping[str, Callable[[NDArray[Any]], NDArray[np.float64]]] = {"log": class_weights, "root": root_weights}
+"""The class weights of the loss for the number of voxels of each class."""
+
+
 class Task:
     """The task of a network that takes occupancy to the logits of all voxels. A network that does something else has a subclass.
 
     Attributes:
         fields: fields of a sample that the network takes.
         training_fields: more fields, which only its loss takes, beside the labels of the voxels.
+        weighting: how much more a rare class weighs in its loss, if the settings do not say: one of `WEIGHTINGS`.
         fixed_shapes: whether the shapes of its inputs are always the same, so that it can be compiled.
     """
 
     fields: tuple[str, ...] = ("occupancy",)
     training_fields: tuple[str, ...] = ()
+    weighting = "log"
     fixed_shapes = True
 
     def from_scan(self, points: NDArray[np.float32], spec: GridSpec) -> Batch:
@@ -66,13 +79,14 @@ class Task:
         """Return how the parts make the loss: (S,) factors, and a number to add. Here the loss is the mean of the parts."""
         return torch.full_like(parts, 1 / len(parts)), parts.new_zeros(())
 
+    def logits(self, outputs: Any) -> Tensor:
+        """Return the (B, X, Y, Z, K) logits from what the network returns when it is not training."""
+        logits: Tensor = outputs
+        return logits
+
     def labels(self, outputs: Any) -> Tensor:
         """Return the (B, X, Y, Z) predicted classes from what the network returns when it is not training."""
-        return outputs.argmax(-1)
-
-    def class_weights(self, counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
-        """Return the (K,) class weights of the loss for the number of voxels of each class."""
-        return class_weights(np.asarray(counts))
+        return self.logits(outputs).argmax(-1)
 
     def set_epoch(self, network: nn.Module, epoch: int) -> None:
         """Change what the network changes from epoch to epoch, counted from 0."""

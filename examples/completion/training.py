@@ -6,6 +6,7 @@ import dataclasses
 import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from carlasc import Source
 from carlasc.errors import ArgumentError, CarlascError, ConflictError
 from carlasc.metrics import ConfusionMatrix
 from completion.config import Config
@@ -41,9 +43,13 @@ class Progress:
         losses: mean training loss of each epoch.
         mious: mIoU on the validation split after each epoch.
         samples_per_s: training samples per second in each epoch.
+        step: number of steps made of an epoch that is not finished.
+        loss_so_far: sum of their losses.
     """
 
     epoch: int = 0
+    step: int = 0
+    loss_so_far: float = 0.0
     best_epoch: int = 0
     best_miou: float = -1.0
     losses: list[float] = field(default_factory=list)
@@ -56,7 +62,9 @@ class Progress:
         return self.epoch >= config.epochs or stalled
 
 
-def train(source: str | Path, config: Config, out: Path, processes: Processes, *, resume: bool = False) -> Progress:
+def train(
+    source: str | Path | Source, config: Config, out: Path, processes: Processes, *, resume: bool = False
+) -> Progress:
     """Train a network on a data set.
 
     Writes to `out`: config.yaml, last.pt (to continue from), best.safetensors (the weights of the best epoch by mIoU) and TensorBoard's files.
@@ -86,28 +94,35 @@ def train(source: str | Path, config: Config, out: Path, processes: Processes, *
     progress = _resume(out, config, parts) if resume else _begin(out, config, processes)
     stepped = _prepare(network, config, processes)
 
+    def save() -> None:
+        if processes.first:
+            states = {name: part.state_dict() for name, part in parts.items()}
+            write_checkpoint(out / LAST, states | dataclasses.asdict(progress))
+        processes.wait()
+
     with Board(out / "tensorboard", data.classes, enabled=processes.first) as board:
         while not progress.is_over(config):
             start = time.perf_counter()
             task_of(network).set_epoch(network, progress.epoch)
-            loss = _train_epoch((network, stepped), optimizer, loader, weights, progress.epoch, config, processes)
+            first = progress.step
+            _train_epoch((network, stepped), optimizer, loader, weights, progress, config, processes, save)
+            loss = progress.loss_so_far / len(loader)
             elapsed_s = time.perf_counter() - start
             learning_rate = optimizer.param_groups[0]["lr"]
             schedule.step()
             processes.share(network.buffers())
             matrix = score(network, val_loader, num_classes, processes, config.precision == "bf16")
 
-            progress.epoch += 1
+            progress.epoch, progress.step, progress.loss_so_far = progress.epoch + 1, 0, 0.0
             progress.losses.append(loss)
             progress.mious.append(matrix.miou)
-            progress.samples_per_s.append(len(data) / elapsed_s)
+            progress.samples_per_s.append(len(data) * (1 - first / len(loader)) / elapsed_s)
             if matrix.miou > progress.best_miou:
                 progress.best_miou, progress.best_epoch = matrix.miou, progress.epoch
                 if processes.first:
                     write_weights(out / BEST, network)
+            save()
             if processes.first:
-                states = {name: part.state_dict() for name, part in parts.items()}
-                write_checkpoint(out / LAST, states | dataclasses.asdict(progress))
                 board.add_epoch(progress.epoch, loss, learning_rate, matrix)
                 board.add_pictures(progress.epoch, network, val, processes.device)
                 _print_epoch(progress, config, matrix)
@@ -130,10 +145,12 @@ def _begin(out: Path, config: Config, processes: Processes) -> Progress:
 
 
 def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
-    """Load last.pt. Nothing else is needed, because order, flips and draws depend on the seed and the epoch only."""
+    """Load last.pt. Nothing else is needed, because order, flips and draws depend on the seed, the epoch and the step only."""
     before = Config.read(out / CONFIG) if (out / CONFIG).is_file() else config
     changed = [f.name for f in dataclasses.fields(Config) if getattr(before, f.name) != getattr(config, f.name)]
-    if changed := [name for name in changed if name not in ("epochs", "patience", "workers")]:
+    if changed := [
+        name for name in changed if name not in ("epochs", "patience", "workers", "save_every", "keep_samples")
+    ]:
         raise ConflictError(
             out / CONFIG,
             expected="the settings of the run that is resumed",
@@ -168,17 +185,24 @@ def _train_epoch(
     optimizer: torch.optim.Optimizer,
     loader: TrainLoader,
     class_weights: Tensor,
-    epoch: int,
+    progress: Progress,
     config: Config,
     processes: Processes,
-) -> float:
-    """Make the steps of an epoch; return the mean loss. `networks` are the network itself, and as it is wrapped."""
+    save: Callable[[], None],
+) -> None:
+    """Make the steps of an epoch that are left, and note them in `progress`. `networks` are the network itself, and as it is wrapped."""
     networks[1].train()
-    total = 0.0
-    for step, batch in enumerate(loader.epoch(epoch)):
+    epoch = progress.epoch
+    for step, batch in enumerate(loader.epoch(epoch, progress.step), progress.step):
         try:
             loss = _train_step(networks, optimizer, batch, class_weights, (epoch, step), config, processes)
-        except (torch.OutOfMemoryError, RuntimeError) as error:
+        except (torch.OutOfMemoryError, RuntimeError, ValueError) as error:
+            if "more than 1 value per channel" in str(error):  # torch's words, where a batch norm has one value only
+                raise CarlascError(
+                    f"epoch {epoch + 1}, batch {step + 1}",
+                    problem=f"{len(batch['frame'])} sample is too little for a batch norm on a grid as small as this",
+                    advice=f"choose a batch_size that does not leave one of the {len(loader.data)} samples alone",
+                ) from error
             if not _is_out_of_memory(error):
                 raise
             smaller = max(1, config.batch_size // 2)
@@ -195,14 +219,15 @@ def _train_epoch(
                 problem=f"the loss is {loss} (frames {names})",
                 advice=f"try a smaller learning rate; the last finished epoch is in {LAST}",
             )
-        total += loss
+        progress.step, progress.loss_so_far = step + 1, progress.loss_so_far + loss
+        if config.save_every and progress.step % config.save_every == 0 and progress.step < len(loader):
+            save()
         if processes.first and sys.stderr.isatty():
             print(
-                f"\repoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss {total / (step + 1):.4f}",
+                f"\repoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss {progress.loss_so_far / (step + 1):.4f}",
                 end="",
                 file=sys.stderr,
             )
-    return total / len(loader)
 
 
 def _train_step(

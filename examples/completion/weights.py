@@ -23,8 +23,12 @@ _MARKS = {  # a name that only one network's state dict has; looked for in this 
     "sscnet": "conv_classes.weight",
     "js3cnet": "seg_head.sparseModel.2.0.1.weight",
     "js3cnet_kitti": "seg_head.sparseModel.2.0.1.0.weight",
+    "baseline": "voxels.weight",
 }
-_VARIANTS = {"js3cnet_exact": "js3cnet"}  # networks whose weights cannot be told from those of another
+_VARIANTS = {
+    "js3cnet_exact": "js3cnet",
+    "baseline_hits": "baseline",
+}  # networks whose weights cannot be told from those of another
 
 
 def read_weights(path: Path) -> StateDict:
@@ -139,6 +143,7 @@ def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None
         "sscnet": "conv_classes.bias",
         "js3cnet": "complet_head.Decoder.pre_conv2.0.bias",
         "js3cnet_kitti": "complet_head.Decoder.pre_conv2.0.bias",
+        "baseline": "classes.bias",
     }
     return name, len(state[last.get(_VARIANTS.get(name, name), "seg_head_1_1.conv_classes.bias")])
 
@@ -146,6 +151,8 @@ def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None
 def _advice(layer: str) -> str:
     if "conv3d_" in layer:
         return "the weights are for another history (T)"
+    if layer.startswith("seen."):
+        return "the weights are for another history (T), or for another grid (cells along z)"
     if "classes" in layer or layer.startswith("seg_head.linear"):
         return "the weights are for another number of classes"
     return "the weights are for another grid (cells along z) or network"

@@ -27,6 +27,7 @@ class PointsAndVoxels(Task):
     """
 
     training_fields = ("point_labels",)
+    weighting = "root"
     fixed_shapes = False
 
     def __init__(self, voxel_m: float = 0.1, extent: int = 2048, *, remission: bool = False) -> None:
@@ -103,14 +104,9 @@ class PointsAndVoxels(Task):
         variances = torch.cat([network.get_parameter("seg_sigma"), network.get_parameter("complet_sigma")]) ** 2
         return 1 / variances, variances.log().sum()
 
-    def labels(self, outputs: Prediction) -> Tensor:
-        """Return the classes of the voxels."""
-        return outputs.voxels.argmax(-1)
-
-    def class_weights(self, counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
-        """Return the cube root of how many times rarer each class is than the most frequent one; 0 for classes that never occur."""
-        counts = np.asarray(counts, np.float64)
-        return np.where(counts > 0, np.cbrt(counts.max() / np.maximum(counts, 1)), 0)
+    def logits(self, outputs: Prediction) -> Tensor:
+        """Return the logits of the voxels."""
+        return outputs.voxels
 
     def set_epoch(self, network: nn.Module, epoch: int) -> None:
         """Set the momentum of the norms of points and of neighbours, which falls every ten epochs."""

@@ -16,6 +16,7 @@ pytest.importorskip("torch", reason="needs carlasc[torch]")
 
 import torch
 from completion.losses import IGNORE
+from completion.tasks import WEIGHTINGS
 from js3cnet.model import JS3CNet, nearest, pool
 from js3cnet.sparse import Level, NormReLU, SameSites, Sites
 from js3cnet.task import PointsAndVoxels, site_cells
@@ -322,7 +323,7 @@ def test_remission_is_the_fourth_column_where_a_network_takes_it_and_must_be_the
 
 
 def test_class_weights_are_cube_roots_of_the_rarity():
-    np.testing.assert_allclose(PointsAndVoxels().class_weights(np.array([800, 100, 0])), [1, 2, 0])
+    np.testing.assert_allclose(WEIGHTINGS[PointsAndVoxels().weighting](np.array([800, 100, 0])), [1, 2, 0])
 
 
 def test_the_momentum_of_the_norms_of_points_falls_and_the_others_stay():

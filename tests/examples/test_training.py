@@ -11,14 +11,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.completion import write_split
+from helpers.range_server import serve_folder
 
+import carlasc
+from carlasc import ShardSampler, pack
 from carlasc.core import REMAPS
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
 import torch
+from completion import training
 from completion.config import Config
+from completion.data import EpochSampler, TrainLoader, open_split
 from completion.processes import Processes
 from completion.training import BEST, LAST, train
 from completion.weights import read_checkpoint, read_weights
@@ -65,6 +70,55 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data,
         assert torch.equal(value, found[name]), name
 
 
+@pytest.mark.parametrize("store", ["files", "zarr"])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_run_that_is_stopped_in_the_middle_of_an_epoch_ends_with_the_same_weights(
+    data, tmp_path, monkeypatch, store, workers
+):
+    source = data if store == "files" else pack(data, tmp_path / "data.zarr").out
+    config = replace(QUICK, free_ratio=2.0, save_every=1)
+    whole = train(source, config, tmp_path / "whole", ALONE)
+    steps = []
+
+    def stop_in_the_second_epoch(networks, optimizer, batch, weights, place, *others):
+        steps.append(place)
+        if place == (1, 2):
+            raise KeyboardInterrupt
+        return training._train_step_before(networks, optimizer, batch, weights, place, *others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_train_step_before", training._train_step, raising=False)
+        patch.setattr(training, "_train_step", stop_in_the_second_epoch)
+        with pytest.raises(KeyboardInterrupt):
+            train(source, replace(config, workers=workers), tmp_path / "parts", ALONE)
+    assert steps == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
+    parts = train(source, config, tmp_path / "parts", ALONE, resume=True)
+    assert parts.losses == whole.losses and parts.mious == whole.mious
+    expected, found = read_weights(tmp_path / "whole" / LAST), read_weights(tmp_path / "parts" / LAST)
+    for name, value in expected.items():
+        assert torch.equal(value, found[name]), name
+
+
+@pytest.mark.needs("zarr", "aiohttp")
+def test_training_from_a_server_gives_the_weights_of_training_from_disk(data, tmp_path):
+    store = pack(data, tmp_path / "served" / "data.zarr").out
+    here = train(store, replace(QUICK, epochs=1), tmp_path / "here", ALONE)
+    with serve_folder(store.parent) as served:
+        source = carlasc.open(f"{served.url}/data.zarr", cache=tmp_path / "cache")
+        there = train(source, replace(QUICK, epochs=1), tmp_path / "there", ALONE)
+    assert there.losses == here.losses and there.mious == here.mious
+    assert max(served.sent[path] - (store.parent / path).stat().st_size for path in served.sent) == 0
+
+
+def test_shards_of_a_packed_store_are_read_one_after_another_and_files_in_any_order(data, tmp_path):
+    assert isinstance(TrainLoader(open_split(data, "train", QUICK), QUICK).sampler, EpochSampler)
+    packed = pack(data, tmp_path / "data.zarr").out
+    loaders = [TrainLoader(open_split(packed, "train", QUICK), replace(QUICK, batch_size=4), r, 2) for r in range(2)]
+    assert all(isinstance(loader.sampler, ShardSampler) for loader in loaders)
+    places = [[str(b["sequence"]) + str(b["frame"]) for b in loader.epoch(0)] for loader in loaders]
+    assert len(places[0]) == len(places[1]) == 2 and not set(places[0]) & set(places[1])
+
+
 def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(data, tmp_path):
     train(data, replace(QUICK, epochs=1), tmp_path, ALONE)
     with pytest.raises(ConflictError, match="--resume"):
@@ -106,8 +160,6 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_the_batch(data, tmp_pa
 
 
 def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monkeypatch):
-    from completion import training
-
     def no_memory(*_):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
@@ -133,7 +185,7 @@ def test_data_that_cannot_be_trained_on_is_named(data, tmp_path):
 
 
 def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(data, tmp_path):
-    from completion.data import class_weights, open_split
+    from completion.data import class_weights
 
     split = open_split(data, "train", QUICK)
     names = split.classes.names
@@ -144,9 +196,41 @@ def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(
     np.testing.assert_allclose(found, np.arange(11) / 10)
 
 
+def test_how_much_rare_classes_weigh_is_the_networks_own_unless_the_settings_say(data):
+    from completion.data import class_weights, open_split
+    from completion.tasks import root_weights
+
+    split = open_split(data, "train", QUICK)
+    log, root = (class_weights(data, split, replace(QUICK, weighting=kind)) for kind in ("log", "root"))
+    np.testing.assert_array_equal(class_weights(data, split, QUICK), log)
+    np.testing.assert_array_equal(class_weights(data, split, replace(QUICK, network="baseline")), root)
+    assert root.max() / root[0] > log.max() / log[0]
+    np.testing.assert_allclose(root_weights(np.array([800, 100, 0])), [1, 2, 0])
+    with pytest.raises(ArgumentError, match="weighting: expected .*found 'much'"):
+        replace(QUICK, weighting="much")
+
+
+def test_a_score_with_certainty_is_the_score_and_its_calibration(data):
+    from completion.data import eval_loader, open_split
+    from completion.networks import build_network
+    from completion.scoring import score, score_with_certainty
+
+    val = open_split(data, "val", QUICK)
+    network = build_network("lmscnet_ss", 11, val.spec)
+    matrix, certainty = score_with_certainty(network, eval_loader(val, QUICK), 11, ALONE)
+    np.testing.assert_array_equal(matrix.counts, score(network, eval_loader(val, QUICK), 11, ALONE).counts)
+    result = certainty.compute()
+    voxels = result.empty.count.sum() + result.occupied.count.sum()
+    assert voxels == matrix.total
+    right = np.nansum(result.empty.accuracy * result.empty.count) + np.nansum(
+        result.occupied.accuracy * result.occupied.count
+    )
+    assert right == pytest.approx(matrix.true_positives.sum())
+
+
 def test_the_mistakes_of_the_fork_of_js3cnet_are_not_made(data):
     """Ground stays ground in the labels of points, and class weights are those of the voxel counts."""
-    from completion.data import class_weights, open_split
+    from completion.data import class_weights
 
     split = open_split(data, "train", replace(QUICK, network="js3cnet"), training=True)
     sequence = split.sequences[0]
@@ -170,8 +254,6 @@ def test_the_mistakes_of_the_fork_of_js3cnet_are_not_made(data):
 
 
 def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_path):
-    from completion.data import open_split
-
     raw = (10, 40, 52, 99)  # car, road, and two that the benchmark ignores
     for split in ("Train", "Val"):
         write_split(tmp_path, split, [f"KITTI_{split}"], frames=2, classes=raw, table="semantickitti")
@@ -192,7 +274,7 @@ def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_
 
 def test_settings_files_of_every_network_are_read(examples):
     files = sorted(examples.glob("*/*.yaml"))
-    assert len(files) == 8
+    assert len(files) == 9
     for file in files:
         assert Config.read(file, ["epochs=3"]).epochs == 3
     with pytest.raises(ArgumentError, match="found speed"):
@@ -259,6 +341,7 @@ def test_data_that_have_no_soft_labels_are_refused_with_what_to_do(data, tmp_pat
         replace(QUICK, soft_labels=True, remap="semantickitti19")
 
 
+@pytest.mark.slow
 def test_the_script_takes_soft_labels(certain, tmp_path, examples):
     settings = {"epochs": 1, "batch_size": 2, "workers": 0, "class_weights": "none"}
     options = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]

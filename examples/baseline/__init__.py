@@ -1,0 +1,1 @@
+"""A small network of our own: what past scans saw in, classes of all voxels out."""
