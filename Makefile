@@ -49,8 +49,8 @@ unit: $(VENV)/ready ## the quick tests
 benchmark: $(VENV)/ready ## time the hot paths (docs/performance.md)
 	$(RUN)/pytest tests/benchmarks --benchmark-enable --benchmark-only -p no:xdist -m slow
 
-benchmark-ssc: $(VENV)/ready ## train the networks on a small simulated data set and print the tables (SIZE=full on a GPU)
-	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small) --history
+benchmark-ssc: $(VENV)/ready ## train networks on simulated drives and print the tables, 20 minutes (SIZE=medium: hours, SIZE=full: on a GPU)
+	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small)
 
 notebooks: $(VENV)/ready ## run the notebooks and keep what they show in them
 	$(RUN)/python examples/notebooks/run.py

@@ -300,6 +300,7 @@ def test_pictures_are_small_and_shown_on_a_page(figures):
         assert f"images/{image.name}" in shown, image.name
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy():
     heavy = "{'numba', 'scipy', 'trimesh', 'torch', 'zarr', 'h5py', 'pyarrow', 'matplotlib', 'PIL', 'fsspec'}"
     for name in group().commands:

@@ -18,12 +18,14 @@ pytestmark = pytest.mark.slow
 
 GOOD = {
     "train": """
-        from carlasc import Dataset, Flip
+        from carlasc import Dataset, Flip, ShardSampler
         from torch.utils.data import DataLoader
 
         dataset = Dataset("CarlaSC", split="train", history=5, fields=("occupancy", "labels", "known"))
         dataset.transform = Flip(dataset.spec, seed=0)
-        loader = DataLoader(dataset, batch_size=2, shuffle=True)
+        sampler = ShardSampler(dataset, seed=0)
+        position: int = sampler.state_dict(trained=2)["position"]
+        loader = DataLoader(dataset, batch_size=2, sampler=sampler)
         for batch in loader:
             batch["occupancy"]
         names = dataset.classes.names[0].lower()

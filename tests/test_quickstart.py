@@ -8,8 +8,10 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from helpers.drives import write_drive  # noqa: E402
+from helpers.range_server import serve_folder  # noqa: E402
 
 from carlasc.core.grids import GridSpec  # noqa: E402
+from carlasc.storage.packing import pack  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 HOWTO, README = ROOT / "docs" / "howto" / "train.md", ROOT / "README.md"
@@ -52,10 +54,15 @@ def test_the_quick_start_makes_one_training_step_in_ten_lines(path, downloads):
     assert names["optimizer"].state[next(network.parameters())]["step"] == 1
 
 
-def test_the_how_to_runs_from_top_to_bottom(downloads, capsys):
+@pytest.mark.needs("zarr", "aiohttp")
+def test_the_how_to_runs_from_top_to_bottom(downloads, capsys, tmp_path):
     names: dict = {}
-    for block in blocks(HOWTO.read_text()):
-        exec(block, names)
+    (tmp_path / "bucket").mkdir()
+    pack(tmp_path / "CarlaSC", tmp_path / "bucket" / "carlasc.zarr")
+    with serve_folder(tmp_path) as served:  # in place of a bucket
+        for block in blocks(HOWTO.read_text()):
+            exec(block.replace("s3://bucket/", f"{served.url}/bucket/"), names)
+    assert names["state"]["position"] == 4 and list((tmp_path / "cache").glob("??/*"))
     assert capsys.readouterr().out == (
         "[(300, 3), (300, 3)] (2, 128, 128, 8)\ncartesian 256 x 256 x 16 cylindrical 128 x 128 x 8\n"
     )
