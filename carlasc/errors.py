@@ -5,7 +5,6 @@ Every message is one line: what it is about (a file, a field, an argument), what
 
 from __future__ import annotations
 
-import copy
 import importlib
 import re
 from types import ModuleType
@@ -45,7 +44,10 @@ class CarlascError(Exception):
 
     def within(self, where: object) -> Self:
         """Return a copy that also names what contains the place: `within("a.zip")` of an error at "b" is at "a.zip: b"."""
-        error = copy.copy(self)
+        error = type(self).__new__(
+            type(self), *self.args
+        )  # not copy.copy: packages that pickle tracebacks change what it does
+        vars(error).update(vars(self))
         error.where = f"{where}: {self.where}"
         return error
 
