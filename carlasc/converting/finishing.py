@@ -16,7 +16,7 @@ from carlasc.converting.actors import Velocity
 from carlasc.converting.assembling import Motion, Rig, assemble
 from carlasc.converting.axes import mirror_boxes, mirror_points
 from carlasc.converting.nearby import labels_nearby
-from carlasc.converting.outcomes import Fields, Outcome, write_outcomes
+from carlasc.converting.outcomes import Fields, Outcome, written_in_worker
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.scans import make_fields
 from carlasc.converting.target import Target
@@ -76,10 +76,7 @@ class FinishBlock:
 
 def finish_block(block: FinishBlock) -> list[Outcome]:
     """Finish several frames, and write them if the writer can be used in workers."""
-    outcomes = [_finish(job, block) for job in block.jobs]
-    if block.writer.concurrent:
-        write_outcomes(block.writer, outcomes)
-    return outcomes
+    return written_in_worker(block.writer, [_finish(job, block) for job in block.jobs])
 
 
 def fail_finish_block(block: FinishBlock, message: str) -> list[Outcome]:

@@ -13,6 +13,7 @@ from carlasc.errors import CarlascError, StorageError
 from carlasc.storage.sinks import SequenceWriter
 
 Item = TypeVar("Item")
+Result = TypeVar("Result", bound="Outcome")
 _BLOCK = 8  # frames of a task where each has files of its own, because a task costs more than a frame
 
 Fields = Mapping[str, NDArray[Any]]
@@ -54,6 +55,13 @@ def write_outcomes(writer: SequenceWriter, outcomes: Iterable[Outcome]) -> None:
         writer.write_frames(frames)
     for outcome in outcomes:
         outcome.outputs = {}
+
+
+def written_in_worker(writer: SequenceWriter, outcomes: list[Result]) -> list[Result]:
+    """Return the outcomes of a block, written if the writer can be used in workers."""
+    if writer.concurrent:
+        write_outcomes(writer, outcomes)
+    return outcomes
 
 
 def in_blocks(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from carlasc.converting.actors import ActorSighting, find_actors
 from carlasc.converting.assembling import Assembled, Motion, Rig, assemble
 from carlasc.converting.axes import mirror_grid, mirror_points
-from carlasc.converting.outcomes import Fields, Outcome, write_outcomes
+from carlasc.converting.outcomes import Fields, Outcome, written_in_worker
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.target import Target
 from carlasc.core.classes import ClassTable
@@ -79,10 +79,7 @@ class FrameResult(Outcome):
 
 def convert_block(block: Block) -> list[FrameResult]:
     """Read several frames, and write them if the writer can be used in workers."""
-    results = [_convert(job, block) for job in block.jobs]
-    if block.writer.concurrent:
-        write_outcomes(block.writer, results)
-    return results
+    return written_in_worker(block.writer, [_convert(job, block) for job in block.jobs])
 
 
 def fail_block(block: Block, message: str) -> list[FrameResult]:

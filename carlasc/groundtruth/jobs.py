@@ -155,9 +155,10 @@ class Work:
 
         Sequences follow each other without a pause: while the last frames of one are made, the next one is prepared and begun.
         """
-        ours = [job.missing() & dealt for job, dealt in zip(self.jobs, self._deal(), strict=True)]
+        dealt = self._deal()
+        ours = [job.missing() & numbers for job, numbers in zip(self.jobs, dealt, strict=True)]
         self.wanted = sum(map(len, ours))
-        self.skipped = sum(map(len, self._deal())) - self.wanted
+        self.skipped = sum(map(len, dealt)) - self.wanted
         passes = sum(job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing)
         steps = Steps(progress, self.skipped, self.skipped + self.wanted + passes)
         under_way: deque[Job] = deque()  # the job of each batch, in order

@@ -95,7 +95,7 @@ class SimulatedCapture(Capture):
 
     @property
     def _drive(self) -> Drive:
-        return drive_of(*self._drive_of)
+        return _cached_drive(*self._drive_of)
 
     def _check(self, frame: int) -> None:
         if frame not in self._frames:
@@ -104,6 +104,6 @@ class SimulatedCapture(Capture):
 
 
 @lru_cache(maxsize=1)
-def drive_of(seed: int, traffic: TrafficLevel, lidar: Lidar) -> Drive:
+def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> Drive:
     """Return the drive of this process: the town is built once."""
     return Drive(seed, traffic, lidar)

@@ -12,9 +12,8 @@ from functools import partial
 import numpy as np
 
 from carlasc.captures.lidar import Lidar
-from carlasc.captures.settings import TrafficLevel, check_at_least, check_traffic
-from carlasc.captures.town.birdseye import render_birdseye
-from carlasc.captures.town.simulated import drive_of
+from carlasc.captures.settings import TrafficLevel
+from carlasc.captures.town.simulated import SimulatedCapture
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
 from carlasc.errors import import_extra
@@ -106,9 +105,9 @@ def simulate(
         StorageError: `out` cannot be written to.
         CarlascError: a worker process died.
     """
-    check_at_least(1, count=count, sensors=sensors)
-    check_at_least(0, first_frame=first_frame, seed=seed)
-    check_traffic(traffic)
+    drive = SimulatedCapture(
+        count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev
+    )
     check_shared(os.fspath(out), count_workers(workers))
     settings = _Settings(seed, traffic, sensors, bev, lidar or Lidar())
     check_dependencies(bev)
@@ -122,7 +121,7 @@ def simulate(
     if progress is not None:
         progress(len(complete), len(wanted))
     points: Counter[str] = Counter()
-    recorded = run_all(partial(_record_frame, writer, settings), missing, workers=workers, executor=executor)
+    recorded = run_all(partial(_record_frame, writer, drive), missing, workers=workers, executor=executor)
     with TimesLog(writer) as log:
 
         def note(frame: int) -> None:
@@ -165,15 +164,14 @@ def check_dependencies(bev: bool = True) -> None:
         import_extra(module, "simulate")
 
 
-def _record_frame(writer: CaptureWriter, settings: _Settings, frame: int) -> dict[str, int]:
+def _record_frame(writer: CaptureWriter, drive: SimulatedCapture, frame: int) -> dict[str, int]:
     """Write the recordings of all sensors and the picture of a frame. Return the number of points per class name."""
-    drive = drive_of(settings.seed, settings.traffic, settings.lidar)
     points = np.zeros(CARLA.num_channels, np.int64)
-    for sensor in range(settings.sensors):
-        recording = drive.record(frame, sensor)
+    for sensor in drive.sensors:
+        recording = drive.read(sensor, frame)
         if recording.scan.labels is not None:
             points += np.bincount(recording.scan.labels, minlength=len(points))
         writer.write(sensor, frame, recording)
-    if settings.bev:
-        writer.write_bev(frame, render_birdseye(drive.snapshot(frame)))
+    if (picture := drive.read_bev(frame)) is not None:
+        writer.write_bev(frame, picture)
     return {CARLA.names[label]: int(number) for label, number in enumerate(points) if number}
