@@ -24,10 +24,8 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.grid_options import (
     BoundsOption,
-    Coordinates,
     CoordinatesOption,
     DynamicOption,
-    Preset,
     PresetOption,
     ResOption,
     RuleOption,
@@ -35,7 +33,7 @@ from carlasc.cli.grid_options import (
     StrideOption,
     WindowMOption,
     WindowOption,
-    parse_grid,
+    parse_grid_or_published,
     scans_of,
 )
 from carlasc.errors import ArgumentError
@@ -178,9 +176,7 @@ def convert(
             expected="--bounds or --grids none with it, because the height of grids is found from the ground of all sequences",
             found="neither",
         )
-    if preset is None and res is None and size is None:
-        preset = Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse
-    spec = parse_grid(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
+    spec = parse_grid_or_published(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
     with progress_bar(f"convert {name}") as progress, engine(cluster, workers) as executor:
         result = convert_recordings(
             name,

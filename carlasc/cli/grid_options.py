@@ -183,6 +183,15 @@ def _parse_window(text: str) -> tuple[int, int]:
         ) from None
 
 
+def parse_grid_or_published(
+    res: str | None, size: str | None, preset: Preset | None, coordinates: Coordinates | None, bounds: str | None
+) -> GridSpec:
+    """Return the grid that the options describe, or the published one of the coordinates if they name none."""
+    if res is None and size is None and preset is None:
+        preset = Preset.cylindrical if coordinates is Coordinates.cylindrical else Preset.coarse
+    return parse_grid(res, size, preset, coordinates, bounds)
+
+
 def parse_grid(
     res: str | None, size: str | None, preset: Preset | None, coordinates: Coordinates | None, bounds: str | None
 ) -> GridSpec:

@@ -32,11 +32,10 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.grid_options import (
     CoordinatesOption,
-    Preset,
     PresetOption,
     ResOption,
     SizeOption,
-    parse_grid,
+    parse_grid_or_published,
 )
 
 if TYPE_CHECKING:
@@ -83,9 +82,7 @@ def simulate(
             )
         print_json(written) if json else _print_capture(written)
         return
-    if res is None and size is None and preset is None:
-        preset = Preset.cylindrical if coordinates == "cylindrical" else Preset.coarse
-    spec, simulated = parse_grid(res, size, preset, coordinates, None), captures.SimulatedCapture(**drive)
+    spec, simulated = parse_grid_or_published(res, size, preset, coordinates, None), captures.SimulatedCapture(**drive)
     with progress_bar("simulate") as progress, engine(cluster, workers) as executor:
         made = regrid(simulated, spec, out, workers=workers, executor=executor, part=part_of, progress=progress)
     print_json(made) if json else _print_grids(made)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, rotate_vectors, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import run_all
 
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""

@@ -21,8 +21,9 @@ from carlasc.converting.records import ExportRecord
 from carlasc.converting.registry import load_exporter
 from carlasc.converting.results import Failure, Progress, Steps
 from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageError
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, count_workers, one_pool, run_all
+from carlasc.running.processes import count_workers, one_pool, run_all
 from carlasc.storage.files import remove_stale, write_atomic
 
 

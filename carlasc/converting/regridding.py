@@ -12,7 +12,7 @@ from carlasc.converting.results import Steps
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
-from carlasc.running.processes import Engine
+from carlasc.running.engines import Engine
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import Sink
 

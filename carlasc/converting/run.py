@@ -28,8 +28,9 @@ from carlasc.converting.target import Target
 from carlasc.converting.trajectory import PoseSource
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, count_workers, one_pool
+from carlasc.running.processes import count_workers, one_pool
 from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.remote import check_shared

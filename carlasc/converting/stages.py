@@ -26,7 +26,8 @@ from carlasc.converting.trajectory import estimate_poses, fill_gaps, jitter_note
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import run_all
 from carlasc.storage.metadata import Metadata
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for

@@ -24,7 +24,7 @@ from carlasc.groundtruth.options import FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.evidence import Evidence
-from carlasc.running.processes import Engine
+from carlasc.running.engines import Engine
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence

@@ -16,8 +16,9 @@ from carlasc.groundtruth.inputs import Plan, SequenceInput, Steps
 from carlasc.groundtruth.reporting.facts import sample_frames
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.groundtruth.tasks import Batch, Done, MakeFrame, MeasureFrame, Task, fail_batch, run_batch, write_frames
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.sinks import SequenceWriter
 

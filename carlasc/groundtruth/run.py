@@ -20,8 +20,9 @@ from carlasc.groundtruth.from_scans.sequences import scan_sequences
 from carlasc.groundtruth.inputs import Plan, SequenceInput
 from carlasc.groundtruth.jobs import FrameFailure, Job, Work
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, count_workers, one_pool
+from carlasc.running.processes import count_workers, one_pool
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.folders.trees import is_url

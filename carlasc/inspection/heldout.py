@@ -24,7 +24,8 @@ from carlasc.groundtruth.from_scans.others import feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import Plan, Steps
 from carlasc.inspection.heldout_scores import HeldOutScores
-from carlasc.running.processes import Engine, count_workers, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import count_workers, run_all
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 

@@ -18,7 +18,8 @@ from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_fram
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
-from carlasc.running.processes import Engine, count_workers, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import count_workers, run_all
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence, FolderWriter
 from carlasc.storage.protocol import Sequence, Source

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.running.processes import Engine, count_workers, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import count_workers, run_all
 from carlasc.storage import as_source
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source

@@ -23,7 +23,8 @@ from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import run_all
 from carlasc.storage import as_source, layout
 from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source

@@ -13,7 +13,8 @@ from carlasc.metrics.conventions import CONVENTIONS, Convention
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
 from carlasc.metrics.scorer import LabelPair, Options, Region, Scorer, Voxels
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import run_all
 
 _TOGETHER = 8  # frames that a worker scores in one task
 

@@ -7,11 +7,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cached_property
 from itertools import islice, takewhile
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from carlasc.errors import CarlascError, import_extra
+from carlasc.running.engines import DaskClient, LazyClient
 from carlasc.running.pools import LostTaskError
 from carlasc.running.workers import Session, run_task
 
@@ -22,38 +22,6 @@ _AHEAD = 4  # tasks that the scheduler knows, per thread of the workers
 _LEAST = 32  # also with few threads, so that calls for several tasks at once are enough
 _TOGETHER = 16  # results that are fetched together, at most
 _COUNT_S = 1.0  # workers are counted again after this time
-
-
-class DaskClient(Protocol):
-    """What is used of a `distributed.Client`."""
-
-    id: str
-    status: str
-
-    def map(self, func: Any, *iterables: Any, **kwargs: Any) -> Any:
-        """Start tasks."""
-
-    def gather(self, futures: Any) -> Any:
-        """Return the results of tasks."""
-
-    def nthreads(self) -> Any:
-        """Return the number of threads of each worker."""
-
-
-class LazyClient:
-    """A client that connects when it is first used: a cluster starts no jobs for a run that has nothing to do, or wrong arguments.
-
-    Args:
-        connect: returns the client.
-    """
-
-    def __init__(self, connect: Callable[[], DaskClient]) -> None:
-        self._connect = connect
-
-    @cached_property
-    def client(self) -> DaskClient:
-        """The client of Dask."""
-        return self._connect()
 
 
 def run_on_cluster(

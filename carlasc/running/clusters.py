@@ -12,15 +12,14 @@ from functools import partial
 from typing import Any
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra
-from carlasc.running.clients import DaskClient, LazyClient, one_line_if_lost
+from carlasc.running.clients import one_line_if_lost
+from carlasc.running.engines import DaskClient, LazyClient
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
 from carlasc.running.processes import count_workers
 from carlasc.running.workers import Versions
 
-_CONNECT_S, _WORKERS_S = (
-    "10s",
-    "10m",
-)  # Dask's settings carlasc.connect-timeout and carlasc.workers-timeout replace these
+_CONNECT_S = "10s"  # Dask's setting carlasc.connect-timeout replaces it
+_WORKERS_S = "10m"  # the same of carlasc.workers-timeout
 _REFILL_S = 2.0
 _FORMS = "local, local:N, tcp://HOST:PORT, slurm, or the dotted path of a class"
 _SETTINGS = {

@@ -11,14 +11,11 @@ from itertools import chain, islice
 from typing import TypeVar
 
 from carlasc.errors import ArgumentError, CarlascError
-from carlasc.running.clients import DaskClient, LazyClient, run_on_cluster
+from carlasc.running.engines import Engine
 from carlasc.running.pools import LostTaskError, OwnProcesses
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-Engine = Executor | DaskClient | LazyClient
-"""What does work in parallel: any `concurrent.futures.Executor`, a `distributed.Client` of Dask, or what `open_cluster` yields."""
 
 
 def run_all(
@@ -65,6 +62,8 @@ def run_all(
     elif isinstance(executor, Executor):
         yield from _submit_all(executor, function, items, 2 * workers, lost)
     else:
+        from carlasc.running.clients import run_on_cluster  # Dask and what a worker of it needs
+
         yield from run_on_cluster(executor, function, items, lost)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError
-from carlasc.running.processes import Engine, count_workers, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import count_workers, run_all
 from carlasc.storage import layout
 from carlasc.storage.folders.trees import is_url
 from carlasc.storage.protocol import Sequence, Source

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, count_workers
+from carlasc.running.processes import count_workers
 from carlasc.storage import layout
 from carlasc.storage.copying import (
     Block,

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from carlasc.errors import ConflictError
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, count_workers
+from carlasc.running.processes import count_workers
 from carlasc.storage.copying import Progress, blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
 from carlasc.storage.folders.folder import FolderSink
 from carlasc.storage.folders.trees import is_url

@@ -13,7 +13,7 @@ from helpers import jobs
 
 from carlasc.errors import CarlascError
 from carlasc.running import open_cluster, run_all
-from carlasc.running.clients import LazyClient
+from carlasc.running.engines import LazyClient
 
 pytestmark = pytest.mark.needs("distributed")
 

@@ -17,8 +17,9 @@ from carlasc.captures.town.simulated import SimulatedCapture
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
 from carlasc.errors import import_extra
+from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
-from carlasc.running.processes import Engine, count_workers, run_all
+from carlasc.running.processes import count_workers, run_all
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.storage.remote import check_shared
 

@@ -35,7 +35,8 @@ from carlasc.motion import (
     seen_from,
     tracks_from_boxes,
 )
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.folders.folder import FolderSequence
 

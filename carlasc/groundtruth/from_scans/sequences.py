@@ -34,7 +34,7 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.motion import LONGEST_M
-from carlasc.running.processes import Engine
+from carlasc.running.engines import Engine
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter

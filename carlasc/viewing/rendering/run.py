@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
-from carlasc.running.processes import Engine, run_all
+from carlasc.running.engines import Engine
+from carlasc.running.processes import run_all
 from carlasc.viewing.colors import merge_legends
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.rendering.cameras import Viewpoint
