@@ -96,6 +96,7 @@ class OwnProcesses(Executor):
             self._pool.shutdown()
             self._pool = _Pool(workers)
         if not self._is_alive():
+            self._pool.shutdown()  # what its processes say on stderr comes before the error, not after it
             raise CarlascError(
                 "worker processes die as soon as they start",
                 problem='there is no memory for them, or they are started by a script without `if __name__ == "__main__":`',
