@@ -18,6 +18,7 @@ from carlasc.converting.plans import (
     check_voxel_grid,
     choose_recordings,
     plan_recording,
+    sequence_path,
 )
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import load_converter
@@ -117,7 +118,7 @@ def convert(
     converter = load_converter(name) if isinstance(name, str) else name
     _check(converter, classes=classes, axes=axes, grids=grids, split=split, poses=poses, flow=flow)
     root = Path(source)
-    sink = as_sink(out)
+    sink = as_sink(out, part=part)
     check_shared(sink.location, 1 if executor is None and workers == 1 else 2)
     _check_sink(root, sink, grids)
     if not root.exists():
@@ -171,7 +172,7 @@ def convert(
         notes += result.notes
         failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
     return ConvertResult(
-        tuple(plan.writer.location for plan in plans),
+        tuple(f"{sink.location}/{sequence_path(plan.recording)}" for plan in plans),
         sum(conversion.made for conversion in done),
         sum(len(plan.recording.frames) - len(plan.unfinished) for plan in plans),
         tuple(failures),

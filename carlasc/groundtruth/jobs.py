@@ -42,6 +42,7 @@ class FrameFailure:
 class Job:
     """What a run does with one sequence: what is made, where it goes, and the documents to write first."""
 
+    path: str
     inputs: SequenceInput
     plan: Plan
     writer: SequenceWriter

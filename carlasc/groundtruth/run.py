@@ -119,7 +119,7 @@ def regrid(
     start, workers = time.perf_counter(), count_workers(workers)
     part.refuse(overwrite)
     grid = layout.grid_folder(spec) if name is None else check_name(name)
-    sink = as_sink(_folder_of(source) if out is None else out)
+    sink = as_sink(_folder_of(source) if out is None else out, part=part)
     for place in (sink.location, str(source)):
         check_shared(place, 1 if executor is None and workers == 1 else 2)
     plan = Plan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
@@ -139,7 +139,7 @@ def regrid(
         elif not any(job.missing() for job in jobs):
             sink.finish()
 
-    grids = tuple(f"{job.writer.location}/{grid}" for job in jobs)
+    grids = tuple(f"{sink.location}/{job.path}/{grid}" for job in jobs)
     notes = tuple(note for job in jobs for note in job.inputs.notes())
     made = work.wanted - len(failures)
     return RegridResult(grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes)
@@ -208,7 +208,8 @@ def _folder_of(source: str | os.PathLike[str] | Source | Capture) -> str | Path:
 
 def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) -> Job:
     """Compare what exists with what this run makes, and stop before anything is written if they do not agree."""
-    writer = sink.sequence("/".join(part for part in (inputs.path, plan.spec.coordinates) if part))
+    path = "/".join(part for part in (inputs.path, plan.spec.coordinates) if part)
+    writer = sink.sequence(path)
     how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
     how |= {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
     made_from = inputs.record()
@@ -224,7 +225,7 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) 
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    return Job(inputs, plan, writer, needed, params, replaces=exists and overwrite)
+    return Job(path, inputs, plan, writer, needed, params, replaces=exists and overwrite)
 
 
 def _begin(job: Job) -> None:

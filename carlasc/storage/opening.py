@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.running.parts import Part
 from carlasc.storage.caching import Cache, CachedTree
 from carlasc.storage.folders.folder import FolderSink, FolderSource
 from carlasc.storage.folders.published import PublishedSource
@@ -108,22 +109,34 @@ def open_sink(
     return HDF5Sink(path, options, overwrite)
 
 
-def as_sink(out: str | os.PathLike[str] | Target | Sink, *, overwrite: bool = False, **storage_options: Any) -> Sink:
+def as_sink(
+    out: str | os.PathLike[str] | Target | Sink,
+    *,
+    overwrite: bool = False,
+    part: Part = Part(),  # noqa: B008 (frozen)
+    **storage_options: Any,
+) -> Sink:
     """Return a Sink unchanged; start one at any other place.
 
     Args:
         out: a folder of the published layout, or a packed store, whose name ends in .zarr, .h5, .hdf5 or .parquet; a path or a URL.
         overwrite: replace an existing packed store.
+        part: the part of a run that writes to it.
         **storage_options: options of fsspec for a URL.
 
     Raises:
-        ArgumentError: nothing can be written there.
+        ArgumentError: nothing can be written there, or not by several parts.
         ConflictError: a packed store exists there, and `overwrite` is not given.
         DependencyError: a package is missing.
     """
     if isinstance(out, Sink):
         return out
-    if PurePosixPath(out.location if isinstance(out, Target) else out).suffix in PACKED:
+    suffix = PurePosixPath(out.location if isinstance(out, Target) else out).suffix
+    if part.count > 1 and suffix in PACKED[1:]:
+        raise ArgumentError(
+            "part", expected="a folder or a .zarr store, which several processes can write", found=str(out)
+        )
+    if suffix in PACKED:
         return open_sink(out, None, overwrite, **storage_options)
     return FolderSink(out, **storage_options)
 

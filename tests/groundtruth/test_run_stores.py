@@ -13,7 +13,7 @@ from helpers.captures import read_tree, write_capture
 
 import carlasc
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
+from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.groundtruth import FromScans, Voting, regrid
 from carlasc.running import Part
 
@@ -161,6 +161,29 @@ def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(source, 
     monkeypatch.setattr(targets, "write_atomic", write)
     regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
     assert read_tree(tmp_path / "x.zarr") == source[2]
+
+
+@pytest.mark.needs("h5py", "hdf5plugin", "pyarrow")
+@pytest.mark.parametrize("kind", ["h5", "parquet"])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_stores_of_one_writer_take_what_workers_make(source, tmp_path, kind, workers):
+    result = regrid(source[0], SPEC, tmp_path / f"x.{kind}", workers=workers)
+    assert result.grids == (f"{tmp_path}/x.{kind}/cartesian/evaluation_16x16x4",)
+    carlasc.unpack(tmp_path / f"x.{kind}", tmp_path / "x", workers=1)
+    assert read_tree(tmp_path / "x") == source[1]
+
+
+@pytest.mark.parametrize("kind", ["h5", "parquet"])
+def test_stores_of_one_writer_refuse_parts(source, tmp_path, kind):
+    with pytest.raises(ArgumentError, match=r"part: expected a folder or a \.zarr store"):
+        regrid(source[0], SPEC, tmp_path / f"x.{kind}", part=Part(1, 2))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_cannot_begin_leaves_no_store(tmp_path):
+    with pytest.raises(MissingDataError):
+        regrid(tmp_path / "nothing", SPEC, tmp_path / "x.zarr", workers=1)
+    assert not list(tmp_path.iterdir())
 
 
 def test_memory_is_of_one_process(source, tmp_path):

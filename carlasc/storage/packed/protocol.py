@@ -235,6 +235,10 @@ class PackedWriter(SequenceWriter):
     @abstractmethod
     def _start_field(self, field: str) -> FieldWriter: ...
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy in another process knows its name only: one process writes the store."""
+        return {"location": self.location, "path": self.path, "identity": self.identity, "writers": {}, "contents": {}}
+
     def has(self, field: str, frame: int) -> bool:
         """Whether this run has written it."""
         return field in self.writers and frame in self.writers[field].frames

@@ -18,47 +18,86 @@ _OPTIONS = ("block", "lossy_mm", "small")
 _REPLACES = "replaces"  # attribute of an unfinished store: whether an older one waits as `<name>.old`
 
 
-def begin(target: Target, options: Options, overwrite: bool) -> bool:
-    """Create the root of a store, or join a store that has the same options.
+class Root:
+    """The root of a store that is written to, shared by its writers. A new one is created with the first thing that is written.
 
-    Returns:
-        Whether the store is finished.
-
-    Raises:
-        ArgumentError: the target has no name.
-        ConflictError: something else exists there, or a store with other options.
+    Attributes:
+        is_finished: whether a finished store with the same options exists, to which more is added.
     """
-    if isinstance(target, LocalTarget) and not target.folder.name:
-        raise ArgumentError("out", expected="the name of a store", found=f"{target.location!r}")
-    wanted = {"type": STORE, "version": VERSION, "complete": False, **options_of(options)}
-    replaced = False
-    for _ in range(_TRIES):
+
+    def __init__(self, target: Target, options: Options, overwrite: bool) -> None:
+        """Check that the store may be written. Nothing is written yet, but a store that is replaced is moved away.
+
+        Raises:
+            ArgumentError: the target has no name.
+            ConflictError: something else exists there, or a store with other options.
+        """
+        if isinstance(target, LocalTarget) and not target.folder.name:
+            raise ArgumentError("out", expected="the name of a store", found=f"{target.location!r}")
+        self._target, self._options, self._overwrite, self._begun = target, options, overwrite, False
         root = read_root(target)
         if root is None:
             _refuse_other(target)
-            about = wanted | ({_REPLACES: True} if replaced else {})
-            if target.put(METADATA, to_json(group_metadata(about)), create=True):
-                return False
-            continue  # another process was first
-        same = all(root.get(name) == wanted[name] for name in ("type", "version", *_OPTIONS))
-        finished = root.get("complete") is True
-        if same and not (overwrite and finished):
-            return finished
+        elif not self._joins(root):
+            self.begin()  # what is replaced must not be taken for what was written
+            root = None
+        self.is_finished = root is not None and root.get("complete") is True
+
+    def begin(self) -> None:
+        """Create the root unless it exists: exactly one of several processes does, and the others join it.
+
+        Raises:
+            ConflictError: something else exists there, or a store with other options.
+        """
+        if self._begun:
+            return
+        replaced = False
+        for _ in range(_TRIES):
+            root = read_root(self._target)
+            if root is None:
+                _refuse_other(self._target)
+                about = self._wanted | ({_REPLACES: True} if replaced else {})
+                self._begun = self._target.put(METADATA, to_json(group_metadata(about)), create=True)
+            elif self._joins(root):
+                self._begun = True
+            else:
+                finished = root.get("complete") is True
+                replaced = _move_away(self._target, finished=finished) or root.get(_REPLACES) is True
+            if self._begun:
+                return
+        raise ConflictError(self._target.location, problem="other processes keep replacing it", advice="wait for them")
+
+    @property
+    def _wanted(self) -> dict[str, Any]:
+        """The attributes of the root of a store that is begun."""
+        return {"type": STORE, "version": VERSION, "complete": False, **options_of(self._options)}
+
+    def _joins(self, root: dict[str, Any]) -> bool:
+        """Whether a store that exists is written to; if not, it is replaced.
+
+        Raises:
+            ConflictError: neither may be done.
+        """
+        wanted = self._wanted
+        differs = [name for name in ("type", "version", *_OPTIONS) if root.get(name) != wanted[name]]
+        if not differs:
+            return not (self._overwrite and root.get("complete") is True)
         if root.get("type") not in (STORE, "carlasc.unfinished"):
             raise ConflictError(
-                target.location, expected="a packed store to overwrite", found="another zarr store",
+                self._target.location, expected="a packed store to overwrite", found="another zarr store",
                 advice="choose another name",
             )  # fmt: skip
-        if not overwrite:
-            differs = [f"{name} {root.get(name)}" for name in ("version", *_OPTIONS) if root.get(name) != wanted[name]]
+        if not self._overwrite:
             raise ConflictError(
-                target.location,
+                self._target.location,
                 expected="nothing there, or a store with the same options",
-                found=f"one with {', '.join(differs)}",
+                found=f"one with {', '.join(f'{name} {root.get(name)}' for name in differs if name != 'type')}",
                 advice="choose another name, or give `overwrite=True`",
             )
-        replaced = _move_away(target, finished=finished) or root.get(_REPLACES) is True
-    raise ConflictError(target.location, problem="other processes keep replacing it", advice="wait for them")
+        return False
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_overwrite": False}  # only the process that was told to replaces a store
 
 
 def options_of(options: Options) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from carlasc.storage.packed.arrays.blocks import StoredField
 from carlasc.storage.packed.arrays.chunks import in_threads
 from carlasc.storage.packed.arrays.fields import VERSION, Encoded
 from carlasc.storage.packed.arrays.reading import SEQUENCE, document_node, field_node
-from carlasc.storage.packed.arrays.zarr_begin import begin, existing_options
+from carlasc.storage.packed.arrays.zarr_begin import Root, existing_options
 from carlasc.storage.packed.arrays.zarr_finish import EXPECTED, finish, format_expected, parse_expected
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
 from carlasc.storage.packed.arrays.zarr_store import ZarrSource
@@ -68,11 +68,12 @@ class ZarrSink(Sink):
         self.options = options or (Options() if overwrite else existing_options(self.target)) or Options()
         if self.options.small:
             import_extra("pcodec", "zarr")
-        self.is_finished = begin(self.target, self.options, overwrite)
+        self._root = Root(self.target, self.options, overwrite)
+        self.is_finished = self._root.is_finished
 
     def sequence(self, path: str) -> ZarrWriter:
         """Start or continue a sequence."""
-        return ZarrWriter(self.target, node_of(path, self.location), path, self.options)
+        return ZarrWriter(self.target, node_of(path, self.location), path, self.options, self._root)
 
     def finish(self, *, incomplete: bool = False) -> None:
         """Write the metadata by which the store can be opened.
@@ -80,6 +81,7 @@ class ZarrSink(Sink):
         Raises:
             ConflictError: frames that a run has announced (`SequenceWriter.expect`) are not there, and `incomplete` is not given.
         """
+        self._root.begin()
         finish(self.target, incomplete=incomplete)
         self.is_finished = True
 
@@ -100,7 +102,7 @@ class ZarrWriter(SequenceWriter):
 
     concurrent = True
 
-    def __init__(self, target: Target, group: str, path: str, options: Options) -> None:
+    def __init__(self, target: Target, group: str, path: str, options: Options, root: Root) -> None:
         self.target = target
         self.group = group
         self.path = path
@@ -109,6 +111,7 @@ class ZarrWriter(SequenceWriter):
         self.options = options
         self.block = options.block
         self._rows: dict[str, int] = {}
+        self._root = root
         self._begun = False
         self._keeps = True
         self._fields: dict[str, StoredField] = {}
@@ -190,8 +193,9 @@ class ZarrWriter(SequenceWriter):
         self._flush()
 
     def _start(self) -> None:
-        """Create the sequence."""
+        """Create the store and the sequence, with the first thing that is written."""
         if not self._begun:
+            self._root.begin()
             split, name, coordinates = self.identity
             about = {"type": SEQUENCE, "version": VERSION, "path": self.path, "split": split, "name": name}
             data = to_json(group_metadata(about | {"coordinates": coordinates}))
