@@ -172,7 +172,7 @@ def convert(
         notes += result.notes
         failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
     return ConvertResult(
-        tuple(f"{sink.location}/{sequence_path(plan.recording)}" for plan in plans),
+        tuple(sink.place(sequence_path(plan.recording)) for plan in plans),
         sum(conversion.made for conversion in done),
         sum(len(plan.recording.frames) - len(plan.unfinished) for plan in plans),
         tuple(failures),

@@ -139,7 +139,7 @@ def regrid(
         elif not any(job.missing() for job in jobs):
             sink.finish()
 
-    grids = tuple(f"{sink.location}/{job.path}/{grid}" for job in jobs)
+    grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
     notes = tuple(note for job in jobs for note in job.inputs.notes())
     made = work.wanted - len(failures)
     return RegridResult(grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import logging
 import re
@@ -178,12 +179,18 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
 
     connect_s = parse_timedelta(dask.config.get("carlasc.connect-timeout", _CONNECT_S))
     workers_s = parse_timedelta(dask.config.get("carlasc.workers-timeout", _WORKERS_S))
+    failure = None
     try:
         client = distributed.Client(place, timeout=connect_s, set_as_default=False)
     except (OSError, ValueError, RuntimeError, TypeError) as error:
-        raise CarlascError(
+        failure = CarlascError(
             f"cluster {where}", problem=f"no scheduler answers: {error}", advice="check the address, and that it runs"
-        ) from error
+        )
+    if failure:
+        # Dask does not close a client that could not start: its finalizer does. If that ran while another client starts,
+        # each would wait for the other, so it runs now, and the cause, which holds the client, is not kept.
+        gc.collect()
+        raise failure
     try:
         with one_line_if_lost(client):
             try:

@@ -133,6 +133,10 @@ class Sink(ABC):
     def sequence(self, path: str) -> SequenceWriter:
         """Start or continue the sequence at a path such as "Train/Town01_Light/cartesian"."""
 
+    def place(self, path: str) -> str:
+        """Return what to call a sequence, or a grid in one, once the store is finished: the place of the store and the path in it."""
+        return path if self.location == "." else f"{self.location}/{path}"
+
     def finish(self, *, incomplete: bool = False) -> None:  # noqa: B027 (a folder has nothing to finish)
         """Finish the store: a packed store can be opened from then on. This is not called if the work failed.
 

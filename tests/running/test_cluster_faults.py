@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 from pathlib import Path
 
@@ -30,15 +31,18 @@ def test_two_numbers_of_workers_contradict_each_other():
         run("local:2", workers=3)
 
 
-def test_no_scheduler_at_the_address(monkeypatch):
-    monkeypatch.setenv("DASK_CARLASC__CONNECT_TIMEOUT", "0.5s")
+def test_no_scheduler_at_the_address():
     import dask
+    import distributed
 
     with dask.config.set({"carlasc.connect-timeout": "0.5s"}):
         for where in ("tcp://127.0.0.1:1", "tls://127.0.0.1:1", "tcp://nowhere.invalid:8786"):
             with pytest.raises(CarlascError, match=f"^cluster {where}: no scheduler answers: ") as caught:
                 run(where)
             assert "\n" not in str(caught.value)
+            # the finalizer of one that is not closed would block a client that starts
+            left = [value for value in gc.get_objects() if isinstance(value, distributed.Client)]
+            assert all(client.status == "closed" for client in left)
 
 
 def test_no_work_opens_nothing():
