@@ -48,6 +48,7 @@ def capture(tmp_path_factory):
     return root, read_tree(root / "whole")
 
 
+@pytest.mark.slow
 def test_regrid_gives_the_same_bytes_and_a_second_run_starts_no_cluster(capture, tmp_path):
     root, whole = capture
     command = ("regrid", root, "-o", tmp_path, "--preset", "coarse", "--cluster")

@@ -365,6 +365,7 @@ def test_boxes_of_the_real_sample_hold_the_points_that_the_annotators_counted(sa
         assert len(boxes) > 40
 
 
+@pytest.mark.slow
 def test_the_road_of_the_real_sample_is_in_the_grid_and_each_lidar_casts_its_own_rays(sample, tmp_path):
     result = convert("argoverse2", sample, tmp_path / "out", axes="right", workers=1)
     assert result.failures == () and result.made == 3

@@ -58,6 +58,7 @@ def test_the_mirrored_frame_comes_back_too(simulated, tmp_path):
     assert np.abs(simulated[1].poses - poses).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_tiny_round_trip_of_several_sequences(tmp_path):
     for number in ("00", "08"):
         write_tiny_kitti(tmp_path / "in", number, voxels=True)

@@ -254,7 +254,7 @@ if end == "error":
 @pytest.mark.parametrize(
     "workers, end, status",
     [
-        ("no loader", "error", 3),
+        pytest.param("no loader", "error", 3, marks=pytest.mark.slow),
         pytest.param("0", "", 0, marks=pytest.mark.slow),
         pytest.param("2", "", 0, marks=pytest.mark.slow),
     ],

@@ -152,6 +152,7 @@ def test_the_command_that_is_advised_makes_the_exact_grid(capture, tmp_path):
 
 
 @pytest.mark.needs("pyarrow", "h5py")
+@pytest.mark.slow
 def test_flow_of_a_real_sample_is_that_of_its_data_set(real, tmp_path):
     import h5py
     from pyarrow import feather

@@ -79,7 +79,7 @@ def test_scans_are_merged_over_the_borders_of_parts(source, tmp_path):
     assert read_tree(tmp_path / "one") == read_tree(tmp_path / "parts")
 
 
-@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("same", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_commands_that_start_at_once_lose_nothing(source, tmp_path, same):
     """Four processes: the four parts of a run, or four times the whole run."""
     parts = [[] if same else ["--part", f"{n}/4"] for n in range(1, 5)]

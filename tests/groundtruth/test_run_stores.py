@@ -107,7 +107,8 @@ def _command(source, out, *options):
     return [sys.executable, "-c", "from carlasc.cli import main; main()", *arguments]
 
 
-@pytest.mark.parametrize("same", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("same", [True, False])
 def test_commands_that_start_at_once_lose_nothing(source, tmp_path, same):
     out = tmp_path / "x.zarr"
     parts = [[] if same else ["--part", f"{n}/3"] for n in range(1, 4)]

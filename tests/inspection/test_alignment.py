@@ -118,6 +118,7 @@ def test_a_rare_choice_of_axes_is_named_only_if_no_common_one_explains_as_much(s
     assert correction.name == rare.name
 
 
+@pytest.mark.slow
 def test_mistakes_are_named_on_a_real_drive(real):
     pytest.importorskip("kiss_icp")
     from carlasc.motion.odometry import estimate_poses

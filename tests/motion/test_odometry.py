@@ -93,7 +93,7 @@ def test_a_drive_may_start_at_any_speed(bend):
     assert step_errors(estimated, true).max() < 0.06  # of 0.8 m; registered forwards only, 0.4 m
 
 
-@pytest.mark.parametrize("height_m", [1.0, 2.5])
+@pytest.mark.parametrize("height_m", [1.0, pytest.param(2.5, marks=pytest.mark.slow)])
 def test_the_sensor_may_be_at_any_height(height_m):
     sensors = (Sensor("lidar", translation((0.0, 0.0, height_m))),)
     drive = SimulatedDrive(frames=20, speed=10.0, channels=32, columns=540, sensors=sensors)

@@ -70,8 +70,9 @@ def work_until_killed_often_enough(killer: Killer, folder: Path, executor: Engin
     assert written == {str(number): str(number) for number in made}
 
 
+@pytest.mark.slow
 @pytest.mark.needs("distributed")
-@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, 50])
 def test_workers_of_a_cluster_are_killed(kills, tmp_path: Path):
     with open_cluster("local:2") as cluster:
         assert list(run_all(jobs.square, range(2), executor=cluster)) == [0, 1]  # it has started

@@ -93,6 +93,7 @@ def test_a_bucket_store_is_read_with_few_requests(server: FaultyServer, referenc
     assert server.requests.total() == 1, server.requests  # the indices of the shards are kept
 
 
+@pytest.mark.slow
 def test_packing_to_a_bucket_and_back(server: FaultyServer, reference: Path, tmp_path: Path) -> None:
     out = f"s3://{BUCKET}/{tmp_path.name}.zarr"
     there, here = pack(reference, out, workers=1), pack(reference, tmp_path / "x.zarr", workers=1)

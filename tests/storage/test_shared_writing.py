@@ -117,6 +117,7 @@ finish(LocalTarget(out))
 """
 
 
+@pytest.mark.slow
 def test_two_processes_that_write_the_same_blocks_at_once_lose_nothing(
     tmp_path: Path, reference: dict[str, bytes]
 ) -> None:

@@ -60,6 +60,7 @@ def keep(name, picture):
     pytest.importorskip("PIL.Image").fromarray(picture).save(OUTPUT / f"{name}.png")
 
 
+@pytest.mark.slow
 def test_keys_step_and_toggle_scan_grid_flow_and_classes(blocks, tmp_path):
     seen, state = drive_window(
         tmp_path,

@@ -77,7 +77,7 @@ def test_the_command_writes_a_store_or_grids_if_it_is_asked_to(tmp_path, monkeyp
     assert "0 frames made (2 existed)" in again.output
 
 
-@pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2)])
+@pytest.mark.parametrize("order", [pytest.param((1, 2, 3), marks=pytest.mark.slow), (3, 1, 2)])
 def test_parts_of_a_simulation_write_the_bytes_of_one(written, tmp_path, order):
     for number in order:
         assert not (tmp_path / "raw" / "times0.txt").exists()
