@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import importlib
 import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Self
 
@@ -95,10 +99,32 @@ def import_extra(module: str, extra: str) -> ModuleType:
         DependencyError: the module is not installed or fails to load.
     """
     try:
-        return importlib.import_module(module)
+        with _ctrl_c_waits():
+            return importlib.import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
         problem = "is not installed" if error.name == package else f"does not load ({error})"
         raise DependencyError(
             f"{package} {problem}", advice=f"install it with `pip install 'carlasc[{extra}]'`"
         ) from error
+
+
+@contextmanager
+def _ctrl_c_waits() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of the block: packages such as trimesh catch every exception of what they import, and go on without it."""
+    usual, pressed = signal.getsignal(signal.SIGINT), False
+    if not callable(usual) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def remember(*_: object) -> None:
+        nonlocal pressed
+        pressed = True
+
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+        if pressed:
+            usual(signal.SIGINT, None)

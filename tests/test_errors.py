@@ -84,6 +84,14 @@ def test_a_module_that_fails_to_load_says_why(tmp_path, monkeypatch):
         import_extra("broken_module", "view")
 
 
+def test_ctrl_c_is_not_lost_in_a_module_that_catches_everything(tmp_path, monkeypatch):
+    lines = ("import os, signal", "try:", "    os.kill(os.getpid(), signal.SIGINT)", "    sum(range(1000))")
+    (tmp_path / "catches_all.py").write_text("\n".join([*lines, "except BaseException:", "    pass", ""]))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        import_extra("catches_all", "view")
+
+
 def test_importing_carlasc_loads_numpy_and_nothing_heavier():
     code = (
         "import sys, carlasc; heavy = {'numba', 'torch', 'typer', 'rich', 'zarr', 'h5py', 'pyarrow', 'trimesh', 'open3d', 'fsspec'};"

@@ -32,6 +32,7 @@ from carlasc.storage.targets import LocalTarget, Target
 
 _PUTS = 16  # objects that are written side by side to an object store
 _CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
+_PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
 _T = TypeVar("_T")
 
 
@@ -238,7 +239,10 @@ class ZarrWriter(SequenceWriter):
         rows = self._rows.get(name) if rows is None else rows
         if rows is None and entry.per == "vote":
             rows = self._cells(entry.folder) // _CELLS_PER_VOTE
-        return (max(map(len, arrays)) if rows is None else rows,)
+        if rows is None:
+            rows = max(map(len, arrays))
+            rows = 1 << (max(rows, _PICTURE) - 1).bit_length() if entry.kind == "picture" else rows
+        return (rows,)
 
     def _cells(self, grid: str) -> int:
         """Return the number of voxels of a grid, 0 if nothing says it."""
