@@ -80,5 +80,16 @@ class FrameRange:
         return ":".join("" if bound is None else str(bound) for bound in (self.start, self.stop))
 
 
+def compact(frames: NDArray[np.int64]) -> range | NDArray[np.int64]:
+    """Return rising frame numbers as a range if none is missing between them: that is pickled in a few bytes."""
+    first, last = (int(frames[0]), int(frames[-1])) if len(frames) else (0, -1)
+    return range(first, last + 1) if last - first == len(frames) - 1 else frames
+
+
+def expand(frames: range | NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the array of frame numbers that `compact` was given."""
+    return np.arange(frames.start, frames.stop, dtype=np.int64) if isinstance(frames, range) else frames
+
+
 Frames = FrameRange | tuple[int | None, int | None] | None
 """What a `frames` argument takes: a FrameRange, a tuple of its bounds, or None for all frames."""

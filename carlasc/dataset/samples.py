@@ -285,9 +285,7 @@ class Dataset(_MapStyle):
         if grids is not None:
             parts = self._grid_fields.parts(grids, grid)
             wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
-        part = Part(
-            scans, grids, grid, common_frames(wanted), frozenset(scans.frames("points").tolist()), tuple(wanted)
-        )
+        part = Part(scans, grids, grid, common_frames(wanted), tuple(wanted))
         if self._needs_poses:
             part.check_poses()
         return part

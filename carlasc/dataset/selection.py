@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.frames import compact, expand
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
@@ -31,7 +33,6 @@ class Part:
             None if no grid is needed.
         grid: name of the grid in `grids`.
         frames: numbers of the frames that are samples, increasing.
-        scanned: numbers of the frames that have a scan.
         fields: the fields that samples are read from, each with its sequence.
     """
 
@@ -39,14 +40,24 @@ class Part:
     grids: Sequence | None
     grid: str
     frames: NDArray[np.int64]
-    scanned: frozenset[int]
     fields: tuple[tuple[Sequence, str], ...]
+
+    @cached_property
+    def _scanned(self) -> frozenset[int]:
+        return frozenset(self.scans.frames("points").tolist())
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {name: value for name, value in self.__dict__.items() if name != "_scanned"}
+        return state | {"frames": compact(self.frames)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, frames=expand(state["frames"]))
 
     def history(self, frame: int, length: int) -> list[int | None]:
         """Return the frame numbers of a stack, oldest first; None before the start of the sequence and before a gap."""
         past: list[int | None] = [None] * length
         for back in range(length):
-            if frame - back not in self.scanned:
+            if frame - back not in self._scanned:
                 break
             past[length - 1 - back] = frame - back
         return past

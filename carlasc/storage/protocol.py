@@ -271,6 +271,10 @@ class Sequence(ABC):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what another process can read again faster than it is sent."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("poses", "times", "_frame_lines")}
+
 
 class Source(ABC):
     """A store that sequences are read from.

@@ -1,5 +1,7 @@
 """Datasets in torch's DataLoader: worker processes, shuffling, several ranks, determinism, batches."""
 
+import pickle
+
 import numpy as np
 import pytest
 from helpers.drives import write_drive
@@ -135,3 +137,21 @@ def test_flips_do_not_depend_on_how_many_workers_there_are_or_on_the_order(world
     assert plain.keys() == shuffled.keys()
     for key, grid in plain.items():
         np.testing.assert_array_equal(grid, shuffled[key])
+
+
+def test_what_is_sent_to_workers_does_not_grow_with_the_frames(tmp_path):
+    sizes = []
+    for frames in (5, 40):
+        write_drive(tmp_path / str(frames) / "cartesian", range(frames), spec=SPEC)
+        dataset = Dataset(tmp_path / str(frames), history=3, fields=DENSE)
+        dataset[frames - 1]
+        sizes.append(len(pickle.dumps(dataset)))
+    assert sizes[1] < sizes[0] + 50
+
+
+def test_a_pickled_dataset_has_the_same_samples_where_frames_are_missing(tmp_path):
+    write_drive(tmp_path / "cartesian", (0, 1, 2, 5, 6, 9), spec=SPEC)
+    dataset = Dataset(tmp_path, history=3, fields=DENSE)
+    other = pickle.loads(pickle.dumps(dataset))
+    for sample, again in zip(dataset, other, strict=True):
+        assert all(np.array_equal(sample[name], again[name]) for name in sample)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.frames import compact, expand
 from carlasc.errors import MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.folders.trees import Tree
@@ -89,6 +90,12 @@ class PublishedSequence(Sequence):
         if field not in self._frames:
             self._list_folder_of(field)
         return self._frames[field]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"_frames": {name: compact(found) for name, found in self._frames.items()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _frames={name: expand(found) for name, found in state["_frames"].items()})
 
     def _list_folder_of(self, field: str) -> None:
         if field not in self._listing:

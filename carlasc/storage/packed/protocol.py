@@ -167,7 +167,7 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
         return self._readers[field]
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_readers": {}}  # a worker looks up what it needs
+        return super().__getstate__() | {"_readers": {}}  # a worker looks up what it needs
 
 
 class PackedSink(Sink):
