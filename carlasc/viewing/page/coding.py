@@ -79,7 +79,7 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     for array in arrays.values():
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         parts.append(little.view(np.uint8).reshape(-1, array.dtype.itemsize).T.tobytes())
-    return zlib.compress(b"".join(parts), 9)
+    return zlib.compress(b"".join(parts), 6)  # level 9 takes twice as long for 1.5 % fewer bytes
 
 
 def unpack_arrays(block: bytes) -> Arrays:
