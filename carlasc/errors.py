@@ -1,6 +1,7 @@
 """The few kinds of error that a user can meet, and the check for optional packages.
 
-Every message is one line: what it is about (a file, a field, an argument), what was expected, what was found, what to do.
+Every message is one line: what it is about (a file, a field, an argument), what was expected, what was found, what to do. Parts of it come
+from files and from other libraries: `printable` shows what a terminal would obey, and no part is longer than a few lines.
 """
 
 from __future__ import annotations
@@ -15,6 +16,11 @@ from types import ModuleType
 from typing import Self
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
+# What a terminal obeys, or what changes the order in which a line is read: control characters (ESC starts the terminal's commands), the marks
+# that turn the direction of writing (Unicode's Bidi_Control), ends of lines and of paragraphs, and halves of characters, which no
+# terminal can show: Python uses them for bytes of file names that are not UTF-8.
+_UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_LONGEST = 600  # characters of a part of a message; other libraries put whole headers into theirs
 _QUERY = re.compile(r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*")  # a signature or a token
 
 
@@ -40,11 +46,11 @@ class CarlascError(Exception):
         self.expected, self.found, self.advice = expected, found, advice
 
     def __str__(self) -> str:
-        comparison = ", ".join(
-            f"{verb} {text}" for verb, text in (("expected", self.expected), ("found", self.found)) if text
+        where, problem, expected, found, advice = (
+            _one_line(str(part)) for part in (self.where, self.problem, self.expected, self.found, self.advice)
         )
-        text = ": ".join(part for part in (self.where, self.problem, comparison, self.advice) if part)
-        return without_credentials(" ".join(text.splitlines()))  # other libraries' messages may have several lines
+        comparison = ", ".join(f"{verb} {text}" for verb, text in (("expected", expected), ("found", found)) if text)
+        return without_credentials(": ".join(part for part in (where, problem, comparison, advice) if part))
 
     def within(self, where: object) -> Self:
         """Return a copy that also names what contains the place: `within("a.zip")` of an error at "b" is at "a.zip: b"."""
@@ -56,6 +62,21 @@ class CarlascError(Exception):
         return error
 
 
+def printable(text: str) -> str:
+    r"""Return a text as a terminal may show it: control characters, and marks that turn the direction of writing, as `\\x1b`.
+
+    Names of sequences, classes and files come from data that anybody may have made: they must not clear a screen, hide a line, or write
+    to a clipboard. Everything else is shown as it is.
+    """
+    return _UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def _one_line(text: str) -> str:
+    """Return a part of a message as a printable line of bounded length, without its middle where it is too long."""
+    line = printable(" ".join(text.splitlines()))
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST * 2 // 3]} [...] {line[-_LONGEST // 3 :]}"
+
+
 def without_credentials(text: str) -> str:
     """Return a text without what its URLs say of credentials: user and password, and queries, which may be signatures."""
     return _QUERY.sub(r"\1", _USER.sub("", text)) if "://" in text else text
@@ -63,6 +84,39 @@ def without_credentials(text: str) -> str:
 
 class FormatError(CarlascError, ValueError):
     """A file or store does not hold what the format says it must."""
+
+
+@contextmanager
+def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
+    """Turn whatever goes wrong in a block that interprets data from a file into a FormatError.
+
+    Data that anybody may have made can fail in any way: NumPy, zlib, zipfile, h5py, pyarrow and the JSON parser raise two dozen types between
+    them, of which few are documented. The block should therefore hold the call that interprets the data, and nothing else.
+
+    Args:
+        where: the file.
+        expected: what it should hold.
+        advice: what to do about it.
+
+    Raises:
+        FormatError: anything but a CarlascError was raised; that is the cause.
+    """
+    try:
+        yield
+    except CarlascError:
+        raise
+    except Exception as error:
+        raise FormatError(
+            where, expected=expected, found=f"something else ({describe(error)})", advice=advice
+        ) from error
+
+
+def describe(error: BaseException) -> str:
+    """Return the message of another library's error; its type where the message alone says nothing."""
+    text = str(error).strip()
+    if isinstance(error, LookupError):
+        return f"{type(error).__name__}: {text}"  # the message of a KeyError is the key
+    return text or type(error).__name__
 
 
 class MissingDataError(CarlascError):

@@ -17,6 +17,8 @@ from carlasc.errors import (
     MissingDataError,
     StorageError,
     import_extra,
+    printable,
+    reading,
 )
 
 KINDS = (FormatError, MissingDataError, DependencyError, ArgumentError, ConflictError, StorageError)
@@ -67,6 +69,41 @@ def test_an_error_within_a_place_names_both_and_leaves_the_first_as_it_is(kind):
     assert str(outer) == "c: a.zip: b: expected c, found d: e"
     assert str(error) == "b: expected c, found d: e"
     assert str(pickle.loads(pickle.dumps(outer))) == str(outer)
+
+
+@pytest.mark.parametrize("part", ["where", "problem", "expected", "found", "advice"])
+def test_no_part_of_a_message_steers_a_terminal_or_fills_it(part):
+    hostile = "a\x1b[2J\x07\u202eb\nc\x85d\udcff\u2066" + "x" * 5000 + "end"
+    parts = {name: hostile if name == part else "fine" for name in ("where", "problem", "expected", "found", "advice")}
+    message = str(FormatError(parts.pop("where"), **parts))
+    assert "a\\x1b[2J\\x07\\u202eb c d\\udcff\\u2066xxx" in message
+    assert message.isprintable()
+    assert " [...] xxx" in message
+    assert "end" in message
+    assert len(message) < 1000
+
+
+def test_names_are_shown_as_they_are_except_for_what_a_terminal_obeys():
+    assert printable("Straße 京都 שלום [/bold] <b> \\ é") == "Straße 京都 שלום [/bold] <b> \\ é"
+    assert printable("a\tb\x9b31m\u2028") == "a\\tb\\x9b31m\\u2028"
+
+
+def test_whatever_a_block_raises_is_one_error_that_names_the_file_and_keeps_its_cause():
+    for error, found in (
+        (KeyError("a"), "KeyError: 'a'"),
+        (RecursionError(), "RecursionError"),
+        (OSError("b\nc"), "b c"),
+    ):
+        with pytest.raises(FormatError) as caught, reading("x.bin", "numbers", "copy it again"):
+            raise error
+        assert str(caught.value) == f"x.bin: expected numbers, found something else ({found}): copy it again"
+        assert caught.value.__cause__ is error
+    own = MissingDataError("y.bin")
+    with pytest.raises(MissingDataError) as caught, reading("x.bin", "numbers"):
+        raise own
+    assert caught.value is own
+    with pytest.raises(KeyboardInterrupt), reading("x.bin", "numbers"):
+        raise KeyboardInterrupt
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install():

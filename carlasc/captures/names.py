@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import re
 
-from carlasc.captures.npy import ArrayFormat
 from carlasc.errors import FormatError
+from carlasc.storage.arrays import ArrayFormat
 
 RAW = "raw"
 """Name of the folder that holds a capture, in the folder of its sequence."""
@@ -21,11 +21,11 @@ FOLDERS = {  # value -> folder, to which the sensor's number is appended
     "pose": "pose",
 }
 FORMATS = {
-    "points": ArrayFormat("<f4", (None, 3)),
-    "labels": ArrayFormat("<u4", (None,)),
-    "instances": ArrayFormat("<u4", (None,)),
-    "velocities": ArrayFormat("<f8", (None, 4)),
-    "pose": ArrayFormat("<f8", (4, 4)),
+    "points": ArrayFormat(("<f4",), (None, 3)),
+    "labels": ArrayFormat(("<u4",), (None,)),
+    "instances": ArrayFormat(("<u4",), (None,)),
+    "velocities": ArrayFormat(("<f8",), (None, 4)),
+    "pose": ArrayFormat(("<f8",), (4, 4)),
 }
 _BEV = "bev"
 
@@ -53,12 +53,15 @@ def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, 
     """
     found: dict[int, tuple[float, str]] = {}
     for number, line in enumerate(bytes(data).decode(errors="replace").splitlines(), 1):
-        match = re.match(r"\s*([0-9]+)\s*,.*\belapsed_seconds=([-+0-9.eE]+)", line)
-        if not match:
+        match = re.match(r"\s*([0-9]{1,18})\s*,.*\belapsed_seconds=([-+0-9.eE]+)", line)
+        try:
+            if match is None:
+                raise ValueError("another form")
+            found[int(match[1])] = float(match[2]), line
+        except ValueError as error:
             raise FormatError(
                 where,
                 expected="'<frame>, Timestamp(...,elapsed_seconds=...)'",
                 found=f"{line[:60]!r} in line {number}",
-            )
-        found[int(match[1])] = float(match[2]), line
+            ) from error
     return found

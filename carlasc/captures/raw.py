@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.names import FOLDERS, FORMATS, RAW, array_path, bev_path, parse_times, times_path
-from carlasc.captures.npy import parse_npy
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.scans import Scan, check_finite
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.storage.arrays import parse_npy
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, tree_of
 
 _SEARCH_DEPTH = 3  # levels: <root>/<split>/<sequence>, and one folder around them
@@ -89,7 +89,7 @@ class Capture:
         """
         found = set()
         for name, is_folder in self._entries("").items():
-            match = re.fullmatch(r"([a-z]+)([0-9]+)", name)
+            match = re.fullmatch(r"([a-z]+)([0-9]{1,18})", name)
             if match and match[1] in FOLDERS.values() and is_folder:
                 found.add(int(match[2]))
         if 0 not in found:
@@ -114,7 +114,7 @@ class Capture:
         found: set[int] = set()
         for kind in FOLDERS.values():
             names = self._entries(f"{kind}{ego}")
-            found |= {int(name.removesuffix(".npy")) for name in names if re.fullmatch(r"[0-9]+\.npy", name)}
+            found |= {int(name.removesuffix(".npy")) for name in names if re.fullmatch(r"[0-9]{1,18}\.npy", name)}
         if not found:
             raise MissingDataError(self.location, expected="frames such as velodyne0/100.npy", found="none")
         return np.array(sorted(found), np.int64)

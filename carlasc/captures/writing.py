@@ -15,10 +15,10 @@ from carlasc.captures.names import FOLDERS, FORMATS, RAW, array_path, bev_path, 
 from carlasc.captures.raw import Recording
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError, MissingDataError
-from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.storage.remote import target_of
-from carlasc.storage.targets import Target
+from carlasc.storage.targets import LocalTarget, Target
 
 
 class CaptureWriter:
@@ -54,7 +54,9 @@ class CaptureWriter:
         """
         where = self.target.tree.where(file)
         if not self.target.tree.is_file(file):
-            if self.target.tree.entries():
+            if any(
+                not name.startswith(".") for name in self.target.tree.entries()
+            ):  # one that begins so is what a killed run left
                 raise ConflictError(
                     self.location,
                     expected=f"nothing, or a capture of `{command}`",
@@ -76,17 +78,24 @@ class CaptureWriter:
             )
 
     def write_settings(self, file: str, settings: Mapping[str, Any]) -> None:
-        """Write the settings of a capture as JSON."""
+        """Write the settings of a capture as JSON; the unfinished files of a run that was killed are removed."""
+        if isinstance(self.target, LocalTarget):
+            remove_stale(self.target.folder)
         self.target.put(file, to_json(dict(settings)))
 
     def has(self, sensor: int, frame: int) -> bool:
-        """Whether all of a sensor's files of a frame exist. An existing file is whole."""
-        return all(self.target.tree.is_file(array_path(name, sensor, frame)) for name in FOLDERS)
+        """Whether all of a sensor's files of a frame exist. An existing file is whole unless a power failure left it empty."""
+        return all(self._has(array_path(name, sensor, frame)) for name in FOLDERS)
 
     def has_frame(self, frame: int, sensors: int, bev: bool) -> bool:
         """Whether all files of a frame exist: those of `sensors` sensors, and the bird's-eye picture where `bev` is true."""
         complete = all(self.has(sensor, frame) for sensor in range(sensors))
-        return complete and (not bev or self.target.tree.is_file(bev_path(frame)))
+        return complete and (not bev or self._has(bev_path(frame)))
+
+    def _has(self, path: str) -> bool:
+        if isinstance(self.target, LocalTarget):
+            return has_content(self.target.folder / path)
+        return self.target.tree.is_file(path)
 
     def timed_frames(self, sensors: int) -> frozenset[int]:
         """Return the frames whose times are written for all sensors.
@@ -117,7 +126,7 @@ class CaptureWriter:
         files: dict[str, bytes | memoryview] = {}
         for name, array in arrays.items():
             buffer = io.BytesIO()
-            np.save(buffer, np.ascontiguousarray(array, FORMATS[name].dtype), allow_pickle=False)
+            np.save(buffer, np.ascontiguousarray(array, FORMATS[name].dtypes[0]), allow_pickle=False)
             files[array_path(name, sensor, frame)] = buffer.getbuffer()
         self.target.put_many(files)
 

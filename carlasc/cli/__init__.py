@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from carlasc.cli.common import CommandGroup
+from carlasc.cli.common import CommandGroup, echo
 
 _COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
     "demo",
@@ -97,7 +97,7 @@ def _print_version(requested: bool) -> None:
     if requested:
         from carlasc import __version__
 
-        typer.echo(__version__)
+        echo(__version__)
         raise typer.Exit
 
 
@@ -106,8 +106,20 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
+    durable: Annotated[
+        bool | None,
+        typer.Option(
+            "--durable/--no-durable",
+            show_default=False,
+            help="Sync files to the disk before they get their names, so that a power failure leaves no empty ones; on unless"
+            " CARLASC_DURABLE=no.",
+        ),
+    ] = None,
 ) -> None:
-    pass
+    if durable is not None:
+        from carlasc.storage.durability import set_durable
+
+        set_durable(durable)
 
 
 def main() -> None:

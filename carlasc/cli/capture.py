@@ -18,7 +18,7 @@ from carlasc.cli.capture_options import (
     SensorsOption,
     TrafficOption,
 )
-from carlasc.cli.common import Json, print_json, progress_bar
+from carlasc.cli.common import Json, echo, print_json, progress_bar
 
 
 def capture(
@@ -67,12 +67,12 @@ def capture(
     if json:
         print_json(result)
         return
-    typer.echo(
+    echo(
         f"{result.out}: {result.written} frames of {result.sensors} LiDARs written,"
         f" {result.count - result.written} existed already"
         f" (CARLA {result.server_version}, {result.vehicles} vehicles, {result.walkers} pedestrians)"
     )
-    typer.echo(f"next: carlasc regrid {result.out} --res 0.2")
+    echo(f"next: carlasc regrid {result.out} --res 0.2")
 
 
 def _interrupt(_: int, __: Any) -> None:

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 from typer.core import TyperGroup
 
-from carlasc.errors import ArgumentError, CarlascError
+from carlasc.errors import ArgumentError, CarlascError, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
     from carlasc.core.frames import FrameRange
     from carlasc.running import Engine, Part
@@ -121,18 +122,21 @@ class CommandGroup(TyperGroup):
             return super().invoke(ctx)
         except CarlascError as error:
             options, shown = self._options(ctx), copy.copy(error)
-            shown.where = options.get(error.where, error.where)
+            if isinstance(error, ArgumentError):
+                shown.where = options.get(error.where, error.where)
             message = _replace_arguments(str(shown), options)
             fail(message, WRONG_USAGE if isinstance(error, ArgumentError) else FAILED)
         except _BatchError as error:
             for message in error.messages:
-                typer.echo(f"carlasc: {_replace_arguments(message, self._options(ctx))}", err=True)
+                echo(f"carlasc: {_replace_arguments(message, self._options(ctx))}", err=True)
             fail(str(error))
         except KeyboardInterrupt:
             fail("interrupted: files written so far are complete; run the same command again to continue", INTERRUPTED)
         except BrokenPipeError:  # `carlasc info | head`
             sys.stderr.close()
             raise typer.Exit(FAILED) from None
+        except OSError as error:  # of a file that the library reads or writes in passing
+            fail(f"{error.filename or 'the file system'}: {error.strerror or error}")
 
     def _options(self, ctx: Any) -> dict[str, str]:
         """Return what a user types for each parameter of the command that runs, by its name."""
@@ -169,9 +173,21 @@ def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
     return _ARGUMENT.sub(replace, text)
 
 
+def echo(text: object, *, err: bool = False, nl: bool = True) -> None:
+    """Print lines on stdout or stderr. Names in them come from data: what a terminal would obey is shown escaped."""
+    typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
+
+
+def line(text: str, style: str = "") -> Text:
+    """Return a line for a console, as it is: without markup, and with what a terminal would obey escaped."""
+    from rich.text import Text
+
+    return Text(printable(text), style)
+
+
 def fail(message: str, code: int = FAILED) -> None:
     """Print one line on stderr and end the command with an exit code."""
-    typer.echo(f"carlasc: {message}", err=True)
+    echo(f"carlasc: {message}", err=True)
     raise typer.Exit(code)
 
 
@@ -248,7 +264,7 @@ def console() -> Console:
 
 def print_json(value: Any) -> None:
     """Print a result as JSON; it may hold dataclasses, paths and NumPy values."""
-    typer.echo(json.dumps(value, indent=2, default=_plain))
+    echo(json.dumps(value, indent=2, default=_plain))
 
 
 def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], option: str) -> tuple[_Number, ...]:

@@ -13,6 +13,7 @@ from carlasc.cli.common import (
     Json,
     PartOption,
     Workers,
+    echo,
     engine,
     file_argument,
     parse_options,
@@ -83,7 +84,7 @@ def _print_list(wanted: bool) -> None:
         from carlasc.converting import converter_names, load_converter
 
         for name in converter_names():
-            typer.echo(f"{name}: {load_converter(name).title}")
+            echo(f"{name}: {load_converter(name).title}")
         raise typer.Exit
 
 
@@ -205,11 +206,11 @@ def convert(
         print_json(result)
     else:
         for note in result.notes:
-            typer.echo(f"note: {note}")
+            echo(f"note: {note}")
         for place in (*result.sequences, *result.grids):
-            typer.echo(place)
+            echo(place)
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        typer.echo(f"{result.made} frames converted{skipped} in {result.elapsed_s:.1f} s")
+        echo(f"{result.made} frames converted{skipped} in {result.elapsed_s:.1f} s")
     report_failures(
         [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
     )

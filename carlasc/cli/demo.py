@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import FAILED, Workers, file_argument, progress_bar
+from carlasc.cli.common import FAILED, Workers, echo, file_argument, progress_bar
 from carlasc.cli.stats import print_statistics
 from carlasc.cli.validate import print_result
 
@@ -27,13 +27,13 @@ def demo(
     result = demonstrate(out, count=count, sensors=sensors, seed=seed, workers=workers, step=_show_step)
     print_statistics(result.statistics)
     print_result(result.validation)
-    typer.echo(f"\ndone in {result.elapsed_s:.0f} s")
-    typer.echo(f"capture  {result.sequence / 'raw'}")
+    echo(f"\ndone in {result.elapsed_s:.0f} s")
+    echo(f"capture  {result.sequence / 'raw'}")
     for grid in result.grids:
-        typer.echo(f"grid     {grid}")
+        echo(f"grid     {grid}")
     for picture in result.pictures:
-        typer.echo(f"picture  {picture}")
-    typer.echo(
+        echo(f"picture  {picture}")
+    echo(
         f"next     carlasc regrid {result.sequence} --res 0.4    or    carlasc render {result.sequence} --frames 0:{count} -o drive.mp4"
     )
     if not result.validation.ok:
@@ -43,6 +43,6 @@ def demo(
 @contextmanager
 def _show_step(name: str) -> Iterator[Callable[[int, int], None]]:
     """Print the name of a step, and show its progress where there is a terminal."""
-    typer.echo(f"{name} ...")
+    echo(f"{name} ...")
     with progress_bar(name, unit="steps") as progress:
         yield progress

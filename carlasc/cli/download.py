@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Json, file_argument, print_json, progress_bar
+from carlasc.cli.common import Json, echo, file_argument, print_json, progress_bar
 
 
 def download(
@@ -48,4 +48,4 @@ def download(
         return
     for archive in result.archives:
         place = archive.path if archive.folder is None else f"{archive.files} files in {archive.folder}"
-        typer.echo(f"{archive.name}: {archive.fetched / 1e9:.2f} GB fetched: {place}")
+        echo(f"{archive.name}: {archive.fetched / 1e9:.2f} GB fetched: {place}")

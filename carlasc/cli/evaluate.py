@@ -14,8 +14,10 @@ from carlasc.cli.common import (
     FramesOption,
     Json,
     console,
+    echo,
     engine,
     file_option,
+    line,
     place_argument,
     place_option,
     print_json,
@@ -163,9 +165,9 @@ def evaluate(
         with progress_bar("Scoring the other") as progress, engine(cluster, workers) as common["executor"]:
             other = score(compare, truth, name=Path(compare).name, progress=progress, **common)
     if per_frame is not None:
-        from carlasc.storage.files import write_atomic
+        from carlasc.storage.files import write_output
 
-        write_atomic(per_frame, result.to_csv().encode())
+        write_output(per_frame, result.to_csv().encode())
     if plot is not None:
         from carlasc.inspection.charts import draw_frame_scores
 
@@ -200,7 +202,7 @@ def _print(result: Evaluation, other: Evaluation | None, *, as_json: bool, latex
         print_json(values)
         return
     if latex or csv:
-        typer.echo("\n".join(table.to_latex() if latex else table.to_csv() for table in result.tables()), nl=False)
+        echo("\n".join(table.to_latex() if latex else table.to_csv() for table in result.tables()), nl=False)
         return
     from carlasc.cli.tables import print_table
 
@@ -210,16 +212,20 @@ def _print(result: Evaluation, other: Evaluation | None, *, as_json: bool, latex
         print_table(out, table.header, table.texts(), title=title)
     if (interval := result.interval()) is not None:
         out.print(
-            f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to {100 * interval.high:.2f} ({len(result.sequences)} sequences)"
+            line(
+                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to {100 * interval.high:.2f} ({len(result.sequences)} sequences)"
+            )
         )
     if comparison is not None and other is not None:
         found = comparison.difference
         out.print(
-            f"mIoU less that of {other.name}: {100 * found.value:+.2f}, 95 % interval {100 * found.low:+.2f} to {100 * found.high:+.2f},"
-            f" p = {comparison.p_value:.3g} ({len(comparison.sequences)} sequences)"
+            line(
+                f"mIoU less that of {other.name}: {100 * found.value:+.2f}, 95 % interval {100 * found.low:+.2f} to {100 * found.high:+.2f},"
+                f" p = {comparison.p_value:.3g} ({len(comparison.sequences)} sequences)"
+            )
         )
     for note in result.notes:
-        typer.echo(f"note: {note}", err=True)
+        echo(f"note: {note}", err=True)
 
 
 def _print_conventions(found: Any, as_json: bool) -> None:
@@ -247,7 +253,7 @@ def _print_conventions(found: Any, as_json: bool) -> None:
         header = ["Convention", "Voxels", "mIoU", "IoU", "Precision", "Recall"]
         print_table(console(), header, rows, title="The same predictions by each convention (percent)", turn=False)
         for reason in reasons:
-            typer.echo(f"no score: {reason}")
+            echo(f"no score: {reason}")
     for result in found.values():
         if not isinstance(result, CarlascError):  # a frame that cannot be read fails by every convention
             report_failures(result.failures, result.frames + len(result.failures))

@@ -12,6 +12,7 @@ from carlasc.cli.common import (
     Json,
     PartOption,
     Workers,
+    echo,
     engine,
     file_argument,
     parse_options,
@@ -30,7 +31,7 @@ def _print_list(wanted: bool) -> None:
         for name in exporter_names():
             exporter = load_exporter(name)
             options = ", ".join(option_names(exporter))
-            typer.echo(f"{name}: {exporter.title}" + (f" (options: {options})" if options else ""))
+            echo(f"{name}: {exporter.title}" + (f" (options: {options})" if options else ""))
         raise typer.Exit
 
 
@@ -93,11 +94,11 @@ def export(
         print_json(result)
     else:
         for note in result.notes:
-            typer.echo(f"note: {note}")
+            echo(f"note: {note}")
         for path, place in result.sequences.items():
-            typer.echo(f"{path or '.'} -> {result.out / place}")
+            echo(f"{path or '.'} -> {result.out / place}")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        typer.echo(f"{result.made} frames written{skipped} in {result.elapsed_s:.1f} s")
+        echo(f"{result.made} frames written{skipped} in {result.elapsed_s:.1f} s")
     report_failures(
         [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
     )

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import Json, place_argument, print_json
+from carlasc.cli.common import Json, echo, place_argument, print_json
 
 
 def finish(
@@ -28,7 +28,7 @@ def finish(
         return
     for path, fields in result.sequences.items():
         listed = ", ".join(f"{name} {count}" for name, count in fields.items())
-        typer.echo(f"{path or '.'}: {listed or 'no frames'}")
+        echo(f"{path or '.'}: {listed or 'no frames'}")
     missing = sum(sum(fields.values()) for fields in result.missing.values())
     left_out = f", without {missing} files that are missing" if missing else ""
-    typer.echo(f"{result.location}: {len(result.sequences)} sequences{left_out}")
+    echo(f"{result.location}: {len(result.sequences)} sequences{left_out}")

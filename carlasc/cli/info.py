@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-from carlasc.cli.common import Json, console, place_argument, print_json
+from carlasc.cli.common import Json, console, line, place_argument, print_json
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview
@@ -31,22 +31,22 @@ def _print(overview: Overview) -> None:
 
     out = console()
     splits = ", ".join(f"{name} {count}" for name, count in overview.splits.items())
-    out.print(f"[bold]{overview.location}[/bold]: {overview.level} ({overview.store})", highlight=False)
+    out.print(line(overview.location, "bold") + line(f": {overview.level} ({overview.store})"))
     if overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
-        out.print(f"{len(overview.sequences)} sequences: {splits}{size}", highlight=False)
+        out.print(line(f"{len(overview.sequences)} sequences: {splits}{size}"))
         header = ("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Frame", "Classes", "Size")
         print_table(out, header, [_row(sequence) for sequence in overview.sequences])
     for sequence in overview.sequences:
         if sequence.problem:
-            out.print(f"{sequence.path or sequence.name}: {sequence.problem}", highlight=False, markup=False)
+            out.print(line(f"{sequence.path or sequence.name}: {sequence.problem}"))
     if kinds := _kinds_of_grids(overview):
         header = ("Grid", "Axes", "Size", "Cell", "Bounds", "Parts", "Sequences", "Frames", "Made")
         print_table(out, header, [_grid_row(grids) for grids in kinds])
     for capture in overview.captures:
         span = f"{capture.first}..{capture.last}" + (f" with {capture.gaps} gaps" if capture.gaps else "")
         text = f"raw capture {capture.path or '.'}: {capture.sensors} sensors, {capture.frames} frames ({span})"
-        out.print(text, highlight=False, markup=False)
+        out.print(line(text))
 
 
 def _row(sequence: SequenceOverview) -> list[str]:

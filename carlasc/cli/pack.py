@@ -12,7 +12,9 @@ from carlasc.cli.common import (
     PartOption,
     Workers,
     console,
+    echo,
     engine,
+    line,
     parse_part,
     place_argument,
     print_json,
@@ -62,22 +64,22 @@ def pack(
     elif result.is_finished:
         _print(result)
     else:
-        typer.echo(f"{result.out}: part {part} is packed; the last part finishes the store")
+        echo(f"{result.out}: part {part} is packed; the last part finishes the store")
 
 
 def _print(result: PackResult) -> None:
     from rich.table import Table
 
-    typer.echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
+    echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
     table = Table()
     for heading in ("field", "published bytes", "packed bytes", "share"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
     for name in sorted({*result.published_bytes, *result.stored_bytes}):
         before, after = result.published_bytes.get(name, 0), result.stored_bytes.get(name, 0)
-        table.add_row(name, f"{before:,}", f"{after:,}", f"{after / before:.1%}" if before else "")
+        table.add_row(line(name), f"{before:,}", f"{after:,}", f"{after / before:.1%}" if before else "")
     before, after = sum(result.published_bytes.values()), sum(result.stored_bytes.values())
     table.add_row("total", f"{before:,}", f"{after:,}", f"{result.ratio:.1%}", style="bold")
     console().print(table)
     if result.left_out:
         more = f" and {len(result.left_out) - 5} more" if len(result.left_out) > 5 else ""
-        typer.echo(f"Left out, because the layout does not know them: {', '.join(result.left_out[:5])}{more}")
+        echo(f"Left out, because the layout does not know them: {', '.join(result.left_out[:5])}{more}")

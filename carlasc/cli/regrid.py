@@ -14,6 +14,7 @@ from carlasc.cli.common import (
     Overwrite,
     PartOption,
     Workers,
+    echo,
     engine,
     parse_part,
     place_argument,
@@ -180,11 +181,11 @@ def regrid(
         print_json(result)
     else:
         for note in result.notes:
-            typer.echo(f"note: {note}")
+            echo(f"note: {note}")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
         for grid in result.grids:
-            typer.echo(grid)
-        typer.echo(f"{spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")
+            echo(grid)
+        echo(f"{spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")
     failures = [(failure.frame, failure.message) for failure in result.failures]
     report_failures(failures, result.made + result.skipped + len(failures))
 

@@ -11,6 +11,7 @@ from carlasc.cli.common import (
     Cluster,
     FramesOption,
     Json,
+    echo,
     engine,
     file_option,
     print_json,
@@ -120,9 +121,9 @@ def render(
         print_json(result)
         return
     for note in result.notes:
-        typer.echo(note)
+        echo(note)
     shown = f"{', '.join(result.what)} of {result.sequence}, {describe_frames(result.frames)}"
-    typer.echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")
+    echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")
 
 
 def _parse_size(text: str) -> tuple[int, int]:

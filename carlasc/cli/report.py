@@ -12,8 +12,10 @@ from carlasc.cli.common import (
     Json,
     Workers,
     console,
+    echo,
     engine,
     file_option,
+    line,
     place_argument,
     print_json,
     progress_bar,
@@ -73,23 +75,21 @@ def report(
     else:
         _print(result, everything=everything)
         if html is not None:
-            typer.echo(f"page: {html}")
+            echo(f"page: {html}")
     frames = sum(len(one.frames) for one in result.reports.values()) + len(result.failures)
     report_failures([(failure.frame, failure.message) for failure in result.failures], frames)
 
 
 def _print(result: ReportResult, *, everything: bool) -> None:
-    from rich.text import Text
-
     from carlasc.inspection.report_page import describe
 
     out = console()
     for name, one in result.reports.items():
-        out.print(Text(name, style="bold"), soft_wrap=True)
+        out.print(line(name, "bold"), soft_wrap=True)
         rows = describe(one)
         width = max(len(label) for label, _ in rows)
         for label, text in rows:
-            out.print(Text(f"  {label:<{width}}  {text}"), soft_wrap=True)
+            out.print(line(f"  {label:<{width}}  {text}"), soft_wrap=True)
         if one.actors:
             _print_actors(one.actors, everything=everything)
 

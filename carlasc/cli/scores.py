@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Overwrite, console
+from carlasc.cli.common import Overwrite, console, echo
 
 
 def scores(
@@ -42,10 +42,10 @@ def scores(
         "markdown": table.to_markdown, "latex": table.to_latex, "html": table.to_html, "text": table.table().to_csv,
     }[format or "text"]()  # fmt: skip
     if out is None:
-        typer.echo(text, nl=False)
+        echo(text, nl=False)
         return
     if out.exists() and not overwrite:
         raise ConflictError(out, problem="exists already", advice="choose another name, or give `overwrite=True`")
-    from carlasc.storage.files import write_atomic
+    from carlasc.storage.files import write_output
 
-    write_atomic(out, text.encode())
+    write_output(out, text.encode())

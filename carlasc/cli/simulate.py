@@ -24,6 +24,7 @@ from carlasc.cli.common import (
     PartOption,
     Workers,
     console,
+    echo,
     engine,
     parse_part,
     print_json,
@@ -102,6 +103,6 @@ def _print_capture(result: SimulationResult) -> None:
 
 def _print_grids(result: RegridResult) -> None:
     for grid in result.grids:
-        typer.echo(grid)
+        echo(grid)
     skipped = f" ({result.skipped} existed)" if result.skipped else ""
-    typer.echo(f"{result.spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")
+    echo(f"{result.spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")

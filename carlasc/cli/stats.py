@@ -11,8 +11,10 @@ from carlasc.cli.common import (
     Cluster,
     Json,
     console,
+    echo,
     engine,
     file_option,
+    line,
     place_argument,
     print_json,
     progress_bar,
@@ -71,7 +73,7 @@ def stats(
     else:
         print_statistics(result, by)
         if plot is not None:
-            typer.echo(f"plot: {plot}")
+            echo(f"plot: {plot}")
     report_failures(list(result.failures), result.frames + len(result.failures), "files")
 
 
@@ -94,7 +96,7 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
     total = result.total
     if total.grids:
         text = f"{total.known_share:.1%} of voxels known ({total.grids} grids); shares of voxels are shares of the known voxels; class 0 of points is unlabelled"
-        out.print(text, highlight=False)
+        out.print(line(text))
 
 
 def _class_table(

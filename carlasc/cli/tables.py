@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from carlasc.errors import printable
+
 _MOST_COLUMNS = 10  # a table with more columns beside the first is turned
 _TEXT_WIDTH = 16  # a longer text is wrapped at this width or wider, never inside a word
 _BORDER = 3  # border and padding of a column, in characters
@@ -33,6 +35,8 @@ def print_table(
         title: printed above the table.
         turn: whether the table may be turned; False for one whose rows must stay rows.
     """
+    title, header = printable(title), [printable(name) for name in header]
+    rows = [[printable(cell) for cell in row] for row in rows]  # names come from data
     columns: list[Column] = list(zip(header, *rows, strict=True))
     if turn and rows and (len(columns) - 1 > _MOST_COLUMNS or _least_width(columns) > console.width):
         names = [header[0], *(row[0].replace("/", "/\n") for row in rows)]  # paths are too long for a column

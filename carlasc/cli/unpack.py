@@ -11,6 +11,7 @@ from carlasc.cli.common import (
     Json,
     PartOption,
     Workers,
+    echo,
     engine,
     parse_part,
     place_argument,
@@ -50,4 +51,4 @@ def unpack(
         print_json(result)
     else:
         kept = f" ({result.kept} were written by an earlier run)" if result.kept else ""
-        typer.echo(f"{result.out}: {len(result.sequences)} sequences, {result.files} files written{kept}")
+        echo(f"{result.out}: {len(result.sequences)} sequences, {result.files} files written{kept}")

@@ -12,6 +12,7 @@ from carlasc.cli.common import (
     Json,
     console,
     engine,
+    line,
     place_argument,
     print_json,
     progress_bar,
@@ -130,18 +131,16 @@ def validate(
 
 def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
-    from rich.text import Text
-
     from carlasc.inspection.findings import SEVERITIES
 
     out = console()
     for (severity, check), findings in result.grouped().items():
-        out.print(Text(f"{severity}: {check} ({len(findings)})", style=_COLORS[severity]))
+        out.print(line(f"{severity}: {check} ({len(findings)})", _COLORS[severity]))
         shown = findings if everything else findings[:_SHOWN]
         for finding in shown:
-            out.print(Text(f"  {finding}"), soft_wrap=True)
+            out.print(line(f"  {finding}"), soft_wrap=True)
         if len(findings) > len(shown):
-            out.print(Text(f"  ... and {len(findings) - len(shown)} more (--all prints them)"))
+            out.print(line(f"  ... and {len(findings) - len(shown)} more (--all prints them)"))
     for report in result.sequences:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})" for grid, share in report.voxel_share.items()
@@ -150,11 +149,9 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             figures.append(f"{report.pose_share:.1%} of a scan's structure on that of an earlier scan under the poses")
         name = report.path or result.location
         text = f"{name}: {report.frames} frames, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
-        out.print(Text(text), soft_wrap=True)
+        out.print(line(text), soft_wrap=True)
     counts = ", ".join(f"{result.count(severity)} {severity}s" for severity in SEVERITIES)
-    out.print(
-        Text(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", style="bold"), soft_wrap=True
-    )
+    out.print(line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"), soft_wrap=True)
 
 
 def print_held_out(result: HoldoutResult) -> None:
@@ -177,7 +174,7 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
     print_table(out, header, [_row(name, shares) for name, shares in parts.items()], title=title, turn=False)
     if scores.swept_share is not None:
         text = f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself drove through are occupied"
-        out.print(text, highlight=False)
+        out.print(line(text))
 
 
 def _row(name: str, shares: RayShares) -> list[str]:

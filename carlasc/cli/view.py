@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import FramesOption, Json, file_option, print_json, progress_bar
+from carlasc.cli.common import FramesOption, Json, echo, file_option, print_json, progress_bar
 from carlasc.cli.scene_options import (
     ClassesOption,
     EveryOption,
@@ -71,7 +71,7 @@ def view(
     if out is None:
         if as_json:
             raise ArgumentError("--json", problem="a window has no figures to print", advice="write a page with `out`")
-        viewing.view(scene, report=typer.echo)
+        viewing.view(scene, report=echo)
         return
     with progress_bar("Writing the page") as progress:
         result = viewing.view(scene, out, thin_m=thin_m, overwrite=overwrite, progress=progress)
@@ -79,6 +79,6 @@ def view(
         print_json(result)
         return
     for note in result.notes:
-        typer.echo(note)
+        echo(note)
     size = f"{result.size_bytes / 1e6:.1f} MB"
-    typer.echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: open it in a browser")
+    echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: open it in a browser")

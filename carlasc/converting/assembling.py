@@ -114,6 +114,9 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
     for name, values in (fields | dict(cloud.others)).items():
         if values is not None and len(values) != count:
             raise FormatError(f"{where}: {name}", expected=f"one for each of {count} points", found=str(len(values)))
+    if cloud.seconds is not None and not np.isfinite(cloud.seconds).all():
+        found = f"NaN or infinity at point {int(np.argmin(np.isfinite(cloud.seconds)))}"
+        raise FormatError(f"{where}: times of points", expected="finite numbers", found=found)
 
 
 def _follows_motion(cloud: Cloud, rig: Rig, motion: Motion | None) -> bool:

@@ -24,7 +24,8 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageE
 from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
 from carlasc.running.processes import count_workers, one_pool, run_all
-from carlasc.storage.files import remove_stale, write_atomic
+from carlasc.storage.durability import rename, sync_tree
+from carlasc.storage.files import has_content, remove_stale, write_many
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,12 @@ def export(
         for exported in ours:
             folder = root / exported.folder
             remove_stale(folder)
-            for document, data in exporter.documents(exported.sequence).items():
-                write_atomic(folder / document, data)
+            documents = exporter.documents(exported.sequence)
+            write_many({folder / document: data for document, data in documents.items()})
             done += _export_sequence(exporter, exported, folder, overwrite, run, steps)
     if part.count == 1 or all(_is_whole(exporter, exported, root / exported.folder) for exported in chosen):
-        for file, data in exporter.index(root, done.exported if part.count == 1 else chosen).items():
-            write_atomic(root / file, data)
+        index = exporter.index(root, done.exported if part.count == 1 else chosen)
+        write_many({root / file: data for file, data in index.items()})
     written = sum(len(exported.frames) for exported in done.exported)
     return ExportResult(
         root,
@@ -218,10 +219,10 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
     sequence = exported.sequence
     if isinstance(exporter, SequenceExporter):
         path = folder / exporter.file(sequence)
-        return path.is_file() and set(exported.frames) <= set(exporter.frames_in(path, sequence))
+        return has_content(path) and set(exported.frames) <= set(exporter.frames_in(path, sequence))
     assert isinstance(exporter, FrameExporter)
     files = (file for frame in exported.frames for file in exporter.frame_files(sequence, frame))
-    return all((folder / file).is_file() for file in files)
+    return all(has_content(folder / file) for file in files)
 
 
 def _export_sequence(
@@ -241,7 +242,7 @@ def _export_frames(
     jobs = [
         _Job(exporter, sequence, frame, folder)
         for frame in exported.frames
-        if overwrite or not all((folder / file).is_file() for file in exporter.frame_files(sequence, frame))
+        if overwrite or not all(has_content(folder / file) for file in exporter.frame_files(sequence, frame))
     ]
     steps(len(exported.frames) - len(jobs))
     failures = []
@@ -262,8 +263,8 @@ def _write_frame(job: _Job) -> str | None:
     """Write one frame's files; return the error message if it cannot be done."""
     assert isinstance(job.exporter, FrameExporter)
     try:
-        for file, data in job.exporter.make_frame(job.sequence, job.frame).items():
-            write_atomic(job.folder / file, data)
+        files = job.exporter.make_frame(job.sequence, job.frame)
+        write_many({job.folder / file: data for file, data in files.items()})
     except StorageError:
         raise
     except (CarlascError, OSError) as error:
@@ -292,7 +293,8 @@ def _export_file(
                     failures.append(Failure(sequence.location, frame, problem))
                 steps()
         if len(failures) < len(exported.frames):
-            part.replace(path)
+            sync_tree(part)
+            rename(part, path)
     except OSError as error:
         raise StorageError(path, problem=f"cannot be written: {error.strerror or error}") from error
     finally:

@@ -9,7 +9,7 @@ from typing import Any
 
 from carlasc import storage
 from carlasc.errors import ConflictError
-from carlasc.storage.files import parse_json, to_json, write_atomic
+from carlasc.storage.files import has_content, parse_json, to_json, write_atomic
 
 RECORD = "carlasc-export.json"
 
@@ -25,7 +25,7 @@ class ExportRecord:
 
     def __init__(self, root: Path, name: str, product: str) -> None:
         self._path, self._name, self._product = root / RECORD, name, product
-        self._all = parse_json(self._path.read_bytes(), str(self._path)) if self._path.is_file() else {}
+        self._all = parse_json(self._path.read_bytes(), str(self._path)) if has_content(self._path) else {}
 
     def check(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
         """Check that the places of sequences, which are paths in the folder, are new, or hold them, exported with the same settings.

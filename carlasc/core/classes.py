@@ -74,8 +74,9 @@ class ClassTable:
             raise ArgumentError(where, expected="an id of the table in geometry_only", found=str(self.geometry_only))
         if self.ground_only is not None and self.ground_only not in self.ground:
             raise ArgumentError(where, expected="an id of ground in ground_only", found=str(self.ground_only))
-        if self.num_channels and self.num_channels <= max(self.names):
-            raise ArgumentError(where, expected=f"num_channels above {max(self.names)}", found=str(self.num_channels))
+        if self.num_channels and not max(self.names) < self.num_channels <= _MAX_ID + 1:
+            expected = f"num_channels above {max(self.names)}, up to {_MAX_ID + 1}"
+            raise ArgumentError(where, expected=expected, found=str(self.num_channels))
         object.__setattr__(self, "names", dict(self.names))
         object.__setattr__(self, "colors", dict(self.colors))
         object.__setattr__(self, "num_channels", self.num_channels or max(self.names) + 1)
@@ -108,7 +109,7 @@ class ClassTable:
             ) from error
         except ArgumentError as error:
             raise FormatError(f"{where}: {error.where}", expected=error.expected, found=error.found) from error
-        except (TypeError, ValueError, AttributeError) as error:
+        except (TypeError, ValueError, AttributeError, OverflowError) as error:
             raise FormatError(
                 f"{where}: classes", expected="names and colours by id, and ids in the roles", found=str(error)
             ) from error

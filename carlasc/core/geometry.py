@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any, TypeVar
 
 import numpy as np
@@ -28,6 +29,18 @@ def translation(xyz: ArrayLike) -> Transform:
     return transform
 
 
+def multiply(*matrices: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the product of (..., N, K) and (..., K, M) small matrices, from left to right, with the same bits on every processor.
+
+    `@` calls BLAS, which adds in another order, and with other roundings, on other processors.
+    """
+    product = np.asarray(matrices[0], np.float64)
+    for matrix in matrices[1:]:
+        terms = [product[..., :, k, None] * matrix[..., None, k, :] for k in range(matrix.shape[-2])]
+        product = reduce(np.add, terms)
+    return product
+
+
 def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDArray[np.float64]:
     """Transform points from frame `src` to frame `dst`.
 
@@ -38,7 +51,7 @@ def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDAr
     Returns:
         (..., 3) float64 metres, frame `dst`.
     """
-    return np.asarray(points, np.float64) @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
+    return rotate_vectors(dst_T_src, points) + dst_T_src[:3, 3]
 
 
 def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
@@ -48,7 +61,11 @@ def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
 
 def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     """Rotate (..., 3) vectors, such as velocities and normals, from frame `src` to frame `dst`, without translation."""
-    return np.asarray(vectors, np.float64) @ dst_T_src[:3, :3].T
+    x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
+    rotated = np.empty((*np.shape(vectors)[:-1], 3))
+    for row, (along_x, along_y, along_z) in enumerate(dst_T_src[:3, :3]):
+        rotated[..., row] = x * along_x + y * along_y + z * along_z  # not `@`: see `multiply`
+    return rotated
 
 
 def invert(dst_T_src: Transform) -> Transform:
@@ -56,7 +73,7 @@ def invert(dst_T_src: Transform) -> Transform:
     rotation = np.swapaxes(dst_T_src[..., :3, :3], -1, -2)
     src_T_dst = np.zeros_like(dst_T_src, dtype=np.float64)
     src_T_dst[..., :3, :3] = rotation
-    src_T_dst[..., :3, 3] = -(rotation @ dst_T_src[..., :3, 3:])[..., 0]
+    src_T_dst[..., :3, 3] = -multiply(rotation, dst_T_src[..., :3, 3:])[..., 0]
     src_T_dst[..., 3, 3] = 1.0
     return src_T_dst
 
@@ -118,24 +135,32 @@ def slerp(poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray
     times = np.asarray(at, np.float64).reshape(-1)
     before = np.clip(np.searchsorted(seconds, times, side="right") - 1, 0, len(poses) - 2)
     share = (times - seconds[before]) / np.diff(seconds)[before]
-    turns = quaternions_of(
-        np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
-    )  # the first number is not negative
+    # The first number of a quaternion is not negative.
+    turns = quaternions_of(multiply(np.swapaxes(poses[:-1, :3, :3], 1, 2), poses[1:, :3, :3]))
     axes = turns[:, 1:]
     lengths = np.linalg.norm(axes, axis=1)
     half = np.arctan2(lengths, turns[:, 0])[before] * share
     units = np.divide(axes, lengths[:, None], out=np.zeros_like(axes), where=lengths[:, None] > 0)[before]
     between = np.tile(np.eye(4), (len(times), 1, 1))
-    between[:, :3, :3] = poses[before, :3, :3] @ rotations_of(
-        np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * units], axis=1)
-    )
+    quaternions = np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * units], axis=1)
+    between[:, :3, :3] = multiply(poses[before, :3, :3], rotations_of(quaternions))
     between[:, :3, 3] = poses[before, :3, 3] + share[:, None] * (poses[before + 1, :3, 3] - poses[before, :3, 3])
     return between.reshape(*np.shape(at), 4, 4)
 
 
 def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Express world poses (..., 4, 4) in the frame `first`: `inv(first) @ pose`, as in poses.txt."""
-    return np.linalg.inv(first) @ poses
+    return multiply(inverse_of(first), poses)
+
+
+def inverse_of(transform: Transform) -> Transform:
+    """Return the inverse of a (4, 4) transform that need not be quite rigid, with the same bits on every processor."""
+    x, y, z = transform[:3, 0], transform[:3, 1], transform[:3, 2]
+    rows = np.array([np.cross(y, z), np.cross(z, x), np.cross(x, y)])
+    inverse = np.eye(4)
+    inverse[:3, :3] = rows / (rows[0, 0] * x[0] + rows[0, 1] * x[1] + rows[0, 2] * x[2])
+    inverse[:3, 3] = -multiply(inverse[:3, :3], transform[:3, 3:])[:, 0]
+    return inverse
 
 
 def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 1e-3) -> NDArray[np.float64]:

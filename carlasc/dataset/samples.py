@@ -331,7 +331,10 @@ class Dataset(_MapStyle):
         if "visibility" in self.fields:
             from carlasc.dataset.visibility import stack_visibility
 
-            stacks["visibility"] = stack_visibility(scans, moves, spec, *ranges)
+            try:
+                stacks["visibility"] = stack_visibility(scans, moves, spec, *ranges)
+            except FormatError as error:  # of poses.txt
+                raise error.within(part.scans.location) from error
         if "occupancy" in self.fields:
             stacks["occupancy"] = (
                 (stacks["density"] > 0).view(np.uint8)

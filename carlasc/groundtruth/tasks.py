@@ -185,10 +185,7 @@ def exists(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) 
     Raises:
         ConflictError: it exists, and differs from `array`.
     """
-    if not writer.has(field, frame):
-        return False
-    check_scan(writer, field, frame, array)
-    return True
+    return writer.has(field, frame) and check_scan(writer, field, frame, array)
 
 
 def _make(frame: FrameInput, plan: Plan) -> tuple[Outputs, Grid]:

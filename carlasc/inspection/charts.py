@@ -12,7 +12,7 @@ import numpy as np
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.inspection.statistics import KINDS, Kind, Statistics
 from carlasc.metrics.results import Evaluation
-from carlasc.storage.files import write_atomic
+from carlasc.storage.files import write_output
 
 _SUFFIXES = (".png", ".svg", ".pdf")
 _OF: dict[Kind, str] = {"points": "points", "voxels": "known voxels"}
@@ -123,4 +123,4 @@ def draw_frame_scores(evaluation: Evaluation, plot: Path) -> None:
 def _write(figure: Any, plot: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=plot.suffix[1:].lower(), dpi=150)
-    write_atomic(plot, buffer.getvalue())
+    write_output(plot, buffer.getvalue())

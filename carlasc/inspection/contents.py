@@ -153,7 +153,7 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
 
 
 def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
-    rows = np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    rows = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     if not rows.all():
         found = f"NaN or infinity in {int((~rows).sum())} rows, first in row {int(np.argmin(rows))}"
         yield Finding("error", "not-finite", sequence.path, where, "finite numbers", found)

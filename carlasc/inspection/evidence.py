@@ -64,11 +64,12 @@ def _mistakes_of_classes(table: NDArray[Any], num_voxels: int, classes: ClassTab
         if not known.all():
             found = f"{table['label'][~known][0]}, and {(~known).sum() - 1} other such rows"
             yield f"class ids of {classes.name} other than 0", found
-    voxels = table["voxel"][inside]
-    sums = np.bincount(voxels, table["votes"][inside], num_voxels)
+    voxels, place = np.unique(table["voxel"][inside], return_inverse=True)
+    sums = np.bincount(place, table["votes"][inside], len(voxels))
     too_large = np.flatnonzero(
-        sums > layout.CERTAIN + 0.5 * np.bincount(voxels, minlength=num_voxels)
+        sums > layout.CERTAIN + 0.5 * np.bincount(place, minlength=len(voxels))
     )  # each is rounded
     if len(too_large):
-        found = f"{sums[too_large[0]]:.0f} in voxel {too_large[0]}, and {len(too_large) - 1} other such voxels"
+        first = too_large[0]
+        found = f"{sums[first]:.0f} in voxel {voxels[first]}, and {len(too_large) - 1} other such voxels"
         yield f"probabilities that add up to at most {layout.CERTAIN} per voxel", found

@@ -10,7 +10,7 @@ from typing import Any
 from carlasc.groundtruth.reporting.actors import Actor
 from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
 from carlasc.inspection.reports import ReportResult
-from carlasc.storage.files import write_atomic
+from carlasc.storage.files import write_output
 from carlasc.storage.resuming import RECORD
 
 _STYLE = """
@@ -41,7 +41,7 @@ def write_report_page(result: ReportResult, out: str | Path) -> None:
         f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>\n"
         f"{''.join(parts)}</body></html>\n"
     )
-    write_atomic(Path(out), page.encode())
+    write_output(Path(out), page.encode())
 
 
 def describe(report: Report) -> list[tuple[str, str]]:

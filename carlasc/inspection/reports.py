@@ -21,7 +21,8 @@ from carlasc.inspection.heldout import holdout as leave_out
 from carlasc.running.engines import Engine
 from carlasc.running.processes import count_workers, run_all
 from carlasc.storage import as_source, layout
-from carlasc.storage.folders.folder import FolderSequence, FolderWriter
+from carlasc.storage.files import write_output
+from carlasc.storage.folders.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
 
@@ -109,7 +110,7 @@ def report(
         if holdout and one.holdout is None:
             one = replace(one, holdout=makers[row].held_out(workers, executor))
         if save and isinstance(sequence, FolderSequence):
-            FolderWriter(sequence.folder).write_document(layout.report_file(name), one.to_json())
+            write_output(sequence.folder / layout.report_file(name), one.to_json())
         found[f"{path}/{name}" if path else name] = one
     return ReportResult(opened.location, found, tuple(failures))
 

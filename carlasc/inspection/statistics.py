@@ -188,7 +188,7 @@ def stats(
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
         raise MissingDataError(opened.location, expected=f"labels of points or the grid {grid}", found="neither")
-    classes = _common_table(tasks)
+    classes = _common_table(tasks, opened.location)
     chosen = _choose_remap(remap, classes)
     total, done = sum(len(frames) for _, _, frames in tasks), 0
     histograms = {path: Histogram.empty(classes) for path in sequences}
@@ -259,20 +259,25 @@ def _table_of(sequence: Sequence, field: str) -> ClassTable:
     return sequence.metadata.classes if field == "labels" else sequence.classes_of(field.removesuffix("/labels"))
 
 
-def _common_table(tasks: Iterable[_Task]) -> ClassTable:
+def _common_table(tasks: Iterable[_Task], where: str) -> ClassTable:
     """Return the grids' table, or the points' if there are no grids: points beside a prediction are counted in its classes."""
     fields = {(sequence.path, field): _table_of(sequence, field) for sequence, field, _ in tasks}
     grids = [table for (_, field), table in fields.items() if field != "labels"]
     tables = {table.name: table for table in grids or fields.values()}
     if len(tables) > 1:
-        raise FormatError("classes", expected="one table", found=", ".join(sorted(tables)), advice=_COUNT_APART)
+        raise FormatError(
+            f"{where}: classes", expected="one table", found=", ".join(sorted(tables)), advice=_COUNT_APART
+        )
     (classes,) = tables.values()
     for table in fields.values():
         try:
             remaps_between(table, classes)
         except ArgumentError as error:
             raise FormatError(
-                "classes", expected=f"classes that remap to {classes.name}", found=table.name, advice=_COUNT_APART
+                f"{where}: classes",
+                expected=f"classes that remap to {classes.name}",
+                found=table.name,
+                advice=_COUNT_APART,
             ) from error
     return classes
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,9 @@ from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
 from carlasc.metrics.grids import GridFrames, LabelFolder
+from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
 
 OCC3D_SPEC = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
 OPENOCCUPANCY_SPEC = GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0))
@@ -65,19 +65,22 @@ class Occ3dScene(TokenFrames):
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
         """Return (200, 200, 16) labels."""
         file = self._file(frame)
-        arrays = _load_npz(file)
-        name = next((name for name in _LABELS if name in arrays), None)
-        if name is None and len(arrays) == 1:
-            (name,) = arrays
-        if name is None or arrays[name].shape != self.spec.size:
-            found = ", ".join(f"{key} {array.shape}" for key, array in arrays.items()) or "nothing"
-            raise FormatError(file, expected=f"an array {_LABELS[0]} of shape {self.spec.size}", found=found)
-        return arrays[name]
+        with open_npz(file) as arrays:
+            name = next((name for name in _LABELS if name in arrays.names), _LABELS[0])
+            name = arrays.names[0] if len(arrays.names) == 1 else name
+            labels = arrays.read(name, ArrayFormat(WHOLE_NUMBERS, self.spec.size))
+        if labels.min() < 0 or labels.max() > _NOISE:
+            found = f"{labels.min()} to {labels.max()}"
+            raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=found)
+        return labels.astype(np.uint8, copy=False)
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
         """Return the (200, 200, 16) mask of the voxels that the LiDAR or a camera observed; None if the file does not contain it."""
-        mask = _load_npz(self._file(frame)).get(f"mask_{seen_by}")
-        return None if mask is None else mask.astype(np.bool_)
+        name = f"mask_{seen_by}"
+        with open_npz(self._file(frame)) as arrays:
+            if name not in arrays.names:
+                return None
+            return arrays.read(name, ArrayFormat(WHOLE_NUMBERS, self.spec.size)).astype(np.bool_)
 
 
 class OpenOccupancyScene(TokenFrames):
@@ -88,12 +91,11 @@ class OpenOccupancyScene(TokenFrames):
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
         """Return (512, 512, 40) labels; a stored 0 is noise, 255 here."""
         file = self._file(frame)
-        try:
-            rows = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FormatError(file, problem=f"cannot be read: {error}") from error
-        if rows.ndim != 2 or rows.shape[1] not in (4, 7):
+        rows = read_npy(file, ArrayFormat(NUMBERS, (None, None)))
+        if rows.shape[1] not in (4, 7):
             raise FormatError(file, expected="rows of 4 or 7 columns (z, y, x, ..., class)", found=str(rows.shape))
+        if not np.isfinite(rows).all():
+            raise FormatError(file, expected="finite numbers", found="others")
         z, y, x = rows[:, :3].astype(np.int64).T
         classes = rows[:, -1].astype(np.int64)
         size = np.array(self.spec.size)[:, None]
@@ -143,13 +145,3 @@ def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "t
             grids = KittiFolder(sequence, sequence.parent.name, benchmark)
             if len(grids.frames()):
                 yield grids
-
-
-def _load_npz(file: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except FileNotFoundError as error:
-        raise MissingDataError(file, expected="a file", found="nothing") from error
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, AttributeError) as error:
-        raise FormatError(file, problem=f"cannot be read: {error}") from error

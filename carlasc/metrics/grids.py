@@ -155,7 +155,7 @@ class LabelFolder(GridFrames):
                 found=f"{size} bytes",
                 advice="the file is truncated, of another grid, or of another type",
             )
-        return np.fromfile(path, types[width])
+        return np.fromfile(path, types[width], int(size // width))  # the size is that of a file: a device has none
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
         """Return (X * Y * Z,) which voxels have votes, or are not invalid; None if there is no such file.

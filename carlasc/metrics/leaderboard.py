@@ -130,11 +130,15 @@ def _read(file: Path) -> dict[str, Any]:
             expected="a result of `carlasc evaluate --json`",
             found=f"JSON without {', '.join(missing[:3])}",
         )
-    if not isinstance(values["class_iou"], dict) or not all(
-        value is None or isinstance(value, int | float)
-        for value in (*values["class_iou"].values(), *(values[figure] for figure in _FIGURES))
-    ):
-        raise FormatError(file, expected="numbers or null for every figure", found="something else")
+    for key in ("name", "convention"):
+        if not isinstance(values[key], str):
+            raise FormatError(file, expected=f"text under {key}", found=type(values[key]).__name__)
+    if not isinstance(values["class_iou"], dict):
+        raise FormatError(file, expected="an IoU by class", found=type(values["class_iou"]).__name__)
+    figures = {figure: values.get(figure) for figure in (*_FIGURES, "rayiou")} | values["class_iou"]
+    for name, value in figures.items():
+        if value is not None and not (isinstance(value, int | float) and 0 <= value <= 1):
+            raise FormatError(file, expected=f"a fraction from 0 to 1, or null, for {name}", found=repr(value)[:40])
     return values
 
 

@@ -8,7 +8,7 @@ import logging
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -204,7 +204,8 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
             _check_versions(client)
         yield client
     finally:
-        client.close(timeout=1)
+        with suppress(TimeoutError):  # a scheduler that is gone does not answer
+            client.close(timeout=1)
 
 
 def _check_versions(client: Any) -> None:

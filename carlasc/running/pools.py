@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from carlasc.errors import CarlascError
@@ -184,6 +186,21 @@ def inherited_by_workers() -> Iterator[None]:
 
 def _prepare_worker() -> None:
     signal.signal(signal.SIGTERM, _exit_worker)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker soon after the main process, which cannot tell its workers to stop when it is killed itself.
+
+    Without this they would wait for tasks for ever: each of them keeps the queue of tasks open.
+    """
+    parent = parent_process()
+    if parent is None:
+        return
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)  # the task removes the file that it is writing
+    time.sleep(_GRACE_S)
+    os._exit(_TERMINATED)
 
 
 def _exit_worker(*_: object) -> None:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
+from carlasc.storage.durability import sync_file
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
 
 _PIECE = 4 << 20  # bytes of a range that is requested
@@ -114,6 +115,7 @@ class Cache:
                         if not self._make_room(descriptor, _size_of(name)):
                             return False
                         fill(descriptor)
+                        sync_file(descriptor)  # it has its full size already: after a power failure it would hold zeros
                         part.rename(path)
                 finally:
                     if _is_at(part, descriptor):
@@ -182,7 +184,7 @@ class CachedTree(Tree):
         """Whether the file exists."""
         return path in self._names or self.remote.is_file(path)
 
-    def read(self, path: str) -> bytes | memoryview:
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Map the cached file into memory."""
         cached = self._from_cache(path, lambda tree, name: tree.read(name))
         return self.remote.read(path) if cached is None else cached

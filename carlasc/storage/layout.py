@@ -8,7 +8,7 @@ Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid
 from __future__ import annotations
 
 import io
-import zipfile
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
+from carlasc.storage.arrays import ArrayFormat, open_npz
 
 SPLITS = ("Train", "Val", "Test")
 COORDINATES = ("cartesian", "cylindrical")
@@ -32,6 +33,7 @@ REPORT = "carlasc-report.json"
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
+_MOST_CLASSES = 256
 CERTAIN = 65535  # the number in the column `votes` of `<grid>/classes` that means a probability of 1
 
 
@@ -89,19 +91,19 @@ class Field:
         Args:
             data: the whole file.
             where: the file, for errors.
-            shape: expected shape, for grids; None computes the number of rows from the size of the file.
+            shape: shape of the grid, for its fields; None computes the number of rows from the size of the file.
 
         Raises:
             FormatError: the size of the file does not match.
         """
         if self.kind == "votes":
-            return _decode_votes(data, where)
+            return _decode_votes(data, where, shape)
         if self.kind == "boxes":
             return _decode_boxes(data, where)
         dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
         size = len(data)
-        if shape is not None and size != dtype.itemsize * int(np.prod(shape)):
-            expected = f"{dtype.itemsize * int(np.prod(shape))} bytes ({' x '.join(map(str, shape))} {dtype.name})"
+        if shape is not None and size != self.size_of(shape):
+            expected = f"{self.size_of(shape)} bytes ({' x '.join(map(str, shape))} {dtype.name})"
             raise FormatError(
                 where, expected=expected, found=str(size), advice="the file is cut short, or belongs to another grid"
             )
@@ -116,6 +118,10 @@ class Field:
         if shape is not None:
             return array.reshape(shape)
         return array if self.columns is None else array.reshape(-1, self.columns)
+
+    def size_of(self, shape: tuple[int, ...] | None) -> int | None:
+        """Return the bytes of a file of a grid of some shape; None where they are not known before it is read."""
+        return None if shape is None or self.per != "voxel" else np.dtype(self.dtype).itemsize * math.prod(shape)
 
     def encode(self, array: NDArray[Any], where: str) -> bytes | memoryview:
         """Return the bytes of a frame's file.
@@ -299,7 +305,9 @@ def frame_of(file_name: str, suffix: str) -> int | None:
     if not file_name.endswith(suffix):
         return None
     stem = file_name[: len(file_name) - len(suffix)]
-    return int(stem) if len(stem) >= 6 and stem.isascii() and stem.isdigit() else None
+    return (
+        int(stem) if 6 <= len(stem) <= 18 and stem.isascii() and stem.isdigit() else None
+    )  # 18 digits fit into an int64
 
 
 def encode_poses(poses: NDArray[np.float64]) -> bytes:
@@ -350,17 +358,15 @@ def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, columns)
 
 
-def _decode_votes(data: bytes | memoryview, where: str) -> NDArray[Any]:
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            columns = {name: archive[name] for name in ("voxel", "label", "votes")}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FormatError(
-            where, expected="an .npz of voxel, label and votes", found="something else", advice=str(error)
-        ) from error
-    votes = np.empty(len(columns["voxel"]), VOTES_DTYPE if columns["label"].dtype.itemsize == 1 else WIDE_VOTES_DTYPE)
-    for name, column in columns.items():
-        votes[name] = column
+def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    # A voxel has at most one row for each class; as many for every voxel of a grid are more than any data set has classes.
+    most = None if shape is None else _MOST_CLASSES * math.prod(shape)
+    with open_npz(data, where) as archive:
+        labels = archive.read("label", ArrayFormat(("u1", "<u2"), (None,), most))
+        votes = np.empty(len(labels), VOTES_DTYPE if labels.itemsize == 1 else WIDE_VOTES_DTYPE)
+        votes["label"] = labels
+        for name in ("voxel", "votes"):
+            votes[name] = archive.read(name, ArrayFormat((VOTES_DTYPE[name].str,), labels.shape))
     return votes
 
 

@@ -266,7 +266,11 @@ class Sequence(ABC):
                 self.location, expected=f"the grid {name}", found=f"{', '.join(self.grids) or 'none'}"
             )
         counts = self.read(f"{name}/counts", frame) if f"{name}/counts" in self.fields() else None
-        return Grid(self.grids[name], cast(NDArray[np.unsignedinteger], self.read(f"{name}/labels", frame)), counts)
+        labels = cast(NDArray[np.unsignedinteger], self.read(f"{name}/labels", frame))
+        try:
+            return Grid(self.grids[name], labels, counts)
+        except FormatError as error:
+            raise error.within(f"{self.location}: frame {frame}") from error
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"

@@ -90,9 +90,10 @@ class RemoteTarget(Target):
             fail(self.tree.where(path), found, writing=True)
         return found.get(_MARK) == mark
 
-    def put_many(self, files: Mapping[str, bytes | memoryview]) -> None:
-        """Write several objects side by side."""
-        self._send(files, [self._request(path, data) for path, data in files.items()])
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write the objects of each group side by side."""
+        for group in groups:
+            self._send(group, [self._request(path, data) for path, data in group.items()])
 
     def paths(self, folder: str = "") -> Iterator[str]:
         """List all objects below the folder: 1000 with each request."""

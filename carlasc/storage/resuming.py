@@ -177,15 +177,21 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     return metadata.to_json() if data is None and metadata != Metadata() else None
 
 
-def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) -> None:
+def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) -> bool:
     """Compare an existing scan field with what this run would write.
+
+    Returns:
+        Whether it need not be written: False if what exists is empty and should not be, as a power failure can leave it.
 
     Raises:
         ConflictError: they differ.
     """
     existing = writer.read(field, frame)
+    if existing is not None and not existing.size and array.size:
+        return False
     if existing is not None and not np.array_equal(existing, array, equal_nan=array.dtype.kind == "f"):
         raise _other_data(f"{writer.location}/{layout.field_named(field).file(frame)}", frame)
+    return True
 
 
 def _other_data(where: str, frame: int) -> ConflictError:

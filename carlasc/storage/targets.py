@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from carlasc.errors import FormatError
-from carlasc.storage.files import write_atomic
+from carlasc.storage.files import write_atomic, write_many
 from carlasc.storage.folders.names import leads_outside
 from carlasc.storage.folders.trees import LocalTree, Tree
 
@@ -50,10 +50,11 @@ class Target(ABC):
             StorageError: it cannot be written; nothing is left behind.
         """
 
-    def put_many(self, files: Mapping[str, bytes | memoryview]) -> None:
-        """Write several files in the order given; remote targets write those of one call side by side."""
-        for path, data in files.items():
-            self.put(path, data)
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write several files: those of a group side by side, and each group after those before it."""
+        for group in groups:
+            for path, data in group.items():
+                self.put(path, data)
 
     @abstractmethod
     def paths(self, folder: str = "") -> Iterator[str]:
@@ -84,6 +85,10 @@ class LocalTarget(Target):
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
         """Write a file under a temporary name, then rename it, or link it where only a new file is wanted."""
         return write_atomic(self._inside(path), data, create=create)
+
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write several files, which are synced together."""
+        write_many(*({self._inside(path): data for path, data in group.items()} for group in groups))
 
     def paths(self, folder: str = "") -> Iterator[str]:
         """Walk the folders; the temporary files of writers are left out."""

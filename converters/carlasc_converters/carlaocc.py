@@ -21,6 +21,8 @@ from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, remap_named
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.storage.arrays import NUMBERS, ArrayFormat
+from carlasc_converters.files import opening, read_text
 from carlasc_converters.npz import read_arrays
 from carlasc_converters.ply import PlyVertices
 
@@ -136,10 +138,8 @@ class CarlaOccRecording(Recording):
         path = self.folder / "poses" / "lidar.txt"
         if not path.is_file():
             return None
-        try:
+        with opening(path, "17 numbers per line"):
             rows = np.loadtxt(path, ndmin=2)
-        except ValueError as error:
-            raise FormatError(path, expected="17 numbers per line", found=f"something else ({error})") from error
         if rows.shape[1] != 17:
             raise FormatError(path, expected="17 numbers per line: frame and 4 x 4 pose", found=str(rows.shape[1]))
         if missing := sorted({frame.number for frame in self.frames} - set(rows[:, 0].astype(int).tolist())):
@@ -215,9 +215,8 @@ class CarlaOccFrame(FrameHandle):
                 expected=f"the geometry of {self.reference}: {expected} from {expected.lower}",
                 found=f"{spec} from {spec.lower}",
             )
-        rows = read_arrays(self.grid, ("occupancy",), _COPY)[0]
-        if rows.ndim != 2 or rows.shape[1] != 4 or rows.dtype != np.uint16:
-            raise FormatError(self.grid, expected="occupancy (N, 4) uint16", found=f"{rows.shape} {rows.dtype}")
+        voxels = ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)
+        rows = read_arrays(self.grid, {"occupancy": voxels}, _COPY)[0]
         cells = rows[:, :3].astype(np.int64)
         if outside := int((cells >= spec.size).any(axis=1).sum()):
             raise FormatError(self.grid, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside")
@@ -252,7 +251,9 @@ def _read_geometry(path: str | Path) -> GridSpec:
     Raises:
         FormatError: the file does not describe a grid.
     """
-    step, origin, size = read_arrays(path, ("voxel_size", "voxel_origin", "volume_size"), _COPY)
+    few = ArrayFormat(NUMBERS, None, 3)
+    names = ("voxel_size", "voxel_origin", "volume_size")
+    step, origin, size = read_arrays(path, dict.fromkeys(names, few), _COPY)
     try:
         lower = np.asarray(origin, np.float64).reshape(3)
         cells = np.asarray(size, np.int64).reshape(3)
@@ -261,7 +262,7 @@ def _read_geometry(path: str | Path) -> GridSpec:
         # in float32, as `--bounds` gives them.
         low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
         return GridSpec("cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])).with_bounds(low, up)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(
             path, expected="voxel_size, and 3 values of voxel_origin and volume_size", found=str(error)
         ) from error
@@ -273,7 +274,7 @@ def _read_splits(root: Path) -> dict[str, Split]:
     names: tuple[tuple[str, Split], ...] = (("train", "Train"), ("val", "Val"), ("test", "Test"))
     for file, split in names:
         path = root / "splits" / f"{file}.txt"
-        for line in path.read_text().splitlines() if path.is_file() else ():
+        for line in read_text(path).splitlines() if path.is_file() else ():
             if len(words := line.split()) == 3:
                 town = "Town10HD" if words[0] == "10" else f"Town{words[0]}"
                 counts.setdefault(f"{town}_Opt_Seq{words[1]}", Counter())[split] += 1

@@ -9,8 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra
-
-_COPY = "the file may be cut short: copy it again"
+from carlasc_converters.files import opening
 
 
 def read_columns(path: Path, names: Sequence[str], texts: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
@@ -29,13 +28,12 @@ def read_columns(path: Path, names: Sequence[str], texts: Sequence[str] = ()) ->
         FormatError: it is not a Feather file, lacks a column, or has a column of another type or with missing values.
         DependencyError: pyarrow is not installed.
     """
-    arrow, feather = import_extra("pyarrow", "parquet"), import_extra("pyarrow.feather", "parquet")
+    feather = import_extra("pyarrow.feather", "parquet")
     if not path.is_file():
         raise MissingDataError(path, expected="a Feather file", found="nothing", advice="download it again")
-    try:
+    with opening(path, "a Feather file"):
         table = feather.read_table(str(path), use_threads=False)  # frames are read side by side already
-    except (arrow.ArrowException, OSError) as error:
-        raise FormatError(path, expected="a Feather file", found=f"something else ({error})", advice=_COPY) from error
+        table.validate(full=True)
     if lacking := [name for name in (*names, *texts) if name not in table.column_names]:
         found = ", ".join(table.column_names) or "no columns"
         raise FormatError(path, expected=f"the columns {', '.join(lacking)}", found=found)
@@ -43,7 +41,8 @@ def read_columns(path: Path, names: Sequence[str], texts: Sequence[str] = ()) ->
     for name in (*names, *texts):
         column = table.column(name)
         kinds, kind = ("O", "text") if name in texts else ("iuf", "numbers")
-        array = column.to_numpy()
+        with opening(path, f"{kind} in the column {name}"):
+            array = column.to_numpy()
         if column.null_count or (array.dtype.kind not in kinds and len(array)):
             found = f"{column.null_count} missing values" if column.null_count else str(column.type)
             raise FormatError(path, expected=f"{kind} in the column {name}", found=found)

@@ -8,10 +8,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import opening
 
 _CHUNK = 1 << 20  # characters read at a time
 _LONGEST_ROW = 4 * _CHUNK
+_TOO_LARGE = 2**63  # of a number in a table: it does not fit into 64 bits
 _GAP = re.compile(r"[\s,]*")
 _EXPECTED = "a JSON list of objects"
 _OTHER = "the file is damaged, or belongs to another version of the data set"
@@ -52,38 +54,40 @@ def read_rows(
 
 def _is_of(value: object, kind: type | int) -> bool:
     """Return whether a value is of a type, or a list of so many numbers."""
+    if kind in (int, float):
+        return _is_number(value) and isinstance(value, int | float if kind is float else int)
     if isinstance(kind, type):
         return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
-    return isinstance(value, list) and len(value) == kind and all(type(number) in (int, float) for number in value)
+    return isinstance(value, list) and len(value) == kind and all(map(_is_number, value))
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is a finite number that fits into 64 bits."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _TOO_LARGE
 
 
 def _objects(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects of a list."""
     decode, count = json.JSONDecoder().raw_decode, 0
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            text = file.read(_CHUNK).lstrip()
-            if not text.startswith("["):
-                raise FormatError(path, expected=_EXPECTED, found=repr(text[:20]))
-            at = 1
-            while text[(at := _end_of_gap(text, at)) : at + 1] != "]":
-                try:
-                    row, at = decode(text, at)
-                except json.JSONDecodeError as error:  # the row goes on in the next chunk, or is damaged
-                    more = file.read(_CHUNK) if len(text) - at < _LONGEST_ROW else ""
-                    if not more:
-                        found = f"text that ends or is damaged after {count} rows ({error.msg})"
-                        raise FormatError(path, expected=_EXPECTED, found=found, advice=_UNPACK) from error
-                    text, at = text[at:] + more, 0
-                    continue
-                if not isinstance(row, dict):
-                    raise FormatError(path, expected=_EXPECTED, found=f"{type(row).__name__} in row {count}")
-                yield row
-                count += 1
-    except FileNotFoundError:
-        raise MissingDataError(path, expected="a table", found="no such file", advice=_UNPACK) from None
-    except UnicodeDecodeError as error:
-        raise FormatError(path, expected="text in UTF-8", found=f"something else ({error})", advice=_UNPACK) from error
+    with opening(path, _EXPECTED, _UNPACK), path.open(encoding="utf-8-sig") as file:
+        text = file.read(_CHUNK).lstrip()
+        if not text.startswith("["):
+            raise FormatError(path, expected=_EXPECTED, found=repr(text[:20]))
+        at = 1
+        while text[(at := _end_of_gap(text, at)) : at + 1] != "]":
+            try:
+                row, at = decode(text, at)
+            except json.JSONDecodeError as error:  # the row goes on in the next chunk, or is damaged
+                more = file.read(_CHUNK) if len(text) - at < _LONGEST_ROW else ""
+                if not more:
+                    found = f"text that ends or is damaged after {count} rows ({error.msg})"
+                    raise FormatError(path, expected=_EXPECTED, found=found, advice=_UNPACK) from error
+                text, at = text[at:] + more, 0
+                continue
+            if not isinstance(row, dict):
+                raise FormatError(path, expected=_EXPECTED, found=f"{type(row).__name__} in row {count}")
+            yield row
+            count += 1
 
 
 def _end_of_gap(text: str, at: int) -> int:

@@ -20,10 +20,11 @@ from carlasc.converting import (
     Trajectory,
     VoxelContent,
 )
-from carlasc.core.geometry import Transform, check_rigid
+from carlasc.core.geometry import Transform, check_rigid, inverse_of, multiply
 from carlasc.core.tables import REMAPS, SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
+from carlasc_converters.files import read_bytes
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
     Calibration,
@@ -85,9 +86,9 @@ class KittiRecording(Recording):
         path = next((path for path in self._pose_files() if path.is_file()), None)
         if path is None:
             return None
-        camera_poses = layout.decode_poses(path.read_bytes(), str(path))
+        camera_poses = layout.decode_poses(read_bytes(path), str(path))
         camera_T_lidar = self._calibration(path, force=force)
-        return Trajectory(np.linalg.inv(camera_T_lidar) @ check_rigid(camera_poses, str(path)) @ camera_T_lidar)
+        return Trajectory(multiply(inverse_of(camera_T_lidar), check_rigid(camera_poses, str(path)), camera_T_lidar))
 
     def _pose_files(self) -> tuple[Path, ...]:
         """Return where poses may be: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""
@@ -112,7 +113,7 @@ class KittiRecording(Recording):
     def times(self) -> NDArray[np.float64] | None:
         """Return the lines of times.txt."""
         path = self.folder / "times.txt"
-        return layout.decode_times(path.read_bytes(), str(path)) if path.is_file() else None
+        return layout.decode_times(read_bytes(path), str(path)) if path.is_file() else None
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the frames that have labels or voxels, but no scan."""

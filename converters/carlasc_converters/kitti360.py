@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.geometry import Transform, check_rigid, invert
 from carlasc.errors import FormatError, MissingDataError
+from carlasc_converters.files import read_text
 from carlasc_converters.kitti360_classes import KITTI360, KITTI360_TO_CARLA
 from carlasc_converters.kitti360_labels import MAX_DISTANCE_M, label_points, window_at, windows_of
 from carlasc_converters.kitti_files import (
@@ -213,8 +214,8 @@ def read_trajectory(files: Files, times: NDArray[np.float64], *, force: bool = F
 def _read_poses(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return (K,) frame numbers and (K, 4, 4) poses."""
     try:
-        rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines() if line.strip()]
-    except ValueError as error:  # UnicodeDecodeError is one too
+        rows = [[float(value) for value in line.split()] for line in read_text(path).splitlines() if line.strip()]
+    except ValueError as error:
         raise FormatError(path, expected="13 numbers per line", found=f"something else ({error})") from error
     for number, row in enumerate(rows, 1):
         if len(row) != 13 or row[0] < 0 or not row[0].is_integer():

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.scans import check_finite
 from carlasc.errors import import_extra
 from carlasc_converters.ply import PlyVertices
 
@@ -40,10 +41,15 @@ class Labelled:
     instances: NDArray[np.uint32]
 
     @classmethod
-    def of(cls, rows: NDArray[np.void]) -> Labelled:
-        """Return the points of some vertices of a file."""
+    def of(cls, rows: NDArray[np.void], where: str) -> Labelled:
+        """Return the points of some vertices of a file, which is named in errors.
+
+        Raises:
+            FormatError: a coordinate is not finite.
+        """
         spatial = import_extra("scipy.spatial", "kitti")
         points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        check_finite(points, where)
         # An unbalanced tree is built several times faster, and as fast to search where points lie on surfaces.
         tree = spatial.cKDTree(points, leafsize=32, compact_nodes=False, balanced_tree=False) if len(rows) else None
         labels = np.clip(rows["semantic"], 0, _MAX_CLASS).astype(np.uint16)
@@ -54,7 +60,11 @@ class Labelled:
         """Return the distance and the index of the nearest point to each of (M, 3); infinite if none is near enough."""
         if self.tree is None:
             return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-        distances, indices = self.tree.query(points, distance_upper_bound=MAX_DISTANCE_M)
+        finite = np.asarray(np.isfinite(points).all(axis=1))
+        distances, indices = self.tree.query(
+            np.where(finite[:, None], points, 0.0), distance_upper_bound=MAX_DISTANCE_M
+        )
+        distances[~finite] = np.inf
         return distances, np.where(np.isfinite(distances), indices, 0)
 
 
@@ -103,7 +113,7 @@ def label_points(
 
 @lru_cache(maxsize=1)  # one window per process: frames are read in their order
 def _standing(path: str) -> Labelled:
-    return Labelled.of(PlyVertices.open(path, _COLUMNS).read())
+    return Labelled.of(PlyVertices.open(path, _COLUMNS).read(), path)
 
 
 @lru_cache(maxsize=1)
@@ -117,4 +127,4 @@ def _by_time(path: str) -> tuple[NDArray[np.void], NDArray[np.integer]]:
 def _moving(path: str, frame: int) -> Labelled:
     rows, stamps = _by_time(path)
     first, last = np.searchsorted(stamps, [frame, frame + 1])
-    return Labelled.of(rows[first:last])
+    return Labelled.of(rows[first:last], path)

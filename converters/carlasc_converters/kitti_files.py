@@ -14,6 +14,7 @@ from carlasc.converting import Converter
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
+from carlasc_converters.files import opening, read_text
 
 HEIGHT_M = 1.73  # of the scanner above the ground, on KITTI's car
 _AGAIN = "copy it again"
@@ -41,12 +42,9 @@ def read_lines(path: Path, expected: str, content: str) -> list[str]:
         MissingDataError: the file does not exist.
         FormatError: it is not text.
     """
-    try:
-        return [line.strip() for line in path.read_text().rstrip().splitlines()]
-    except FileNotFoundError:
-        raise MissingDataError(path, expected=expected, found="no such file", advice="copy it") from None
-    except UnicodeDecodeError as error:
-        raise FormatError(path, expected=content, found=f"a file that is not text ({error})") from error
+    if not path.exists():
+        raise MissingDataError(path, expected=expected, found="no such file", advice="copy it")
+    return [line.strip() for line in read_text(path, content).rstrip().splitlines()]
 
 
 def read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
@@ -56,10 +54,8 @@ def read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
         MissingDataError: the file does not exist.
         FormatError: its size is not a whole number of rows.
     """
-    try:
+    with opening(path, "a file", _AGAIN):
         data = np.fromfile(path, np.uint8)
-    except FileNotFoundError:
-        raise MissingDataError(path, expected="a file", found="nothing", advice=_AGAIN) from None
     row = dtype.itemsize * columns
     if len(data) % row:
         raise FormatError(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from carlasc.converting import VoxelContent
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
+from carlasc_converters.files import read_bytes
 
 GRID = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
 MASKS = (".bin", ".invalid", ".occluded")
@@ -43,7 +44,7 @@ def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
         FormatError: the size of a file does not fit the grid.
     """
     files = {
-        f"{frame:06d}{suffix}": path.read_bytes()
+        f"{frame:06d}{suffix}": read_bytes(path)
         for suffix in _SUFFIXES
         if (path := folder / f"{frame:06d}{suffix}").is_file()
     }

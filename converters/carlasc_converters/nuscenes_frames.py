@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,9 @@ from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle
 from carlasc.core.boxes import Boxes
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc.storage.arrays import ArrayFormat
+from carlasc_converters.files import read_bytes
 from carlasc_converters.npz import read_arrays
 from carlasc_converters.nuscenes_classes import NUSCENES
 
@@ -45,7 +46,7 @@ class NuScenesFrame(FrameHandle):
 
     def read(self) -> Sequence[Cloud]:
         """Read points, classes and instances."""
-        data = _read_bytes(self.location)
+        data = _read(self.location)
         if not len(data) or len(data) % (4 * _COLUMNS):
             raise FormatError(
                 self.location,
@@ -58,7 +59,7 @@ class NuScenesFrame(FrameHandle):
         panoptic = None if self.instances is None else _read_panoptic(self.instances)
         labels: NDArray[Any] | None = None
         if self.labels is not None:
-            labels = np.frombuffer(_read_bytes(self.labels), np.uint8)
+            labels = np.frombuffer(_read(self.labels), np.uint8)
             _check_labels(labels, len(points), self.labels)
         if panoptic is not None and self.instances is not None:
             _check_labels(panoptic // _PER_CLASS, len(points), self.instances)
@@ -95,21 +96,13 @@ def number_instances(
     return numbers
 
 
-def _read_bytes(path: str) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except FileNotFoundError:
-        raise MissingDataError(
-            path, expected="a file that the tables list", found="nothing", advice="unpack it again"
-        ) from None
+def _read(path: str) -> bytes:
+    return read_bytes(path, "a file that the tables list", "unpack it again")
 
 
 def _read_panoptic(path: str) -> NDArray[np.uint16]:
     """Return the panoptic labels of a file."""
-    labels = read_arrays(path, ("data",), "unpack it again")[0]
-    if labels.dtype.kind != "u" or labels.ndim != 1:
-        raise FormatError(path, expected="a row of unsigned integers", found=f"{labels.dtype}, shape {labels.shape}")
-    return labels
+    return read_arrays(path, {"data": ArrayFormat(("u1", "<u2", "<u4"), (None,))}, "unpack it again")[0]
 
 
 def _check_labels(labels: NDArray[Any], points: int, path: str) -> None:

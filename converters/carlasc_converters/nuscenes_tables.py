@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
+from carlasc.storage.folders.names import leads_outside
 from carlasc_converters import json_rows
 from carlasc_converters.nuscenes_classes import CLASS_IDS
 from carlasc_converters.rigid import poses_of
@@ -166,16 +167,31 @@ class Tables:
                 )
             row, scene = samples[sample]
             place = self._pose_rows.setdefault(pose, len(self._pose_rows))
+            self._check_inside("sample_data", file)
             files = labels.get(token), instances.get(token)
             scans.setdefault(scene, []).append(LidarScan(file, timestamp, row if key else -1, mount, place, *files))
-        rows = read_rows(self.path("scene"), ("token", "name"))
+        rows = list(read_rows(self.path("scene"), ("token", "name")))
+        for _, name in rows:
+            self._check_inside("scene", name)
         found = [Scene(name, tuple(sorted(scans.get(token, ()), key=attrgetter("timestamp")))) for token, name in rows]
         return sorted(found, key=attrgetter("name"))
 
     def _label_files(self, table: str) -> dict[str, str]:
         """Return the files of a table of labels by token of the scan; none if there is no such table."""
         path = self.path(table)
-        return dict(read_rows(path, ("sample_data_token", "filename"))) if path.is_file() else {}
+        files = dict(read_rows(path, ("sample_data_token", "filename"))) if path.is_file() else {}
+        for file in files.values():
+            self._check_inside(table, file)
+        return files
+
+    def _check_inside(self, table: str, name: str) -> None:
+        if leads_outside(name):
+            raise FormatError(
+                self.path(table),
+                expected="names of files of the data set",
+                found=repr(name),
+                advice="it leads elsewhere",
+            )
 
     @cached_property
     def poses(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -16,7 +16,8 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import opening
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
@@ -58,12 +59,9 @@ class PlyVertices:
             MissingDataError: the file does not exist.
             FormatError: it is no PLY file, its vertices have a list property or lack a required one, or it is shorter than its header says.
         """
-        try:
-            with Path(path).open("rb") as file:
-                kind, elements = _read_header(file, str(path))
-                offset = file.tell()
-        except FileNotFoundError:
-            raise MissingDataError(path, expected="a PLY file", found="nothing") from None
+        with opening(path, "a PLY file"), Path(path).open("rb") as file:
+            kind, elements = _read_header(file, str(path))
+            offset = file.tell()
         before = _before_vertices(elements, str(path))
         dtype = _row_type(elements["vertex"][1], _BYTE_ORDERS[kind], str(path))
         if missing := [name for name in required if name not in (dtype.names or ())]:

@@ -24,6 +24,7 @@ from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, StorageError, import_extra
+from carlasc_converters.files import opening
 
 _CLASSES = (  # name, class of CarlaSC; the data count from 0, here 0 is unlabelled
     ("unlabelled", "Free"), ("building", "Building"), ("car", "Vehicle"), ("natural ground", "Terrain"), ("ground", "Ground"),
@@ -216,11 +217,8 @@ def _parse_columns(text: str) -> dict[str, str]:
 def _find_columns(path: Path, named: Mapping[str, str]) -> dict[str, str]:
     """Return the names of the columns x, y, z and label of a table."""
     parquet = import_extra("pyarrow.parquet", "parquet")
-    arrow = import_extra("pyarrow", "parquet")
-    try:
+    with opening(path, "a Parquet table"):
         existing = parquet.read_schema(path).names
-    except (arrow.ArrowException, OSError) as error:
-        raise FormatError(path, expected="a Parquet table", found=f"something else ({error})") from error
     columns = {}
     for key, synonyms in _SYNONYMS.items():
         found = [name for name in existing if "".join(filter(str.isalpha, name.lower())) in synonyms]
@@ -243,30 +241,28 @@ def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[NDArray[n
         FormatError: the table is damaged, a coordinate is not finite, or a label is not one of the nine.
     """
     parquet = import_extra("pyarrow.parquet", "parquet")
-    arrow = import_extra("pyarrow", "parquet")
     done = 0
-    try:
-        # Without these two options, whole columns of a row group are in memory, and a table may be one row group.
-        with parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as table:
-            for batch in table.iter_batches(_BATCH, columns=list(dict.fromkeys(columns.values()))):
-                points = np.stack([_numbers(path, batch, columns[key]) for key in "xyz"], axis=1)
-                labels = _numbers(path, batch, columns["label"])
-                if (wrong := ~np.isfinite(points).all(axis=1)).any():
-                    row = done + int(np.argmax(wrong))
-                    raise FormatError(path, expected="finite coordinates", found=f"others in row {row}")
-                if (wrong := ~np.isin(labels, np.arange(len(CLASSES.names) - 1))).any():
-                    value, count = labels[np.argmax(wrong)], int(wrong.sum())
-                    raise FormatError(
-                        path,
-                        expected=f"labels 0 to {len(CLASSES.names) - 2} in the column {columns['label']}",
-                        found=f"{value:g} in row {done + int(np.argmax(wrong))}, and {count - 1} more such rows near it",
-                        advice="another column may hold the labels: name it with the option `columns`",
-                    )
-                yield points, labels.astype(np.uint8) + np.uint8(1)
-                done += len(labels)
-    except (arrow.ArrowException, OSError) as error:
-        found = f"a damaged one ({error})"
-        raise FormatError(path, expected="a Parquet table", found=found, advice="copy it again") from error
+    # Without these two options, whole columns of a row group are in memory, and a table may be one row group.
+    with (
+        opening(path, "a Parquet table", "copy it again"),
+        parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as table,
+    ):
+        for batch in table.iter_batches(_BATCH, columns=list(dict.fromkeys(columns.values()))):
+            points = np.stack([_numbers(path, batch, columns[key]) for key in "xyz"], axis=1)
+            labels = _numbers(path, batch, columns["label"])
+            if (wrong := ~np.isfinite(points).all(axis=1)).any():
+                row = done + int(np.argmax(wrong))
+                raise FormatError(path, expected="finite coordinates", found=f"others in row {row}")
+            if (wrong := ~np.isin(labels, np.arange(len(CLASSES.names) - 1))).any():
+                value, count = labels[np.argmax(wrong)], int(wrong.sum())
+                raise FormatError(
+                    path,
+                    expected=f"labels 0 to {len(CLASSES.names) - 2} in the column {columns['label']}",
+                    found=f"{value:g} in row {done + int(np.argmax(wrong))}, and {count - 1} more such rows near it",
+                    advice="another column may hold the labels: name it with the option `columns`",
+                )
+            yield points, labels.astype(np.uint8) + np.uint8(1)
+            done += len(labels)
 
 
 def _numbers(path: Path, batch: Any, name: str) -> NDArray[np.float64]:

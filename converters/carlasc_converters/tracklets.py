@@ -10,6 +10,7 @@ import numpy as np
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import FormatError
+from carlasc_converters.files import read_bytes
 from carlasc_converters.kitti_boxes import BoxRows, class_of
 
 MAX_BYTES = 256 << 20  # the files of KITTI have at most some ten megabytes
@@ -49,7 +50,7 @@ def _items(path: Path) -> list[ElementTree.Element]:
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise FormatError(path, expected=f"at most {MAX_BYTES} bytes", found=str(size))
-    data = path.read_bytes()
+    data = read_bytes(path)
     if (
         b"<!ENTITY" in data or b"\0" in data
     ):  # entities can make a small file very large; other encodings would hide them

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import reprlib
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from carlasc.errors import ArgumentError, FormatError, import_extra
+from carlasc.errors import ArgumentError, FormatError, import_extra, reading
 
 NETWORKS = (
     "motionsc",
@@ -109,7 +110,7 @@ class Config:
             if kind is float and isinstance(value, int) and not isinstance(value, bool):
                 object.__setattr__(self, name, float(value))
             elif not _fits(value, kind):
-                raise ArgumentError(name, expected=_describe(kind), found=repr(value))
+                raise ArgumentError(name, expected=_describe(kind), found=reprlib.repr(value))
         for name in ("history", "epochs", "batch_size", "decay_every"):
             if getattr(self, name) < 1:
                 raise ArgumentError(name, expected="1 or more", found=str(getattr(self, name)))
@@ -136,10 +137,8 @@ class Config:
             ArgumentError: an override is not "key=value", a key does not exist, or a value is wrong.
         """
         yaml = import_extra("yaml", "torch")
-        try:
-            values = yaml.safe_load(path.read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise FormatError(path, expected="a YAML file of settings", found=f"something else ({error})") from error
+        with reading(path, "a YAML file of settings"):
+            values = yaml.safe_load(path.read_text("utf-8"))
         if not isinstance(values, Mapping):
             raise FormatError(path, expected="settings as `key: value` lines", found=f"{type(values).__name__}")
         settings: dict[str, Any] = dict(values)
@@ -150,10 +149,16 @@ class Config:
             settings[key] = yaml.safe_load(value)
         names = [field.name for field in dataclasses.fields(cls)]
         if unknown := set(settings) - set(names):
-            raise ArgumentError(path, expected=f"some of {', '.join(names)}", found=", ".join(sorted(unknown)))
+            raise ArgumentError(
+                path, expected=f"some of {', '.join(names)}", found=", ".join(sorted(map(str, unknown)))
+            )
         if "network" not in settings:
             raise FormatError(path, expected="the key network", found="none")
-        return cls(**settings)
+        with reading(path, "settings"):
+            try:
+                return cls(**settings)
+            except ArgumentError as error:
+                raise error.within(path) from error
 
     def write(self, path: Path) -> None:
         """Write all settings as YAML."""

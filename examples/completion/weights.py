@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 
 StateDict = dict[str, Tensor]
 
@@ -42,14 +41,13 @@ def read_weights(path: Path) -> StateDict:
         raise MissingDataError(path, expected="weights", found="nothing")
     if path.suffix == ".safetensors":
         safetensors = import_extra("safetensors.torch", "torch")
-        try:
-            return safetensors.load_file(path, device="cpu")
-        except Exception as error:
-            raise FormatError(path, expected="safetensors", found=f"something else ({error})") from error
-    state = read_checkpoint(path)
-    if "network" in state and "epoch" in state:  # a checkpoint of ours
+        with reading(path, "safetensors"):
+            state = safetensors.load_file(path, device="cpu")
+    else:
+        state = read_checkpoint(path)
+    if isinstance(state.get("network"), dict) and "epoch" in state:  # a checkpoint of ours
         state = state["network"]
-    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+    if not state or not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()):
         raise FormatError(path, expected="a state dict (names to tensors)", found=_describe(state))
     return state
 
@@ -60,13 +58,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         FormatError: the file holds something else.
     """
-    try:
+    with reading(path, "a state dict without code, which would not be run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FormatError(
-            path, expected="a state dict", found=f"something else, which was not run ({reason})"
-        ) from error
     if not isinstance(state, Mapping):
         raise FormatError(path, expected="a state dict (names to tensors)", found=f"{type(state).__name__}")
     return dict(state)
@@ -145,7 +138,11 @@ def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None
         "js3cnet_kitti": "complet_head.Decoder.pre_conv2.0.bias",
         "baseline": "classes.bias",
     }
-    return name, len(state[last.get(_VARIANTS.get(name, name), "seg_head_1_1.conv_classes.bias")])
+    layer = last.get(_VARIANTS.get(name, name), "seg_head_1_1.conv_classes.bias")
+    if layer not in state or not state[layer].ndim:
+        found = _shape(state[layer]) if layer in state else "none"
+        raise FormatError(where, expected=f"the layer {layer}, a number for each class", found=found)
+    return name, len(state[layer])
 
 
 def _advice(layer: str) -> str:
@@ -159,8 +156,8 @@ def _advice(layer: str) -> str:
 
 
 def _describe(state: Mapping[str, Any]) -> str:
-    other = next((name for name, value in state.items() if not isinstance(value, Tensor)), None)
-    return "an empty one" if other is None else f"{type(state[other]).__name__} under {other!r}"
+    other = [name for name, value in state.items() if not (isinstance(name, str) and isinstance(value, Tensor))]
+    return f"{type(state[other[0]]).__name__} under {other[0]!r}" if other else "an empty one"
 
 
 def _shape(value: Tensor) -> str:

@@ -103,3 +103,11 @@ def test_numbers_are_aligned_at_the_right_and_markup_is_text():
 def test_a_table_without_rows_has_its_header():
     text = printed(60, ["Name", *map(str, range(12))], [], turn=True)
     assert "Name" in text and cells(text) == []
+
+
+def test_names_from_data_do_not_steer_the_terminal():
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_table(console, ["\x1b[2JName", "B"], [["a\x1b]0;x\x07", "[/bold]"]], title="\u202eT")
+    text = console.export_text()
+    assert all(part in text for part in ("\\x1b[2JName", "a\\x1b]0;x\\x07", "[/bold]", "\\u202eT"))
+    assert not {"\x1b", "\x07", "\u202e"} & set(text)

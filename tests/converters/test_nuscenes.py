@@ -327,7 +327,7 @@ def test_a_table_that_is_missing_or_cut_short_or_lacks_a_key_is_named(tables, ta
     ):
         read()
     path.unlink()
-    found = "none" if table == "scene" else "no such file"
+    found = "none" if table == "scene" else "nothing"
     with pytest.raises(MissingDataError, match=rf"{'scene' if table == 'scene' else table}.json.*found {found}"):
         read()
 
@@ -444,18 +444,18 @@ def test_files_that_do_not_fit_are_named(tables):
     with pytest.raises(FormatError, match=r"panoptic.npz: expected a label for each of \d+ points, found 5"):
         frame.read()
     np.savez(panoptic, other=np.zeros(5, np.uint16))
-    with pytest.raises(FormatError, match=r"panoptic.npz: expected an .npz file with data, found other"):
+    with pytest.raises(FormatError, match=r"panoptic.npz: expected an array data, found other"):
         frame.read()
     np.savez(panoptic, data=np.array([{"a": 1}], object))
-    with pytest.raises(FormatError, match=r"panoptic.npz: expected an .npz file with data.*allow_pickle=False"):
+    with pytest.raises(
+        FormatError, match=r"panoptic.npz: data: expected uint8 or uint16 or uint32 values, found object"
+    ):
         frame.read()
     panoptic.write_bytes(b"PK\x03\x04")
     with pytest.raises(FormatError, match=r"panoptic.npz: expected an .npz file"):
         frame.read()
     panoptic.unlink()
-    with pytest.raises(
-        MissingDataError, match=r"panoptic.npz: expected an .npz file with data, found nothing: unpack it again"
-    ):
+    with pytest.raises(MissingDataError, match=r"panoptic.npz: expected a file, found nothing: unpack it again"):
         frame.read()
     points.unlink()
     with pytest.raises(MissingDataError, match=r"pcd.bin: expected a file that the tables list, found nothing"):
@@ -496,7 +496,7 @@ def test_text_that_is_no_table_is_named(tmp_path, text, message):
 def test_text_of_another_encoding_is_named(tmp_path):
     path = tmp_path / "table.json"
     path.write_bytes(b'[{"token": "\xff"}]')
-    with pytest.raises(FormatError, match=r"table.json: expected text in UTF-8"):
+    with pytest.raises(FormatError, match=r"table.json: expected a JSON list of objects, found something else .*utf-8"):
         list(read_rows(path, ("token",)))
 
 

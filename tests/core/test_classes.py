@@ -123,7 +123,10 @@ def test_a_table_must_colour_what_it_names():
         ({"ground": frozenset({1})}, "expected ids of the table in ground, found 1"),
         ({"moving": frozenset({2})}, "expected ids of the table in moving, found 2"),
         ({"geometry_only": 1}, "expected an id of the table in geometry_only, found 1"),
-        ({"names": {3: "a"}, "colors": {3: (0, 0, 0)}, "num_channels": 3}, "expected num_channels above 3, found 3"),
+        (
+            {"names": {3: "a"}, "colors": {3: (0, 0, 0)}, "num_channels": 3},
+            "expected num_channels above 3, up to 65536, found 3",
+        ),
     ],
 )
 def test_a_table_that_contradicts_itself_is_refused(values, message):

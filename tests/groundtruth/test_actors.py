@@ -78,14 +78,14 @@ class TestKept:
     @pytest.mark.parametrize("size", [0, 1, 100, -200, -1])
     def test_a_damaged_file_is_one_error_that_names_it(self, size):
         data = ACTORS.to_bytes("key")[:size]
-        with pytest.raises(FormatError, match="^tracks.npz: expected tracks written by regrid, found .*: remove it$"):
+        with pytest.raises(FormatError, match="^tracks.npz: .*expected "):
             Actors.from_bytes(data, "tracks.npz")
 
     @pytest.mark.parametrize("position", [60, 300, 1000])
     def test_a_file_with_a_damaged_part_is_refused(self, position):
         data = bytearray(ACTORS.to_bytes("key"))
         data[position : position + 20] = bytes(20)
-        with pytest.raises(FormatError, match="expected tracks written by regrid"):
+        with pytest.raises(FormatError, match="^tracks.npz: .*expected "):
             Actors.from_bytes(bytes(data), "tracks.npz")
 
     def test_a_worker_gets_what_concerns_its_window(self):

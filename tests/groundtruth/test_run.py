@@ -81,7 +81,7 @@ def test_what_is_written_is_read_back_by_a_source(tmp_path):
     assert sequence.read("bev", 1).tobytes() == b"picture 101"
     assert sequence.times.tolist() == [0.0, 0.1, 0.2]
     expected = np.linalg.inv(capture.read_pose(0, 100)) @ capture.read_pose(0, 101)
-    assert np.array_equal(sequence.read_pose(1), expected)
+    assert np.allclose(sequence.read_pose(1), expected, rtol=0, atol=1e-12)
     assert sequence.grid("evaluation_32x32x4", 2).known.any()
 
 

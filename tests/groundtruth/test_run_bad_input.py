@@ -11,7 +11,7 @@ from helpers.captures import read_tree, write_capture
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.groundtruth import FromCapture, regrid
+from carlasc.groundtruth import FromCapture, Voting, regrid
 from carlasc.storage import FolderSource
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
@@ -89,14 +89,15 @@ def test_no_capture_and_no_sensor_are_said(tmp_path):
     assert read_tree(tmp_path, leave_out="nothing") == {}
 
 
-def test_a_file_cut_short_in_the_output_fails_its_frame_alone(tmp_path):
+def test_files_cut_short_in_the_output_are_made_again(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, SMALL, workers=1)
-    (tmp_path / f"cartesian/{GRID}/000001.bin").unlink()
-    _cut_short(tmp_path / "cartesian/velodyne/000001.bin")
-    (failure,) = regrid(tmp_path, SMALL, workers=1).failures
-    assert failure.frame == 101
-    assert "velodyne/000001.bin: expected a multiple of 16 bytes" in failure.message
+    regrid(tmp_path, SMALL, workers=1, voting=Voting(keep=True))
+    whole = read_tree(tmp_path, leave_out="nothing")
+    for file in ("velodyne/000001.bin", f"{GRID}/000000.bin", f"{GRID}/000001.votes.npz", f"{GRID}/000002.label"):
+        _cut_short(tmp_path / "cartesian" / file)
+    result = regrid(tmp_path, SMALL, workers=1, voting=Voting(keep=True))
+    assert (result.made, result.failures) == (3, ())
+    assert read_tree(tmp_path, leave_out="nothing") == whole
 
 
 @pytest.mark.parametrize("workers", [1, 2])

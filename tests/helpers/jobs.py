@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from carlasc.running.processes import run_all
 from carlasc.storage.files import write_atomic
 
 
@@ -47,11 +48,15 @@ def write_for_a_minute(path: Path) -> None:
     """Write a file that takes long; a mark beside it says that it has begun."""
 
     def write_slowly(file: object) -> None:
-        path.with_suffix(".begun").touch()
+        write_atomic(path.with_suffix(".begun"), str(os.getpid()).encode())
         time.sleep(60)
 
     if path.suffix:
         write_atomic(path, write_slowly)
+
+
+def write_in_two_workers(paths: list[Path]) -> None:
+    list(run_all(write_for_a_minute, paths, workers=2))
 
 
 def kill_itself_at_three(number: int) -> int:

@@ -62,8 +62,8 @@ def test_damaged_files_of_occ3d_are_named(tmp_path):
     (bad / "aa" / "labels.npz").write_bytes(b"no archive")
     np.savez(bad / "bb" / "labels.npz", semantics=np.zeros((2, 2, 2), np.uint8))
     messages = dict(evaluate(tmp_path / "pred", tmp_path / "gts", convention="occ3d-lidar").failures)
-    assert "cannot be read" in messages["scene-0001:aa"]
-    assert "expected an array semantics of shape (200, 200, 16), found semantics (2, 2, 2)" in messages["scene-0001:bb"]
+    assert "labels.npz: expected an .npz file, found something else" in messages["scene-0001:aa"]
+    assert "semantics: expected an array of 200 x 200 x 16 values, found 2 x 2 x 2" in messages["scene-0001:bb"]
 
 
 def test_a_pickle_in_an_npz_is_never_loaded(tmp_path):
@@ -73,7 +73,7 @@ def test_a_pickle_in_an_npz_is_never_loaded(tmp_path):
     hostile[0] = {"any": "object"}
     np.savez(tmp_path / "pred" / "scene-0001" / "aa" / "labels.npz", semantics=hostile)
     failures = dict(evaluate(tmp_path / "pred", tmp_path / "gts", convention="occ3d-lidar").failures)
-    assert "cannot be read" in failures["scene-0001:aa"]
+    assert "semantics: expected numeric values, found object" in failures["scene-0001:aa"]
 
 
 def write_openoccupancy(root, rows):

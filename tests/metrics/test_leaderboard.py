@@ -69,7 +69,7 @@ def test_files_that_hold_no_result_are_named(files, tmp_path):
     with pytest.raises(FormatError, match="JSON without convention, frames, class_iou"):
         scores([bad])
     bad.write_text(json.dumps(result("x", miou="much")))
-    with pytest.raises(FormatError, match="numbers or null"):
+    with pytest.raises(FormatError, match="a fraction from 0 to 1, or null, for miou"):
         scores([bad])
     with pytest.raises(MissingDataError, match="nothing"):
         scores([tmp_path / "absent.json"])

@@ -4,6 +4,7 @@ import sys
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,30 @@ def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file
         raise KeyboardInterrupt
     assert time.monotonic() - started < 30
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.begun", "b.begun"]
+
+
+def test_workers_end_when_the_main_process_is_killed_and_leave_no_half_file(tmp_path: Path):
+    slow = [tmp_path / "a.bin", tmp_path / "b.bin"]
+    main = get_context("spawn").Process(target=jobs.write_in_two_workers, args=(slow,))
+    main.start()
+    while not all(path.with_suffix(".begun").exists() for path in slow):
+        time.sleep(0.01)
+    workers = [int(path.read_text()) for path in sorted(tmp_path.glob("*.begun"))]
+    main.kill()
+    end = time.monotonic() + 20
+    while any(map(is_alive, workers)) and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not any(map(is_alive, workers))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.begun", "b.begun"]
+
+
+def is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{process}/stat")  # an ended process whose parent was killed may wait to be forgotten
+    return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_a_number_of_workers_below_one_makes_no_sense():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import carlasc
 from carlasc.errors import FormatError
 from carlasc.storage import Sequence
 from carlasc.storage.opening import open_sink
+from carlasc.storage.packed.output import TABLES_MARK
 from carlasc.storage.packed.protocol import Options
 from carlasc.storage.packed.tables.writing import ParquetSink
 from carlasc.testing.data import SCANS, WHOLE
@@ -101,6 +104,19 @@ def test_what_an_interrupted_run_left_of_a_sequence_of_tables_is_removed(tmp_pat
     assert any("instances" in name for name in files_of(tmp_path))
     write(tmp_path / "x.parquet", [labels], None, "labels")
     assert not any("instances" in name for name in files_of(tmp_path))
+
+
+def test_what_a_run_left_that_was_killed_while_it_finished_a_store_of_tables_is_removed(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    code = (
+        "import os, sys; from carlasc.storage import files; from pathlib import Path\n"
+        "files.write_atomic(Path(sys.argv[1]), lambda file: os.kill(os.getpid(), 9))"
+    )
+    ParquetSink(tmp_path / "x.parquet")
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.parquet.part" / TABLES_MARK)], check=False)
+    assert len(list((tmp_path / "x.parquet.part").glob(".*.part"))) == 1
+    write(tmp_path / "x.parquet", [np.arange(3, dtype=np.uint32)], None, "labels")
+    assert not list(tmp_path.rglob(".*.part"))
 
 
 @pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])

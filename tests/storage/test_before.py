@@ -10,6 +10,8 @@ import pytest
 import carlasc
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI
 from carlasc.storage import layout
+from carlasc.storage.packing import pack
+from carlasc.storage.unpacking import unpack
 from carlasc.testing.data import published_bytes
 
 ENDINGS = ("zarr", "h5", "parquet")
@@ -117,3 +119,39 @@ def test_a_zarr_store_of_version_1_is_read(tmp_path):
         assert shards[0] == f"{path}/scans/points/xyz/c/0/0" and (tmp_path / "store.zarr" / shards[0]).is_file()
     assert read == 56
     assert source.sequences()[KITTI.replace("KITTI_08", "Town07_Heavy")].read("points", 5)[:, 3].any()
+
+
+def files_of_layout(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file that the layout knows, by its path."""
+    return {
+        f"{path}/{name}": (folder / path / name).read_bytes()
+        for path, sequence in carlasc.open(folder).sequences().items()
+        for name in [
+            *sequence.documents(),
+            *(layout.field_named(field).file(frame) for field in sequence.fields() for frame in sequence.frames(field)),
+        ]
+    }
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("name", ["published", *(f"packed.{ending}" for ending in ENDINGS)])
+def test_what_an_old_version_wrote_is_packed_and_unpacked_without_a_change(before, tmp_path, name, ending):
+    for kind in {ending, name.rpartition(".")[2]} & set(ENDINGS):
+        pytest.importorskip({"zarr": "numcodecs", "h5": "h5py", "parquet": "pyarrow"}[kind])
+    pack(before / name, tmp_path / f"new.{ending}", workers=1)
+    unpack(tmp_path / f"new.{ending}", tmp_path / "files", workers=1)
+    found, wanted = files_of_layout(tmp_path / "files"), files_of_layout(before / "published")
+    votes = {file for file in wanted if file.endswith(".votes.npz")}  # deflated, by whichever version of zlib
+    assert found.keys() == wanted.keys() and len(wanted) > 50
+    assert {file for file in wanted if found[file] != wanted[file]} <= votes
+
+
+@pytest.mark.needs("numcodecs")
+def test_a_zarr_store_of_version_1_is_unpacked_and_packed_without_a_change(tmp_path):
+    with tarfile.open(Path(__file__).parents[1] / "data/before/zarr-1.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    pack(tmp_path / "store.zarr", tmp_path / "new.zarr", workers=1)
+    wanted = files_of_layout(tmp_path / "published")
+    for store in ("store.zarr", "new.zarr"):
+        unpack(tmp_path / store, tmp_path / f"{store}.files", workers=1)
+        assert files_of_layout(tmp_path / f"{store}.files") == wanted

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
+from helpers.tables import seal_tables
 
 import carlasc
 from carlasc.errors import FormatError
 from carlasc.storage import FolderSource, Sequence, Source, pack, unpack
 from carlasc.storage.opening import open_sink
+from carlasc.storage.packed.arrays.chunks import Encoding
 from carlasc.storage.packed.protocol import Options
 from carlasc.testing.data import SCANS, WHOLE
 
@@ -184,8 +188,8 @@ def make_larger(root: dict[str, Any]) -> None:
         (change_type, "expected the sequence that the store lists"),
         (remove_split, "expected the attribute split, found none: the store is damaged"),
         (change_kind, "expected a field of kind points, found 'values'"),
-        (make_big_endian, r"expected the codecs and chunks that carlasc writes, found others \(codecs"),
-        (change_codec, r"found others \(codecs bytes, gzip, crc32c\)"),
+        (make_big_endian, r"expected the codecs and chunks that carlasc writes, found something else \(codecs"),
+        (change_codec, r"found something else \(codecs bytes, gzip, crc32c\)"),
         (remove_array, "expected an array, found none"),
         (remove_field, "expected the field that the sequence lists, found none"),
     ],
@@ -313,5 +317,89 @@ def test_a_table_whose_footer_counts_other_rows_is_one_clear_error(data: Path, t
         for group in groups:
             writer.write_table(group)
         writer.add_key_value_metadata({"carlasc": json.dumps(about)})
+    seal_tables(path.parent)
     with pytest.raises(FormatError, match="frame 2.*expected 776 rows, found"):
         carlasc.open(tmp_path / "x.parquet").sequences()[WHOLE].read("labels", 2)
+
+
+def blosc_header(**changes: int) -> bytes:
+    """Return a chunk of 100 zeros with other numbers in its header."""
+    blosc = pytest.importorskip("numcodecs.blosc")
+    data = bytes(blosc.compress(np.zeros(100, "u1"), b"zstd", 5, 0))
+    names = ("version", "codec", "flags", "type", "decoded", "block", "encoded")
+    values = dict(zip(names, struct.unpack_from("<4B3I", data), strict=True)) | changes
+    return struct.pack("<4B3I", *values.values()) + data[16:]
+
+
+def refuse_chunk(data: bytes) -> None:
+    out = np.full(100, 7, np.uint8)
+    with pytest.raises(FormatError, match="its bytes: cannot be decoded"):
+        Encoding().decode(data, out, "zarr")
+    assert (out == 7).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("decoded", 99), ("decoded", 101), ("encoded", 2**32 - 1), ("block", 0), ("block", 2**31)],
+)
+def test_what_the_header_of_a_chunk_says_is_not_believed(name: str, value: int) -> None:
+    refuse_chunk(blosc_header(**{name: value}))  # of 99 bytes, Blosc would leave the last one as it is
+
+
+def test_a_chunk_that_is_cut_short_is_refused() -> None:
+    whole = blosc_header()
+    for size in (0, 15, len(whole) - 1):
+        refuse_chunk(whole[:size])
+    out = np.full(100, 7, np.uint8)
+    Encoding().decode(whole, out, "zarr")
+    assert not out.any()
+
+
+def test_fewer_numbers_than_a_chunk_has_are_not_taken_for_all() -> None:
+    pytest.importorskip("pcodec")
+    encoding = Encoding("pcodec", 8)
+    data = encoding.encode(np.arange(50, dtype="<i4"), "zarr")
+    for count in (49, 51):
+        with pytest.raises(FormatError, match=r"its bytes: cannot be decoded: \d+ elements instead of"):
+            encoding.decode(data, np.empty(count, "<i4"), "zarr")
+
+
+def test_an_hdf5_store_shows_no_other_file(hdf5_store: Path, tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["secret"] = np.frombuffer(b"secret", "u1")
+    (tmp_path / "secret.bin").write_bytes(b"secret")
+    name = "Town01_Light/cartesian/documents/poses.txt"
+    plan = h5py.VirtualLayout((6,), "u1")
+    plan[:] = h5py.VirtualSource(tmp_path / "other.h5", "secret", (6,))
+    makers: dict[str, Callable[[Any], object]] = {
+        "a link to another file": lambda file: file.__setitem__(
+            name, h5py.ExternalLink(tmp_path / "other.h5", "secret")
+        ),
+        "those of other files": lambda file: file.create_virtual_dataset(name, plan),
+        "found those of other": lambda file: file.create_dataset(
+            name, (6,), "u1", external=[(str(tmp_path / "secret.bin"), 0, 6)]
+        ),
+        "a symbolic link": lambda file: file.__setitem__(name, h5py.SoftLink("/elsewhere")),
+    }
+    for message, make in makers.items():
+        with h5py.File(hdf5_store, "r+") as file:
+            del file[name]
+            make(file)
+        with pytest.raises(FormatError, match=message):
+            carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read_document("poses.txt")
+
+
+def test_a_chunk_of_an_hdf5_store_that_unpacks_to_more_than_its_array_is_refused(hdf5_store: Path) -> None:
+    import h5py
+
+    name = f"{LABELS.rpartition('/')[0]}/frames"
+    with h5py.File(hdf5_store, "r+") as file:
+        attributes = dict(file[name].attrs)
+        del file[name]
+        frames = file.create_dataset(name, (4,), "<i8", chunks=(4,), compression="gzip")
+        frames.attrs.update(attributes)
+        frames.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 24), 1))
+    with pytest.raises(FormatError, match=f"{name}: expected 32 bytes, found others: carlasc did not write this"):
+        carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].frames("labels")

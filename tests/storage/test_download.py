@@ -16,6 +16,7 @@ from helpers.http_server import Site, serve
 
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
 from carlasc.storage.downloads import TransferSettings, archives, download, extraction
+from carlasc.storage.downloads.transfer import find_file, transfer
 
 VAL = "/val_cartesian.zip"
 QUICK = TransferSettings(connections=3, block_bytes=20_000, wait_s=0.001)
@@ -164,6 +165,28 @@ def test_a_stream_without_a_length_that_breaks_is_found_by_looking_into_the_zip(
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
+def test_a_stream_of_more_bytes_than_the_published_zip_can_have_is_ended(site: Site, tmp_path: Path) -> None:
+    site.ranges = site.lengths = False
+    file = find_file(f"{site.url}{VAL}", QUICK)
+    assert file.size is None
+    with pytest.raises(FormatError, match="val_cartesian.zip: expected at most 1000 bytes, found more"):
+        transfer(file, tmp_path / "x.zip", QUICK, lambda count: None, 1000)
+    assert "x.zip" not in names(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["file:///etc/passwd", "ftp://127.0.0.1/x", "data:,PK", "http://", VAL])
+def test_a_redirection_that_leads_to_no_web_server_or_nowhere_is_refused_at_once(
+    site: Site, tmp_path: Path, place: str
+) -> None:
+    site.redirect[VAL] = place
+    settings = TransferSettings(wait_s=100.0)  # the error would wait, if it were sent again
+    with pytest.raises(
+        CarlascError, match="val_cartesian.zip: expected a file, found a redirection that leads nowhere"
+    ):
+        get(site, tmp_path, settings=settings)
+    assert names(tmp_path) == []
+
+
 def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path: Path) -> None:
     site.shift_range = 16
     with pytest.raises(CarlascError, match="expected bytes"):
@@ -288,7 +311,7 @@ def test_a_damaged_member_is_named_and_not_left_half_written(tmp_path: Path) -> 
     path.write_bytes(content)
     with pytest.raises(FormatError, match="damaged.*'b'"):
         extraction.extract_zip(path, tmp_path / "out", lambda _: None)
-    assert names(tmp_path / "out") == ["a"]
+    assert names(tmp_path / "out") == []
 
 
 def test_extracting_continues_after_an_interruption_and_refuses_other_files(tmp_path: Path) -> None:

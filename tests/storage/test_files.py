@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from carlasc.errors import CarlascError, FormatError
-from carlasc.storage.files import parse_json, remove_stale, write_atomic, write_json
+from carlasc.storage.files import parse_json, remove_stale, write_atomic, write_json, write_output
 
 
 def test_a_file_is_written_with_its_folders_and_nothing_beside_it(tmp_path):
@@ -90,3 +90,14 @@ def test_what_other_machines_left_is_removed_when_it_is_a_day_old(tmp_path):
     os.utime(old, (0, 0))
     remove_stale(tmp_path)
     assert list(tmp_path.iterdir()) == [new]
+
+
+def test_a_single_file_is_written_where_a_killed_run_left_a_part_of_it_and_other_files_stay(tmp_path):
+    begun = "import os; from carlasc.storage.files import write_atomic; from pathlib import Path;"
+    for name in ("film [1].mp4", "film 1.mp4"):
+        path = tmp_path / name
+        code = f"{begun} write_atomic(Path({str(path)!r}), lambda file: os.kill(os.getpid(), 9))"
+        subprocess.run([sys.executable, "-c", code], check=False)
+    assert len(os.listdir(tmp_path)) == 2
+    write_output(tmp_path / "film [1].mp4", b"whole")
+    assert sorted(name.partition(".mp4")[0] for name in os.listdir(tmp_path)) == [".film 1", "film [1]"]

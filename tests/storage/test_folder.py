@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -173,3 +174,16 @@ def test_unfinished_files_of_a_killed_run_are_removed_inside_the_sequence_only(t
     with pytest.raises(FormatError, match="leads elsewhere"):
         FolderSink(root).sequence("../elsewhere")
     assert list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_pipe_and_a_device_are_no_scans(tmp_path):
+    folder = tmp_path / "Train" / "Town01_Light" / "cartesian" / "velodyne"
+    folder.mkdir(parents=True)
+    os.mkfifo(folder / "000000.bin")  # opening it would wait for a writer
+    (folder / "000001.bin").symlink_to("/dev/zero")
+    (sequence,) = FolderSource(tmp_path).sequences().values()
+    for frame in (0, 1):
+        with pytest.raises(
+            FormatError, match=rf"00000{frame}\.bin: expected a file, found a folder, a pipe or a device"
+        ):
+            sequence.read("points", frame)

@@ -338,8 +338,8 @@ def test_the_last_field_of_a_frame_is_written_after_its_others(endpoint: str) ->
     put: list[list[str]] = []
 
     class Recorder(RemoteTarget):
-        def put_many(self, files: Any) -> None:
-            put.append(sorted(files))
+        def put_many(self, *groups: Any) -> None:
+            put.extend(map(sorted, groups))
 
         def below(self, folder: str) -> RemoteTarget:
             return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import multiprocessing
 import os
@@ -144,16 +145,15 @@ def test_a_process_that_is_killed_anywhere_is_continued(
     out, last = tmp_path / "x.zarr", int(np.random.default_rng(seed).integers(1, 60))
     child = os.fork()
     if child == 0:  # dies at some write, before or after its file has got its name
-        puts = 0
+        puts = itertools.count(1)  # files are written in several threads
         put = LocalTarget.put
 
         def put_and_die(self: LocalTarget, path: str, data: Any, *, create: bool = False) -> bool:
-            nonlocal puts
-            puts += 1
-            if puts == last and seed % 2:
+            number = next(puts)
+            if number == last and seed % 2:
                 os.kill(os.getpid(), signal.SIGKILL)
             done = put(self, path, data, create=create)
-            if puts == last:
+            if number == last:
                 os.kill(os.getpid(), signal.SIGKILL)
             return done
 
@@ -392,7 +392,19 @@ def test_a_store_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
     assert len(list((tmp_path / "x.zarr" / PATH / "scans/labels/values/c").iterdir())) > 20
 
 
-@pytest.mark.parametrize("broken", [b"", b"[]", b'{"frames": [1]}', b'{"frames": {"x": {"xyz": 1}}}'])
+def test_an_empty_table_that_a_power_failure_left_is_made_again(tmp_path: Path, reference: dict[str, bytes]) -> None:
+    writer = start(tmp_path / "x.zarr")
+    for block in range(3):
+        write_block((writer, block))
+    (tmp_path / "x.zarr" / PATH / "scans/points/blocks/000000.json").write_bytes(b"")
+    again = start(tmp_path / "x.zarr")
+    assert not again.has("points", 0)
+    write_block((again, 0))
+    finish(LocalTarget(tmp_path / "x.zarr"))
+    assert files_of(tmp_path / "x.zarr") == reference
+
+
+@pytest.mark.parametrize("broken", [b"[]", b'{"frames": [1]}', b'{"frames": {"x": {"xyz": 1}}}'])
 def test_a_damaged_table_of_a_block_is_one_clear_error(tmp_path: Path, broken: bytes) -> None:
     writer = start(tmp_path / "x.zarr")
     write_block((writer, 0))

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.sequences import FRAMES
+from helpers.tables import seal_tables
 
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
@@ -89,7 +90,7 @@ def test_a_corrupted_page_names_field_and_frame(store: Path) -> None:
 def test_a_truncated_table_is_one_clear_error(store: Path) -> None:
     file = store / WHOLE / "points.parquet"
     file.write_bytes(file.read_bytes()[:-9])
-    with pytest.raises(FormatError, match=r"points\.parquet: cannot be read as Parquet"):
+    with pytest.raises(FormatError, match=r"points\.parquet: expected a Parquet file"):
         carlasc.open(store).sequences()[WHOLE].read("points", 5)
 
 
@@ -169,5 +170,8 @@ def test_a_table_of_another_size_than_the_grid_is_one_clear_error(store: Path) -
     data = [row["data"].replace(b"[4.0, 6.0, 2.0]", b"[4.0, 6.0, 3.0]") for row in rows.to_pylist()]
     changed = rows.set_column(1, "data", [data])
     parquet.write_table(changed.cast(rows.schema), file)
+    with pytest.raises(FormatError, match="documents.parquet: the checksum of the footer does not match"):
+        carlasc.open(store).sequences()[WHOLE].read("evaluation/labels", 5)
+    seal_tables(store / WHOLE)
     with pytest.raises(FormatError, match="frame 5: expected 72 voxels, found 48"):
         carlasc.open(store).sequences()[WHOLE].read("evaluation/labels", 5)

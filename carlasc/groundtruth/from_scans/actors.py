@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import io
 import json
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError
+from carlasc.errors import reading
 from carlasc.motion import Extent, Track
+from carlasc.storage.arrays import ArrayFormat, open_npz
+from carlasc.storage.files import parse_json
 
-# What numpy and zipfile raise for files that are cut short, damaged or of another kind.
-_DAMAGED = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error)
 FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
-_NAMES = ("members", "frames", "poses", "velocities", "bounds", "table", "moving", "moving_frames")
+_FORMATS = {
+    "members": ArrayFormat(("<i4",), (None,)),
+    "frames": ArrayFormat(("<i8",), (None, 3)),
+    "poses": ArrayFormat(("<f8",), (None, 4, 4)),
+    "velocities": ArrayFormat(("<f8",), (None, 3)),
+    "bounds": ArrayFormat(("<f8",), (None, 18)),
+    "table": ArrayFormat(("<i8",), (None, 7)),
+    "moving": ArrayFormat(("<i4",), (None,)),
+    "moving_frames": ArrayFormat(("<i8",), (None, 2)),
+}
 
 
 @dataclass(frozen=True)
@@ -101,19 +108,15 @@ class Actors:
         Raises:
             FormatError: it is no such file; the message starts with `where`.
         """
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                about = json.loads(file["about"].tobytes())
-                arrays = {name: file[name] for name in _NAMES}
+        with open_npz(data, where) as file:
+            arrays = {name: file.read(name, expected) for name, expected in _FORMATS.items()}
+            about = parse_json(file.read("about", ArrayFormat(("u1",), (None,))).tobytes(), where)
+        with reading(where, "tracks written by regrid", "remove it"):
             tracks = _tracks(arrays)
             ends = np.cumsum(arrays["moving_frames"][:, 1])[:-1]
             parts = np.split(arrays["moving"], ends)
             moving = {int(frame): own for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)}
             return cls(tracks, moving, tuple(about["summary"])), str(about["key"])
-        except _DAMAGED as error:
-            raise FormatError(
-                where, expected="tracks written by regrid", found=str(error) or type(error).__name__, advice="remove it"
-            ) from error
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:

@@ -90,7 +90,7 @@ class FrameFacts:
             residuals: as in the attributes.
 
         Raises:
-            FormatError: an array does not fit its field.
+            FormatError: an array does not fit its field, or a label is not in the class table.
         """
         digests = {name: digest_of(name, array) for name, array in arrays.items()}
         labels = np.asarray(arrays[f"{grid}/labels"]).reshape(-1)
@@ -101,6 +101,7 @@ class FrameFacts:
             labels, seen = labels[seen > 0], seen[seen > 0]
             powers = np.clip(np.frexp(seen.astype(np.float32))[1] - 1, 0, POWERS - 1)
             votes, votes_sum = np.bincount(powers, minlength=POWERS), float(seen.sum(dtype=np.float64))
+        classes.check(labels, f"{grid}: frame {frame}")  # a label of 2**32 - 1 would be counted in 32 GB
         by_class = np.bincount(labels, minlength=classes.num_channels)
         inferred = _inferred(arrays.get(f"{grid}/flags"), counts)
         return cls(frame, digests, len(labels), by_class, votes, votes_sum, changes, residuals or {}, inferred)

@@ -7,13 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from hashlib import blake2b
 from itertools import groupby
-from typing import Any, Self
+from typing import Any, Self, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.errors import FormatError
+from carlasc.core.plain import from_plain
+from carlasc.errors import FormatError, reading
 from carlasc.groundtruth.reporting.actors import Actor, actors_of
 from carlasc.groundtruth.reporting.facts import FrameFacts, digest_of_bytes
 from carlasc.storage.files import parse_json, to_json
@@ -22,6 +23,7 @@ REPORT_FORMAT = 1
 """Version of carlasc-report.json: of its keys, and of what they mean."""
 LEFT_OUT = 0.1
 """Share of the scans that is left out where convergence is measured."""
+_MOST_FRAMES = 10_000_000  # of a sequence: a small file must not name so many that they fill the memory
 _SHORT = 8  # hexadecimal digits of the digest of one frame
 _ABSENT = "-" * _SHORT
 
@@ -115,6 +117,35 @@ class FileDigest:
     def matches(self, data: bytes) -> bool:
         """Return whether a file starts with the bytes that the digest is of."""
         return self.of(data[: self.size]) == self
+
+
+class _Rays(TypedDict):
+    """What the rays of left-out scans found in a grid; see `carlasc.inspection.RayShares`."""
+
+    returns: int
+    free: float | None
+    unknown: float | None
+    occupied: float | None
+    passed: float | None
+    passed_object: float | None
+    missed: float | None
+    error_median_m: float | None
+    error_90_m: float | None
+
+
+class _Swept(TypedDict):
+    """What the grid says of the space that the vehicle drove through."""
+
+    occupied_share: float | None
+
+
+class _HeldOut(TypedDict):
+    """Held-out scores as JSON has them."""
+
+    rays: _Rays
+    by_class: Mapping[str, _Rays]
+    by_distance: Mapping[str, _Rays]
+    swept: _Swept
 
 
 @dataclass(frozen=True)
@@ -235,37 +266,21 @@ class Report:
                 found=f"format {version}",
                 advice="upgrade carlasc" if newer else "make it again with `remake=True`",
             )
-        try:
-            coverage, convergence, actors = values["coverage"], values["convergence"], values["actors"]
+        with reading(where, "a report", "make it again with `remake=True`"):
+            inputs, outputs = (from_plain(values[part], Mapping[str, Digests], part) for part in ("inputs", "outputs"))
             return cls(
-                grid=str(values["grid"]),
-                frames=tuple(frame for start, stop in values["frames"] for frame in range(start, stop)),
-                settings=dict(values["settings"]),
-                coverage=Coverage(
-                    coverage["voxels"],
-                    coverage["known"],
-                    dict(coverage["classes"]),
-                    coverage["occupied"],
-                    coverage["mean_votes"],
-                    tuple(coverage["votes"]),
-                ),
-                convergence=None
-                if convergence is None
-                else Convergence(convergence["frames"], convergence["known"], convergence["changed"]),
-                actors=None if actors is None else tuple(_actor(actor) for actor in actors),
-                inferred_share=values["inferred_share"],
-                holdout=values["holdout"],
-                digests={
-                    name: Digests(value["all"], value["frames"])
-                    for name, value in {**values["inputs"], **values["outputs"]}.items()
-                },
-                documents={name: FileDigest(**value) for name, value in values["documents"].items()},
-                versions=dict(values["versions"]),
+                grid=from_plain(values["grid"], str, "grid"),
+                frames=_frames(values["frames"]),
+                settings=from_plain(values["settings"], Mapping[str, Any], "settings"),
+                coverage=from_plain(values["coverage"], Coverage, "coverage"),
+                convergence=from_plain(values["convergence"], Convergence | None, "convergence"),
+                actors=from_plain(values["actors"], tuple[Actor, ...] | None, "actors"),
+                inferred_share=from_plain(values["inferred_share"], float | None, "inferred_share"),
+                holdout=from_plain(values["holdout"], _HeldOut | None, "holdout"),
+                digests={**inputs, **outputs},
+                documents=from_plain(values["documents"], Mapping[str, FileDigest], "documents"),
+                versions=from_plain(values["versions"], Mapping[str, str], "versions"),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise FormatError(
-                where, expected="a report", found=f"something else ({type(error).__name__}: {error})"
-            ) from error
 
     def to_json(self) -> bytes:
         """Return the bytes of carlasc-report.json."""
@@ -336,13 +351,17 @@ def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
     return [(run[0], run[-1] + 1) for run in runs]
 
 
+def _frames(spans: Any) -> tuple[int, ...]:
+    """Return the frame numbers of half-open ranges.
+
+    Raises:
+        ValueError: they are no such ranges, or more than any sequence has.
+    """
+    ranges = [range(start, stop) for start, stop in from_plain(spans, tuple[tuple[int, int], ...], "frames")]
+    if not all(0 <= span.start <= span.stop for span in ranges) or sum(map(len, ranges)) > _MOST_FRAMES:
+        raise ValueError(f"{len(ranges)} ranges of frames with negative numbers, or of more than {_MOST_FRAMES} frames")
+    return tuple(frame for span in ranges for frame in span)
+
+
 def _plain(actor: Actor) -> dict[str, Any]:
     return {**asdict(actor), "size_m": list(actor.size_m), "seen_m": list(actor.seen_m)}
-
-
-def _actor(values: Mapping[str, Any]) -> Actor:
-    sizes = {}
-    for name in ("size_m", "seen_m"):
-        length, width, height = values[name]
-        sizes[name] = (length, width, height)
-    return Actor(**{**values, **sizes})

@@ -7,13 +7,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeGuard
 
-from carlasc.errors import ArgumentError, ConflictError
+from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage.downloads.archives import SEQUENCES, Archive, choose_archives
 from carlasc.storage.downloads.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.downloads.http import RemoteFile
-from carlasc.storage.downloads.transfer import TransferSettings, find_file, remaining_bytes, transfer
-from carlasc.storage.files import parse_json, write_json
+from carlasc.storage.downloads.transfer import TransferSettings, discard_record, find_file, remaining_bytes, transfer
+from carlasc.storage.files import parse_json, remove_stale, write_json, writing
 
 Progress = Callable[[int, int], None]
 
@@ -94,7 +95,9 @@ def download(
         raise ArgumentError("keep", expected="`extract=True` with it", found="it alone", advice="zips are kept anyway")
     archives = choose_archives([split] if isinstance(split, str) else split, what)
     folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
     pending = [archive for archive in archives if done.get(archive) is None]
     files = {archive: find_file(_url(archive, base_url), settings) for archive in pending}
@@ -103,16 +106,18 @@ def download(
     for archive in archives:
         before = done.get(archive)
         if before is not None:
+            if not keep:
+                _remove_left(folder / archive.name, before.size)
             results.append(before)
             continue
-        fetched = _fetch(folder / archive.name, files[archive], settings, progress)
+        fetched = _fetch(folder / archive.name, files[archive], settings, progress, 2e9 * archive.gigabytes)
         result = Downloaded(archive.name, str(folder / archive.name), files[archive].size, fetched)
         results.append(_extract(result, folder, archive, keep, progress) if extract else result)
     return DownloadResult(tuple(results), time.perf_counter() - began)
 
 
-def _fetch(path: Path, file: RemoteFile, settings: TransferSettings, progress: Progress | None) -> int:
-    """Fetch a zip unless it exists; returns the number of bytes fetched."""
+def _fetch(path: Path, file: RemoteFile, settings: TransferSettings, progress: Progress | None, most: float) -> int:
+    """Fetch a zip of at most `most` bytes unless it exists; returns the number of bytes fetched."""
     if path.exists():
         if file.size is not None and path.stat().st_size != file.size:
             raise ConflictError(
@@ -121,6 +126,7 @@ def _fetch(path: Path, file: RemoteFile, settings: TransferSettings, progress: P
                 found=f"{path.stat().st_size} bytes",
                 advice="move it away, or choose another folder",
             )
+        discard_record(path)  # of a run that was ended before it could
         return 0
     count = 0
 
@@ -130,7 +136,7 @@ def _fetch(path: Path, file: RemoteFile, settings: TransferSettings, progress: P
         if progress is not None:
             progress(count, file.size or count)
 
-    resumed = transfer(file, path, settings, advance)
+    resumed = transfer(file, path, settings, advance, most)
     return path.stat().st_size - resumed
 
 
@@ -147,18 +153,36 @@ def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, pro
     files = extract_zip(path, target, advance)
     if not keep:  # record that it was extracted: the next run would fetch it again
         write_json(_record(folder, archive), {"size": path.stat().st_size, "files": files})
-        path.unlink()
+        with writing(path):
+            path.unlink()
     kept = str(path) if keep else None
     return Downloaded(result.name, kept, result.size, result.fetched, str(target), files)
+
+
+def _remove_left(path: Path, size: int | None) -> None:
+    """Remove a zip that was extracted, if the run that did so was ended before it could."""
+    if path.is_file() and path.stat().st_size == size:
+        with writing(path):
+            path.unlink()
 
 
 def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
     record = _record(folder, archive)
     if not record.is_file():
         return None
-    values = parse_json(record.read_bytes(), str(record))
+    try:
+        values = parse_json(record.read_bytes(), str(record))
+    except FormatError:
+        return None  # what a power failure can leave: the zip is fetched again
     size, files = values.get("size"), values.get("files")
-    return Downloaded(archive.name, None, size, 0, str(folder / archive.folder), int(files or 0))
+    if not (_is_count(size) and _is_count(files)):
+        found = f"{size!r} and {files!r}"
+        raise FormatError(record, expected="whole numbers as size and files", found=found, advice="remove it")
+    return Downloaded(archive.name, None, size, 0, str(folder / archive.folder), files)
+
+
+def _is_count(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def _record(folder: Path, archive: Archive) -> Path:

@@ -19,6 +19,20 @@ _GONE = (401, 403, 404, 410)
 _FULL, _PARTIAL = 200, 206
 
 
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    """Follows redirections to web servers only, and from https to https only."""
+
+    def redirect_request(self, req, fp, code, msg, headers, newurl):  # type: ignore[no-untyped-def]  # noqa: ANN
+        """Return the request that follows; refuses an address of another kind."""
+        scheme = newurl.partition(":")[0].lower()
+        if scheme not in ("http", "https") or (req.type == "https" and scheme == "http"):
+            raise urllib.error.HTTPError(req.full_url, code, f"to {newurl.partition(':')[0]}:", headers, fp)
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+_OPENER = urllib.request.build_opener(_Redirects)
+
+
 class InterruptionError(Exception):
     """The connection was interrupted or the server failed: the request may be repeated."""
 
@@ -128,9 +142,13 @@ def _pieces(response: HTTPResponse, count: int | None, piece: int) -> Iterator[b
 def _request(url: str, headers: dict[str, str]) -> Iterator[HTTPResponse]:
     request = urllib.request.Request(url, headers={"User-Agent": "carlasc", "Accept-Encoding": "identity", **headers})
     try:
-        response = urllib.request.urlopen(request, timeout=TIMEOUT_S)
+        response = _OPENER.open(request, timeout=TIMEOUT_S)
     except urllib.error.HTTPError as error:
         error.close()
+        if 300 <= error.code < 400:  # in a circle, or to no web server
+            raise CarlascError(
+                url, expected="a file", found=f"a redirection that leads nowhere ({error.reason})"
+            ) from error
         if error.code in _GONE:
             raise MissingDataError(url, expected="a file", found=f"status {error.code} ({error.reason})") from error
         raise InterruptionError(f"status {error.code} ({error.reason})") from error
@@ -148,13 +166,13 @@ def _validator(response: HTTPResponse) -> str | None:
 
 def _length(response: HTTPResponse) -> int | None:
     text = response.headers.get("Content-Length", "")
-    return int(text) if text.isdigit() else None
+    return int(text) if re.fullmatch("[0-9]{1,18}", text) else None
 
 
 def _total(response: HTTPResponse, url: str) -> int:
     """Return the size of the whole file, from Content-Range."""
     text = response.headers.get("Content-Range", "")
-    match = re.fullmatch(r"bytes [0-9]+-[0-9]+/([0-9]+)", text)
+    match = re.fullmatch(r"bytes [0-9]+-[0-9]+/([0-9]{1,18})", text)
     if match is None:
         raise InterruptionError(f"{url}: expected a Content-Range, found {text!r}")
     return int(match[1])

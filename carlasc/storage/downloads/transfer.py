@@ -5,6 +5,7 @@ Bytes are written to `<name>.part`, and the list of the blocks in it to `<name>.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import zipfile
@@ -24,7 +25,8 @@ from carlasc.storage.downloads.http import (
     read_range,
     read_whole,
 )
-from carlasc.storage.files import parse_json, write_json
+from carlasc.storage.durability import rename, sync_file
+from carlasc.storage.files import parse_json, storage_error, write_json, writing
 
 _T = TypeVar("_T")
 
@@ -95,7 +97,13 @@ def remaining_bytes(file: RemoteFile, path: Path, settings: TransferSettings) ->
     return (file.size or 0) - _load(file, path, settings).total
 
 
-def transfer(file: RemoteFile, path: Path, settings: TransferSettings, advance: Callable[[int], None]) -> int:
+def transfer(
+    file: RemoteFile,
+    path: Path,
+    settings: TransferSettings,
+    advance: Callable[[int], None],
+    most: float = math.inf,
+) -> int:
     """Fetch a file to `path`, continuing what an earlier run has left.
 
     Args:
@@ -103,12 +111,14 @@ def transfer(file: RemoteFile, path: Path, settings: TransferSettings, advance: 
         path: where it is written; it exists only when it is whole.
         settings: connections, blocks.
         advance: called with the number of bytes that arrived, from one thread at a time; negative where bytes are discarded.
+        most: bytes that the file may have, where the server does not say how many there are.
 
     Returns:
         The number of bytes that an earlier run had fetched.
 
     Raises:
         CarlascError: the server cannot be reached, or the file keeps changing. What was fetched stays for the next run.
+        StorageError: the disk is full or fails.
     """
     resumed = 0
     for _ in range(_RESTARTS):
@@ -119,9 +129,11 @@ def transfer(file: RemoteFile, path: Path, settings: TransferSettings, advance: 
             if file.ranges and file.size:
                 _fetch_blocks(state, path, settings, advance)
             else:
-                _fetch_stream(state, path, settings, advance)
+                _fetch_stream(state, path, settings, advance, most)
             _finish(state, path)
             return resumed
+        except OSError as error:
+            raise storage_error(path, error) from error
         except ChangedError:
             advance(-state.total)
             _discard(path)
@@ -165,11 +177,15 @@ def _fetch_blocks(state: _State, path: Path, settings: TransferSettings, advance
     finally:
         stop.set()  # after Ctrl-C or a failed block, the others stop at their next piece; their bytes count
         executor.shutdown(wait=True, cancel_futures=True)
-        _save(state, path, descriptor)
-        os.close(descriptor)
+        try:
+            _save(state, path, descriptor)
+        finally:
+            os.close(descriptor)
 
 
-def _fetch_stream(state: _State, path: Path, settings: TransferSettings, advance: Callable[[int], None]) -> None:
+def _fetch_stream(
+    state: _State, path: Path, settings: TransferSettings, advance: Callable[[int], None], most: float
+) -> None:
     """Fetch from a server without range requests: each try begins again at the start."""
 
     def one_try() -> None:
@@ -180,6 +196,8 @@ def _fetch_stream(state: _State, path: Path, settings: TransferSettings, advance
                 file.write(data)
                 state.got[0] = state.got.get(0, 0) + len(data)
                 advance(len(data))
+                if state.total > most:
+                    raise FormatError(state.file.url, expected=f"at most {most:.0f} bytes", found="more")
 
     _persistently(one_try, state.file.url, settings, threading.Event())
 
@@ -228,7 +246,7 @@ def _load(file: RemoteFile, path: Path, settings: TransferSettings) -> _State:
 
 def _save(state: _State, path: Path, descriptor: int) -> None:
     """Record which bytes were fetched, after they have reached the disk."""
-    os.fsync(descriptor)
+    sync_file(descriptor)
     file = state.file
     got = {str(index): count for index, count in sorted(state.got.items())}
     write_json(
@@ -246,9 +264,19 @@ def _finish(state: _State, path: Path) -> None:
         )
     with _part(path).open("rb") as file:
         _check_zip(file, path)
-        os.fsync(file.fileno())
-    _part(path).replace(path)
-    _record(path).unlink(missing_ok=True)
+        sync_file(file.fileno())
+    rename(_part(path), path)
+    discard_record(path)
+
+
+def discard_record(path: Path) -> None:
+    """Remove what is recorded of the transfer of a file that is whole.
+
+    Raises:
+        StorageError: it cannot be removed.
+    """
+    with writing(_record(path)):
+        _record(path).unlink(missing_ok=True)
 
 
 def _check_zip(file: BinaryIO, path: Path) -> None:

@@ -14,6 +14,7 @@ from carlasc.storage import layout
 from carlasc.storage.files import remove_stale
 from carlasc.storage.folders.published import PublishedSequence, PublishedSource
 from carlasc.storage.folders.trees import LocalTree
+from carlasc.storage.folders.whole import WholeFiles
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.remote import target_of
 from carlasc.storage.sinks import SequenceWriter, Sink
@@ -107,9 +108,12 @@ class FolderWriter(SequenceWriter):
     def __init__(self, folder: str | os.PathLike[str] | Target) -> None:
         self.target = target_of(folder)
         self.location = self.target.location
+        self._whole = WholeFiles(self.location) if isinstance(self.target, LocalTarget) else None
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether the file exists; it is whole then. In an object store, its folder is listed once."""
+        """Whether the file exists and is whole, as far as its size says. In an object store, its folder is listed once."""
+        if self._whole is not None:
+            return self._whole.has(field, frame)
         return self.target.tree.is_file(layout.field_named(field).file(frame))
 
     def refresh(self) -> None:
@@ -121,12 +125,13 @@ class FolderWriter(SequenceWriter):
         self.target.put(*self._file(field, frame, array))
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the files of several frames; in an object store side by side, but the last one of each frame after its others."""
+        """Write the files of several frames side by side, but the last one of each frame after its others."""
         files = [
             [self._file(field, frame, array) for field, array in fields.items()] for frame, fields in frames.items()
         ]
-        self.target.put_many(dict(file for parts in files for file in parts[:-1]))
-        self.target.put_many(dict(parts[-1] for parts in files if parts))
+        self.target.put_many(
+            dict(file for parts in files for file in parts[:-1]), dict(parts[-1] for parts in files if parts)
+        )
 
     def _file(self, field: str, frame: int, array: NDArray[Any]) -> tuple[str, bytes | memoryview]:
         entry = layout.field_named(field)
@@ -148,17 +153,24 @@ class FolderWriter(SequenceWriter):
         ]
         self.target.remove_many(f"{grid}/{name}" for name in names)
         self.target.remove(layout.params_file(grid))
+        if self._whole is not None:
+            self._whole.forget(grid)
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
         self.target.put(name, data)
 
     def create_document(self, name: str, data: bytes) -> bool:
-        """Write a text file unless it exists."""
+        """Write a text file unless it exists. An empty one is replaced."""
+        if data and self._read(name) == b"":
+            self.target.remove(name)
         return self.target.put(name, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
-        """Return a text file's bytes, None if it does not exist."""
+        """Return a text file's bytes, None if it does not exist, or is empty: a power failure can leave that, a run cannot."""
+        return self._read(name) or None
+
+    def _read(self, name: str) -> bytes | None:
         try:
             return bytes(self.target.tree.read(name))
         except MissingDataError:

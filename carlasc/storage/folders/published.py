@@ -111,14 +111,15 @@ class PublishedSequence(Sequence):
         """Read one file; a local one is memory-mapped: the array is read-only, and its bytes are read when they are used."""
         entry = self._entry(field)
         path = self._prefix + entry.file(frame)
-        return entry.decode(self.tree.read(path), self.tree.where(path), self._shape(entry))
+        shape = self._shape(entry)
+        return entry.decode(self.tree.read(path, entry.size_of(shape)), self.tree.where(path), shape)
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
         """Read several files; all at once from a remote tree."""
         entry = self._entry(field)
         paths = [self._prefix + entry.file(frame) for frame in frames]
         shape = self._shape(entry)
-        files = zip(paths, self.tree.read_many(paths), strict=True)
+        files = zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True)
         return [entry.decode(data, self.tree.where(path), shape) for path, data in files]
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
@@ -133,7 +134,7 @@ class PublishedSequence(Sequence):
         return self._listing[field]
 
     def _shape(self, entry: layout.Field) -> tuple[int, int, int] | None:
-        return self.grids[entry.folder].size if entry.per == "voxel" else None
+        return self.grids[entry.folder].size if entry.per in ("voxel", "vote") else None
 
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""

@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError, StorageError, import_extra
+from carlasc.storage.folders.bodies import MOST_BYTES, WrongAnswerError, bounded_response, read_body
 
 _EXTRAS = {"http": "aiohttp", "https": "aiohttp", "s3": "s3fs", "s3a": "s3fs"}  # packages of the extra `remote`
 _S3, _HTTP = ("s3", "s3a"), ("http", "https")
@@ -94,10 +95,6 @@ class Request:
         return (self.url,) if self.data is None else (self.url, self.data)
 
 
-class WrongAnswerError(Exception):
-    """A server sent something other than what was asked for: it is asked again."""
-
-
 class Requests:
     """Sends requests to the file system of one URL. It can be pickled; each process opens its own connections."""
 
@@ -144,7 +141,8 @@ class Requests:
             from aiohttp import ClientTimeout
 
             silence = ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
-            options["client_kwargs"] = {"timeout": silence} | options.get("client_kwargs", {})
+            bounded = {"timeout": silence, "response_class": bounded_response(timeout)}
+            options["client_kwargs"] = bounded | options.get("client_kwargs", {})
         return options
 
     def send(self, requests: Sequence[Request], attempts: int | None = None) -> list[Any]:
@@ -176,21 +174,21 @@ class Requests:
             return [_plain_call(fs, request) for request in requests]
         from fsspec.asyn import sync
 
-        return sync(fs.loop, partial(_gather, fs, requests, self.settings.requests, self.scheme))
+        return sync(fs.loop, partial(_gather, fs, requests, self.settings, self.scheme))
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_opened": None}
 
 
-async def _gather(fs: Any, requests: Sequence[Request], limit: int, scheme: str) -> list[Any]:
+async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings, scheme: str) -> list[Any]:
     import asyncio  # here, because it takes a twentieth of a second, which commands on local files need not wait
 
-    gate = asyncio.Semaphore(limit)
+    gate = asyncio.Semaphore(settings.requests)
 
     async def one(request: Request) -> Any:
         async with gate:
             if request.name == "get":
-                answer = await _get(fs, scheme, str(request.url), **request.options)
+                answer = await _get(fs, scheme, str(request.url), settings.timeout_s, **request.options)
             else:
                 answer = await getattr(fs, f"_{request.name}")(*request.arguments(), **request.options)
             if request.check is not None:
@@ -211,12 +209,14 @@ def _plain_call(fs: Any, request: Request) -> Any:
     return answer
 
 
-def _get(fs: Any, scheme: str, url: str, start: int | None = None, end: int | None = None) -> Awaitable[bytes]:
-    """Return the bytes [start, end) of a file, or the whole file."""
+def _get(
+    fs: Any, scheme: str, url: str, patience_s: float, start: int | None = None, end: int | None = None
+) -> Awaitable[bytes]:
+    """Return the bytes [start, end) of a file, or the whole file; from a web server that sends them within reason."""
     if scheme in _S3:
         return _get_s3(fs, url, start, end)
     if scheme in _HTTP:
-        return _get_http(fs, url, start, end)
+        return _get_http(fs, url, start, end, patience_s)
     return fs._cat_file(url, start=start, end=end)
 
 
@@ -238,7 +238,7 @@ async def _get_s3(fs: Any, url: str, start: int | None, end: int | None) -> byte
     return data
 
 
-async def _get_http(fs: Any, url: str, start: int | None, end: int | None) -> bytes:
+async def _get_http(fs: Any, url: str, start: int | None, end: int | None, patience_s: float) -> bytes:
     session = await fs.set_session()
     settings = dict(fs.kwargs)
     headers = dict(settings.pop("headers", {}))
@@ -250,7 +250,8 @@ async def _get_http(fs: Any, url: str, start: int | None, end: int | None) -> by
         fs._raise_not_found_for_status(answer, url)
         if start is not None and answer.status != 206:
             raise WrongAnswerError("the whole file instead of a range")
-        data = await answer.read()
+        most = MOST_BYTES if start is None or end is None else end - start
+        data = await read_body(answer.content, most, patience_s)
     if start is not None:
         _check_range(answer.headers.get("Content-Range"), start, end)
     return data

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import mmap
 import os
+import stat
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,9 @@ from typing import Any
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError, without_credentials
 from carlasc.storage.folders.blocks import RemoteFile
-from carlasc.storage.folders.requests import Request, Requests, WrongAnswerError, bucket_is_missing, fail
+from carlasc.storage.folders.bodies import WrongAnswerError
+from carlasc.storage.folders.ranges import check_length, check_size, map_range, shorter
+from carlasc.storage.folders.requests import Request, Requests, bucket_is_missing, fail
 
 # Bytes from which on a range is mapped. Reading the megabyte of a scan is faster than touching its mapped pages.
 _MAPPED = 1 << 22
@@ -51,8 +54,13 @@ class Tree(ABC):
         """Return the names in a folder, each with whether it is a folder; empty if the folder does not exist."""
 
     @abstractmethod
-    def read(self, path: str) -> bytes | memoryview:
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Return a file's bytes.
+
+        Args:
+            path: the file.
+            size: the bytes that it has if it is what it should be; None where nothing says it. A packed file of another size is not
+                unpacked.
 
         Raises:
             MissingDataError: the file does not exist.
@@ -73,9 +81,9 @@ class Tree(ABC):
         folder, _, name = path.rpartition("/")
         return self.entries(folder).get(name) is False
 
-    def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
-        """Return several files' bytes; remote trees request all of them at once."""
-        return [self.read(path) for path in paths]
+    def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
+        """Return several files' bytes, each of `size` (see `read`); remote trees request all of them at once."""
+        return [self.read(path, size) for path in paths]
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
         """Return several ranges; remote trees request all of them at once."""
@@ -120,24 +128,26 @@ class LocalTree(Tree):
         """Whether the file exists, without listing its folder."""
         return (self.root / path).is_file()
 
-    def read(self, path: str) -> bytes | memoryview:
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Read the file, or map it into memory: its bytes are read when they are used."""
         with self._opened(path) as descriptor:
-            size = os.fstat(descriptor).st_size
+            found = os.fstat(descriptor).st_size
             if not self.mapped:
-                return os.pread(descriptor, size, 0)
-            if size == 0:
+                return os.pread(descriptor, found, 0)
+            if found == 0:
                 return b""  # an empty file, such as an empty scan, cannot be mapped
             return memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Read the range, or map it into memory if it is large."""
         with self._opened(path) as descriptor:
+            size = os.fstat(descriptor).st_size
             if start < 0:
-                size = os.fstat(descriptor).st_size
                 start, end = max(0, size + start), size + end
+            if end > size:  # what a damaged table says may be more than fits into memory
+                raise shorter(end - start, max(0, size - start), self.where(path))
             if end - start >= _MAPPED:
-                return _map_range(descriptor, start, end, self.where(path))
+                return map_range(descriptor, start, end)
             data = os.pread(descriptor, end - start, start)
         return check_length(data, end - start, self.where(path))
 
@@ -145,8 +155,11 @@ class LocalTree(Tree):
     def _opened(self, path: str) -> Iterator[int]:
         path = f"{self.location}/{path}" if path else self.location
         try:
-            descriptor = os.open(path, os.O_RDONLY)
+            # Opening a pipe would wait for a writer, which may never come.
+            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
             try:
+                if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                    raise FormatError(path, expected="a file", found="a folder, a pipe or a device")
                 yield descriptor
             finally:
                 os.close(descriptor)
@@ -251,7 +264,7 @@ class RemoteTree(Tree):
                 sizes[place.removeprefix(root)] = about["size"]
         return sizes
 
-    def read(self, path: str) -> bytes | memoryview:
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Fetch the file."""
         return self.read_many([path])[0]
 
@@ -259,7 +272,7 @@ class RemoteTree(Tree):
         """Fetch the range."""
         return self.read_ranges([(path, start, end)])[0]
 
-    def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
+    def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
         """Fetch the files, several at a time. Their lengths are compared with the listing, where their folder has been listed."""
         requests = [Request("get", self.url(path), {}, self._length_check(path)) for path in paths]
         answers = self.requests.send(requests)
@@ -273,7 +286,7 @@ class RemoteTree(Tree):
 
     def _length_check(self, path: str) -> Callable[[bytes], None] | None:
         expected = self._sizes.get(path)
-        return None if expected is None else partial(_check_size, expected)
+        return None if expected is None else partial(check_size, expected)
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes]:  # type: ignore[override]
         """Fetch the ranges, several at a time."""
@@ -289,7 +302,7 @@ class RemoteTree(Tree):
         if isinstance(answer, Exception):
             fail(self.where(path), answer)
         if len(answer) != end - start and self._size(path) >= end:
-            check = partial(_check_size, end - start)
+            check = partial(check_size, end - start)
             (answer,) = self.requests.send([Request("get", self.url(path), {"start": start, "end": end}, check)])
             if isinstance(answer, Exception):
                 fail(self.where(path), answer)
@@ -372,27 +385,3 @@ def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_opt
     """
     text = os.fspath(place)
     return RemoteTree(text, storage_options) if is_url(text) else LocalTree(text.removeprefix("file://"), mapped=mapped)
-
-
-def _map_range(descriptor: int, start: int, end: int, where: str) -> memoryview:
-    found = os.fstat(descriptor).st_size
-    if end > found:
-        raise FormatError(where, expected=f"at least {end} bytes", found=str(found), advice="is it truncated?")
-    skipped = start % mmap.ALLOCATIONGRANULARITY
-    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)  # read all pages at once (Linux only)
-    mapped = mmap.mmap(descriptor, end - start + skipped, flags, mmap.PROT_READ, offset=start - skipped)
-    return memoryview(mapped)[skipped:]
-
-
-def check_length(data: bytes, expected: int, where: str) -> bytes:
-    """Return `data` if it has the expected length; else the file is truncated, or a server sent another range."""
-    if len(data) != expected:
-        raise FormatError(
-            where, expected=f"{expected} bytes in this range", found=str(len(data)), advice="is the file truncated?"
-        )
-    return data
-
-
-def _check_size(expected: int, data: bytes) -> None:
-    if len(data) != expected:
-        raise WrongAnswerError(f"{len(data)} bytes instead of {expected}")

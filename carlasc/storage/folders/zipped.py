@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage.arrays import check_ratio
 from carlasc.storage.folders.names import leads_outside
 from carlasc.storage.folders.trees import Tree
 
@@ -53,13 +54,17 @@ class ZipTree(Tree):
         folder, _, name = path.rpartition("/")
         return self._index.folders.get(folder, {}).get(name, -1) >= 0
 
-    def read(self, path: str) -> bytes | memoryview:
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Read a member and check its checksum."""
-        return self.read_many([path])[0]
+        return self.read_many([path], size)[0]
 
-    def read_many(self, paths: Sequence[str]) -> list[bytes | memoryview]:
-        """Read several members; all at once from a remote zip."""
+    def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
+        """Read several members; all at once from a remote zip. None is unpacked to more than `size`, or than its ratio may be."""
         members = [self._member(path) for path in paths]
+        for path, member in zip(paths, members, strict=True):
+            unpacked, packed = (int(self._index.columns[name][member]) for name in ("size", "packed"))
+            if unpacked != size:
+                check_ratio(unpacked, packed, self.where(path))
         ranges = [(self.path, int(self._index.columns["offset"][m]), self._index.end_of(m)) for m in members]
         found = zip(paths, members, self.tree.read_ranges(ranges), strict=True)
         return [self._extract(path, member, memoryview(data)) for path, member, data in found]

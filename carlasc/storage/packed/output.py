@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
+from carlasc.storage.durability import rename
+from carlasc.storage.files import storage_error
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
 UNFINISHED_MARK = "unfinished.json"  # in its place until the store is whole
@@ -28,15 +33,17 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise ConflictError(
             path, expected="nothing there", found=f"a {kind}", advice="choose another name, or give `overwrite=True`"
         )
-    if path.is_dir():
-        is_store = any((path / mark).is_file() for mark in ("zarr.json", TABLES_MARK))
-    else:
-        with path.open("rb") as file:
-            is_store = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
-    if not is_store:
+    if not _is_store(path):
         raise ConflictError(
             path, expected="a packed store to overwrite", found=f"another {kind}", advice="choose another name"
         )
+
+
+def _is_store(path: Path) -> bool:
+    if path.is_dir():
+        return any((path / mark).is_file() for mark in ("zarr.json", TABLES_MARK))
+    with path.open("rb") as file:
+        return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
 
 
 def unfinished(path: Path) -> Path:
@@ -45,24 +52,129 @@ def unfinished(path: Path) -> Path:
 
 
 def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
-    """Rename a finished store to its name; an older one is removed only then.
+    """Rename a finished store, which is on the disk, to its name; an older one is removed only then.
 
     Raises:
         ConflictError: something exists there that may not be overwritten.
         StorageError: it cannot be renamed.
     """
+    old = path.with_name(f"{path.name}.old")
     try:
         if path.exists():
             refuse_existing(path, overwrite)
-            old = path.with_name(f"{path.name}.old")
             remove(old)
             path.rename(old)
-            finished.rename(path)
-            remove(old)
-        else:
-            finished.rename(path)
+        rename(finished, path)
+        if overwrite:
+            remove(old)  # also what a run left that was ended here
     except OSError as error:
         raise StorageError(path, problem=f"cannot be put in place: {error.strerror or error}") from error
+
+
+class PatientFile(io.RawIOBase):
+    """A new file for a library that cannot go on after a failed write: h5py then crashes, pyarrow complains about its own destructor.
+
+    It keeps the first error, drops all that is written after it, and `check` raises it.
+    """
+
+    def __init__(self, path: Path, place: Path) -> None:
+        """Create the file.
+
+        Args:
+            path: the file.
+            place: what it becomes when it is whole, for errors.
+
+        Raises:
+            StorageError: it cannot be created.
+        """
+        super().__init__()
+        self._path, self._place = path, place
+        self._position = self._size = 0
+        self._error: OSError | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        except OSError as error:
+            raise storage_error(place, error) from error
+
+    def check(self) -> None:
+        """Raise the error of the first write that failed.
+
+        Raises:
+            StorageError: one did.
+        """
+        if self._error is not None:
+            raise storage_error(self._place, self._error) from self._error
+
+    def readable(self) -> bool:
+        """It can be read."""
+        return True
+
+    def writable(self) -> bool:
+        """It can be written."""
+        return True
+
+    def seekable(self) -> bool:
+        """It has a position."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Set the position and return it."""
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        return self._position
+
+    def write(self, data: Any) -> int:
+        """Write all bytes at the position."""
+        view = memoryview(data).cast("B")
+        left, place = view, self._position
+        while left and self._error is None:
+            try:
+                written = os.pwrite(self._descriptor, left, place)
+            except OSError as error:
+                self._error = error
+            else:
+                left, place = left[written:], place + written
+        self._position += len(view)
+        self._size = max(self._size, self._position)
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read bytes at the position; zeros after an error."""
+        view = memoryview(buffer).cast("B")
+        found = b""
+        if self._error is None:
+            try:
+                found = os.pread(self._descriptor, len(view), self._position)
+            except OSError as error:
+                self._error = error
+        if self._error is not None:
+            found = bytes(len(view))
+        view[: len(found)] = found
+        self._position += len(found)
+        return len(found)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size."""
+        self._size = self._position if size is None else size
+        if self._error is None:
+            try:
+                os.ftruncate(self._descriptor, self._size)
+            except OSError as error:
+                self._error = error
+        return self._size
+
+    def close(self) -> None:
+        """Close the file, if it is open."""
+        if not self.closed:
+            super().close()
+            try:
+                os.close(self._descriptor)
+            except OSError as error:  # a network file system may report here what it could not write
+                self._error = self._error or error
 
 
 def remove(path: Path) -> None:

@@ -85,11 +85,14 @@ class PackedSource(Source):
 def _check_root(root: Mapping[str, Any] | None, where: str, newest: int) -> Mapping[str, str]:
     if root is None or root.get("type") != STORE:
         raise FormatError(where, expected="a store packed by carlasc", found=f"one without the type {STORE}")
-    if root.get("version", 0) > newest:
+    version = root.get("version", VERSION)
+    if isinstance(version, bool) or not isinstance(version, int | np.integer) or version < 1:
+        raise FormatError(where, expected="a version above 0", found=repr(version), advice="the store is damaged")
+    if version > newest:
         raise FormatError(
             where,
             expected=f"a store of version {newest} or older",
-            found=f"version {root['version']}",
+            found=f"version {version}",
             advice="upgrade carlasc to read it",
         )
     if not root.get("complete"):
@@ -99,7 +102,10 @@ def _check_root(root: Mapping[str, Any] | None, where: str, newest: int) -> Mapp
             found="one that is being written, or was interrupted",
             advice="run the same command again to finish it, or `carlasc finish`",
         )
-    nodes: dict[str, str] = dict(sorted(root["sequences"].items()))
+    sequences = root.get("sequences")
+    if not isinstance(sequences, dict) or not all(isinstance(node, str) for node in sequences.values()):
+        raise FormatError(where, expected="the groups of sequences", found="none", advice="the store is damaged")
+    nodes: dict[str, str] = dict(sorted(sequences.items()))
     check_names([*nodes, *nodes.values()], where)
     return nodes
 
@@ -133,6 +139,16 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
             raise FormatError(
                 location, expected=f"the attribute {error.args[0]}", found="none", advice="the store is damaged"
             ) from error
+        except TypeError as error:
+            raise FormatError(
+                location, expected="lists of fields and text files", found=str(error), advice="the store is damaged"
+            ) from error
+        names = (self.name, self.coordinates, self.split or "", *self._fields, *self._documents)
+        if not all(isinstance(name, str) for name in names) or self.coordinates not in layout.COORDINATES:
+            raise FormatError(
+                location, expected="names of the sequence, its fields and its text files", found="others",
+                advice="the store is damaged",
+            )  # fmt: skip
         check_names([*self._fields, *self._documents], location)
         self._readers: dict[str, _FieldReader] = {}
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError
-from carlasc.storage.files import write_atomic
+from carlasc.storage.files import write_output
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.page.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays
 from carlasc.viewing.scene import GridPanel, Scene, SceneReader
@@ -69,7 +69,7 @@ def write_page(
         if progress is not None:
             progress(done, len(reader.frames))
     page = compose(describe(reader, thin_m), blocks).encode()
-    write_atomic(out, page)
+    write_output(out, page)
     titles = tuple(panel.title for panel in reader.panels)
     return PageResult(
         out, reader.path, titles, reader.frames, len(page), time.monotonic() - started, reader.notes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra
-from carlasc.storage.files import write_atomic
+from carlasc.storage.files import write_output
 
 STILLS = (".png",)
 FILMS = (".gif", ".mp4")
@@ -47,7 +46,7 @@ def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float
         raise ArgumentError("fps", expected="above 0 and at most 240 pictures per second", found=f"{fps:g}")
     writers = {".png": _write_png, ".gif": _write_gif, ".mp4": _write_mp4}
     write = writers[path.suffix.lower()]
-    write_atomic(path, lambda file: write(file, iter(pictures), fps))
+    write_output(path, lambda file: write(file, iter(pictures), fps))
 
 
 def _write_png(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
@@ -72,16 +71,16 @@ def _to_palette(picture: NDArray[np.uint8]) -> Any:
 
 
 def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Encode a film into the file itself, by its name: a killed run leaves no other file, and the encoder can seek in it."""
     encoder = import_extra("imageio_ffmpeg", "render").get_ffmpeg_exe()
-    with tempfile.TemporaryDirectory(prefix="carlasc-") as folder, tempfile.TemporaryFile() as messages:
-        target = Path(folder) / "film.mp4"
+    with tempfile.TemporaryFile() as messages:
         picture = next(pictures)
         height, width, _ = picture.shape
         process = subprocess.Popen(
             [
                 *(encoder, "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
                 *("-r", f"{fps:g}", "-i", "-", "-c:v", "libx264", "-crf", "18", "-preset", "medium"),
-                *("-pix_fmt", "yuv420p", "-movflags", "+faststart", str(target)),
+                *("-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", f"file:{file.name}"),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -98,8 +97,6 @@ def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
             messages.seek(0)
             lines = messages.read().decode(errors="replace").strip().splitlines() or ["the encoder printed no message"]
             raise CarlascError(encoder, problem=f"failed with exit code {process.returncode}", advice=lines[-1])
-        with target.open("rb") as film:
-            shutil.copyfileobj(film, file)
 
 
 def _feed(process: subprocess.Popen[bytes], first: NDArray[np.uint8], rest: Iterator[NDArray[np.uint8]]) -> None:

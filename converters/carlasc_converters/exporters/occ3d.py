@@ -20,8 +20,8 @@ from carlasc.converting import Exported, Files, TargetFrame, mirror_poses
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.geometry import quaternions_of, translation
 from carlasc.core.grids import GridSpec
-from carlasc.errors import FormatError
 from carlasc.storage import layout
+from carlasc.storage.files import parse_json
 from carlasc_converters.exporters.grids import GridExporter, sensor_height
 
 _ANNOTATIONS = "annotations.json"
@@ -90,7 +90,7 @@ class Occ3dExporter(GridExporter):
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
         """Return annotations.json, with the scenes that are in it already."""
         path = root / _ANNOTATIONS
-        annotations = _read_annotations(path) if path.is_file() else {}
+        annotations = parse_json(path.read_bytes(), str(path)) if path.is_file() else {}
         scenes = annotations.get("scene_infos", {})
         splits = {key: set(annotations.get(key, ())) for key in _SPLITS.values()}
         for part in exported:
@@ -130,13 +130,3 @@ def _pose(sequence: storage.Sequence, frame: int, place: TargetFrame) -> dict[st
     scan_T_vehicle = translation((0.0, 0.0, -place.height_m))
     pose = vehicle_T_scan @ first_T_scan @ scan_T_vehicle
     return {"translation": pose[:3, 3].tolist(), "rotation": quaternions_of(pose[None, :3, :3])[0].tolist()}
-
-
-def _read_annotations(path: Path) -> dict[str, Any]:
-    try:
-        annotations = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise FormatError(path, expected="JSON", found="something else", advice=str(error)) from error
-    if not isinstance(annotations, dict):
-        raise FormatError(path, expected="a JSON object", found=type(annotations).__name__)
-    return annotations

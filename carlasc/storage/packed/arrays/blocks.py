@@ -113,7 +113,7 @@ class StoredField:
         }
         changed = [path for path, block in found.items() if len(self._tables.get(block) or {}) < self.options.block]
         for path, data in zip(changed, self.target.tree.read_many(changed), strict=True):
-            self._tables[found[path]] = parse_table(bytes(data), self.target.tree.where(path))
+            self._tables[found[path]] = self._parse(data, path)
         self._listed_s = time.monotonic()
         self._denied = set()
 
@@ -121,9 +121,13 @@ class StoredField:
         """Return what the table of a block says now; None if the block does not exist."""
         path = table_path(self.node, block)
         try:
-            return parse_table(bytes(self.target.tree.read(path)), self.target.tree.where(path))
+            return self._parse(self.target.tree.read(path), path)
         except MissingDataError:
             return None
+
+    def _parse(self, data: bytes | memoryview, path: str) -> Table | None:
+        """Return a table; None for an empty file, which a power failure can leave: the block is then made again."""
+        return parse_table(bytes(data), self.target.tree.where(path)) if data else None
 
     def read(self, frame: int) -> NDArray[np.generic] | None:
         """Read a frame; None if it does not exist."""
@@ -183,7 +187,8 @@ class StoredField:
 
 def _merge(there: bytes, new: Mapping[int, bytes], taken: set[int], room: int, where: str) -> bytes:
     """Return the file of a shard with new chunks, and with those of the present file that are not in slots that are taken."""
-    kept = {slot: chunk for slot, chunk in split_shard(there, room, where).items() if slot not in taken}
+    there_now = split_shard(there, room, where) if there else {}  # a power failure can leave an empty file
+    kept = {slot: chunk for slot, chunk in there_now.items() if slot not in taken}
     return join_shard({**kept, **new}, room)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import struct
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,14 +21,16 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import CarlascError, FormatError, import_extra
+from carlasc.errors import CarlascError, FormatError, describe, import_extra
 from carlasc.running import count_workers
+from carlasc.storage.arrays import check_size
 from carlasc.storage.folders.trees import Tree
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
 NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
+_BLOSC_HEADER = struct.Struct("<4B3I")
 BLOCK = 1 << 21  # bytes that Blosc compresses together: a whole scan, because smaller blocks compress less
 
 
@@ -56,17 +59,37 @@ class Encoding:
         """Decode a chunk's bytes into `out`, a contiguous array of the chunk's shape and dtype.
 
         Raises:
-            FormatError: they cannot be decoded.
+            FormatError: they cannot be decoded, or are those of another number of elements.
         """
         try:
             if self.codec == "pcodec":
-                _pcodec(self.level, extra).decode(bytes(data), out.reshape(-1))
+                # numcodecs does not say how many numbers there were: fewer would leave the rest of `out` as it is.
+                progress = import_extra("pcodec", extra).standalone.simple_decompress_into(bytes(data), out.reshape(-1))
+                if progress.n_processed != out.size or not progress.finished:
+                    raise ValueError(f"{progress.n_processed} elements instead of {out.size}")
             else:
+                _check_blosc(data, out.nbytes)
                 import_extra("numcodecs.blosc", extra).decompress(data, out)
-        except CarlascError:
+        except (CarlascError, KeyboardInterrupt, SystemExit):
             raise
-        except Exception as error:  # each codec raises its own types
-            raise FormatError("its bytes", problem=f"cannot be decoded: {error}") from error
+        except BaseException as error:  # each codec raises its own types; a panic of PCodec, in Rust, is no Exception
+            raise FormatError("its bytes", problem=f"cannot be decoded: {describe(error)}") from error
+
+
+def _check_blosc(data: bytes | memoryview, size: int) -> None:
+    """Check the header of bytes that Blosc will decode, as `blosc_cbuffer_validate` of C-Blosc does: Blosc believes it.
+
+    The header is that of Blosc 1 (README_CHUNK_FORMAT.rst): version, version of the codec, flags, size of a type, and then as 32-bit
+    numbers the bytes that were compressed, those of a block, and the compressed ones.
+
+    Raises:
+        ValueError: it is that of other data.
+    """
+    if len(data) < _BLOSC_HEADER.size:
+        raise ValueError(f"{len(data)} bytes are no Blosc chunk")
+    *_, decoded, block, encoded = _BLOSC_HEADER.unpack_from(data)
+    if (decoded, encoded) != (size, len(data)) or not 0 < block <= max(decoded, 1):
+        raise ValueError(f"{decoded} bytes from {encoded}, in blocks of {block}, instead of {size} from {len(data)}")
 
 
 @cache
@@ -141,6 +164,7 @@ class StoredArray:
 
     def read_chunk(self, number: int) -> NDArray[Any]:
         """Fetch, verify and decode one chunk."""
+        check_size(self.chunk, self.dtype, f"a chunk of {self.name}")
         out = np.empty(self.chunk, self.dtype)
         self.decode(self.fetch([number])[0], number, out)
         return out

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError
 from carlasc.storage import layout
 from carlasc.storage.packed.arrays.columns import FEW, LEAST, Column, Packing, packing_of
-from carlasc.storage.packed.arrays.reading import COLUMN, FIELD, ArrayField, StoredColumn
+from carlasc.storage.packed.arrays.reading import COLUMN, FIELD, ArrayField, StoredColumn, check_attributes
 from carlasc.storage.packed.arrays.shards import ZarrArray, encode_chunk
 from carlasc.storage.packed.arrays.zarr_metadata import array_metadata
 from carlasc.storage.packed.protocol import Options
@@ -60,13 +60,16 @@ class FieldLayout:
             raise FormatError(
                 where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
             )
+        check_attributes(attributes, where)
         options = Options(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
             raise FormatError(where, expected=f"a field of kind {packing.kind}", found=repr(attributes.get("kind")))
         size = attributes.get("shape" if packing.kind == "grid" else "chunk")
         numbers = size if isinstance(size, list) else [size]
-        if not all(isinstance(number, int) and number > 0 for number in numbers):
+        if not all(type(number) is int and 0 < number < 2**31 for number in numbers) or (
+            len(numbers) != 3 if packing.kind == "grid" else isinstance(size, list)
+        ):
             raise FormatError(where, expected="the size of its chunks", found=repr(size), advice="the store is damaged")
         return cls(packing, attributes, block)
 

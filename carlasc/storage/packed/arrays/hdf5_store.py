@@ -6,7 +6,7 @@ themselves are read and decoded directly.
 
 from __future__ import annotations
 
-import json
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,13 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import CarlascError, FormatError, import_extra
+from carlasc.errors import FormatError, import_extra, reading
+from carlasc.storage.arrays import check_ratio
+from carlasc.storage.files import parse_json_value
 from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.packed.arrays.reading import ArraySequence, ArraySource, ArrayStore
 from carlasc.storage.packed.arrays.version1 import OffsetsSequence
 
 _BLOSC = 32001  # the filter's registered number
+_GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # those of the filters that HDF5 brings
+_SMALL_FILTERS = {_GZIP, _SHUFFLE, _FLETCHER32}
+_UNTRUSTED = "carlasc did not write this: do not use this store"
 CRC = "_crc32c"  # suffix of the data set with the checksums of another one's chunks
 
 
@@ -55,18 +60,24 @@ class HDF5Store(ArrayStore):
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""
         with self._open() as file:
-            return _read_attributes(file[node or "/"]) if not node or node in file else None
+            found = find_node(file, node, self.location)
+            return None if found is None else _read_attributes(found, f"{self.location}/{node}")
 
     def read_small(self, node: str) -> NDArray[Any]:
         """Return a whole data set."""
         with self._open() as file:
-            return np.asarray(self._dataset(file, node)[...])
+            return self._read_small(file, node)
+
+    def _read_small(self, file: Any, node: str) -> NDArray[Any]:
+        dataset = self._dataset(file, node)
+        check_small(dataset, f"{self.location}: {dataset.name}")
+        return np.asarray(dataset[...])
 
     def array(self, node: str) -> StoredArray:
         """Return a data set whose chunks can be read."""
         with self._open() as file:
             return HDF5Array.from_dataset(
-                self.tree, self.path, self._dataset(file, node), self._dataset(file, node + CRC)[...]
+                self.tree, self.path, self._dataset(file, node), self._read_small(file, node + CRC)
             )
 
     def stored_bytes(self, node: str) -> int:
@@ -81,33 +92,28 @@ class HDF5Store(ArrayStore):
             total += item.id.get_storage_size() if isinstance(item, h5py.Dataset) else 0
 
         with self._open() as file:
-            if node in file:
-                file[node].visititems(add)
+            if (found := find_node(file, node, self.location)) is not None:
+                found.visititems(add)
         return total
 
     def _dataset(self, file: Any, node: str) -> Any:
-        if node not in file:
+        found = find_node(file, node, self.location)
+        if not isinstance(found, import_extra("h5py", "hdf5").Dataset):
             raise FormatError(
                 self.location, expected=f"the data set {node}", found="none", advice="the store is damaged"
             )
-        return file[node]
+        return found
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
         h5py = import_extra("h5py", "hdf5")
-        try:
+        with reading(self.location, "an HDF5 file", "is it truncated or corrupted?"):
             if isinstance(self.tree, RemoteTree):
                 with self.tree.open(self.path) as remote, h5py.File(remote, "r") as file:
                     yield file
             else:
                 with h5py.File(self.location, "r", locking=False) as file:
                     yield file
-        except CarlascError:
-            raise
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise FormatError(
-                self.location, problem=f"cannot be read as HDF5: {error}", advice="is it truncated or corrupted?"
-            ) from error
 
 
 class HDF5Array(StoredArray):
@@ -125,8 +131,7 @@ class HDF5Array(StoredArray):
             FormatError: it is not chunked, has other filters, or lacks chunks.
         """
         shape, chunk = dataset.shape, dataset.chunks
-        plist = dataset.id.get_create_plist()
-        if chunk is None or plist.get_nfilters() != 1 or plist.get_filter(0)[0] != _BLOSC:
+        if chunk is None or _filters(dataset) != [_BLOSC] or dataset.dtype.kind not in "uif" or checksums.ndim != 1:
             raise FormatError(
                 f"{tree.where(path)}: {dataset.name}",
                 expected="a chunked data set with the Blosc filter",
@@ -149,7 +154,8 @@ class HDF5Array(StoredArray):
                 found="others",
                 advice="the store is damaged",
             )
-        array = cls(tree, dataset.name, dataset.dtype, shape, chunk, axis, Encoding(), _read_attributes(dataset))
+        attributes = _read_attributes(dataset, f"{tree.where(path)}: {dataset.name}")
+        array = cls(tree, dataset.name, dataset.dtype, shape, chunk, axis, Encoding(), attributes)
         array._path, array._places, array._checksums = path, places, checksums
         return array
 
@@ -174,11 +180,67 @@ class HDF5Array(StoredArray):
         return data
 
 
-def _read_attributes(node: Any) -> dict[str, Any]:
+def find_node(file: Any, node: str, where: str) -> Any:
+    """Return a group or a data set of a file, None if it does not exist. Only links to what is in the file itself are followed.
+
+    HDF5 can also put the path of another file into a link, or into a data set: anybody may have made the store, and what it shows must not
+    be another file of this machine.
+
+    Raises:
+        FormatError: a link on the way leads to another file.
+    """
+    h5py = import_extra("h5py", "hdf5")
+    found = file
+    for name in filter(None, node.split("/")):
+        link = found.get(name, getlink=True) if isinstance(found, h5py.Group) else None
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            kind = "a link to another file" if isinstance(link, h5py.ExternalLink) else "a symbolic link"
+            raise FormatError(f"{where}: {node}", expected="what the file itself holds", found=kind, advice=_UNTRUSTED)
+        found = found[name]
+    if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
+        raise FormatError(
+            f"{where}: {node}", expected="values in the file itself", found="those of other files", advice=_UNTRUSTED
+        )
+    return found
+
+
+def check_small(dataset: Any, what: str) -> None:
+    """Check that a data set which is read whole is not larger in memory than what it takes in the file allows.
+
+    Raises:
+        FormatError: it is, or it has other values or filters than those that carlasc writes.
+    """
+    size, stored, filters = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), _filters(dataset)
+    if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
+        raise FormatError(what, expected="numbers, packed by gzip or not at all", found="others", advice=_UNTRUSTED)
+    check_ratio(size, stored, what)
+    if dataset.chunks is None or not size:
+        if size > stored:  # HDF5 would fill the rest with zeros
+            raise FormatError(what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged")
+        return
+    if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
+        raise FormatError(what, expected="one chunk", found="several", advice="the store is damaged")
+    if _GZIP in filters:  # HDF5 unpacks all that a chunk holds, however much it is
+        packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
+        unpacked = zlib.decompressobj().decompress(packed, size + 1)
+        if len(unpacked) != size:
+            raise FormatError(what, expected=f"{size} bytes", found="others", advice=_UNTRUSTED)
+
+
+def _filters(dataset: Any) -> list[int]:
+    plist = dataset.id.get_create_plist()
+    return [plist.get_filter(number)[0] for number in range(plist.get_nfilters())]
+
+
+def _read_attributes(node: Any, where: str) -> dict[str, Any]:
     found = {}
-    for name, value in node.attrs.items():
+    for name, stored in node.attrs.items():
+        value = stored.item() if hasattr(stored, "item") else stored
+        value = value.decode() if isinstance(value, bytes) else value
         if name.endswith(":json"):
-            found[name.removesuffix(":json")] = json.loads(value)
+            found[name.removesuffix(":json")] = parse_json_value(value, f"{where}: {name}")
         else:
-            found[name] = value.item() if hasattr(value, "item") else value
+            found[name] = value
     return found

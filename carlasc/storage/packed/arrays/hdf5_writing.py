@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
+from carlasc.storage.durability import sync_tree
 from carlasc.storage.folders.trees import LocalTree
 from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c, in_threads
 from carlasc.storage.packed.arrays.columns import Column, packing_of
 from carlasc.storage.packed.arrays.hdf5_store import CRC, HDF5Array
 from carlasc.storage.packed.arrays.reading import COLUMN, DOCUMENT, FIELD, SEQUENCE, document_node, field_node
 from carlasc.storage.packed.numbers import common_type
-from carlasc.storage.packed.output import put_in_place, refuse_existing, remove, unfinished
+from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
 from carlasc.storage.packed.protocol import STORE, VERSION, FieldWriter, Options, PackedSink, PackedWriter, node_of
 
 _HEADROOM = 1.125  # a chunk is this much larger than the first frame, so that later frames seldom need a second chunk
@@ -50,7 +51,7 @@ class HDF5Sink(PackedSink):
         self.options = options
         self.overwrite = overwrite
         refuse_existing(self.path, overwrite)
-        self._file = _File(unfinished(self.path))
+        self._file = _File(unfinished(self.path), self.path)
         self._sequences: dict[str, str] = {}
 
     def finished(self, path: str) -> bool:
@@ -69,6 +70,7 @@ class HDF5Sink(PackedSink):
         root = {"type": STORE, "version": VERSION, "complete": True, "sequences": self._sequences}
         root |= {"lossy_mm": self.options.lossy_mm} if self.options.lossy_mm else {}
         self._file.close(root)
+        sync_tree(self._file.path)
         put_in_place(self._file.path, self.path, self.overwrite)
 
 
@@ -235,20 +237,25 @@ def _round_up(count: int) -> int:
 class _File:
     """Writes an HDF5 file with h5py; chunks are encoded here, in parallel, as the Blosc filter would encode them."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, place: Path) -> None:
         h5py = import_extra("h5py", "hdf5")
         self._filters = import_extra("hdf5plugin", "hdf5")
         for module in ("numcodecs", "google_crc32c"):
             import_extra(module, "hdf5")
         self.location = str(path)
         self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove(path)
-        self._file = h5py.File(path, "w", libver=("v110", "v110"), track_order=False)
+        self._output = PatientFile(path, place)
+        self._file = h5py.File(self._output, "w", libver=("v110", "v110"), track_order=False)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the error of a write that failed."""
+        self._output.check()
 
     def write_group(self, node: str, attributes: dict[str, Any]) -> None:
         """Create a group."""
         _write_attributes(self._file.require_group(node), attributes)
+        self.check()
 
     def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
         """Write a data set of one chunk."""
@@ -258,6 +265,7 @@ class _File:
         )
         dataset = self._file.create_dataset(node, data=array, **compact)
         _write_attributes(dataset, attributes)
+        self.check()
 
     def create(
         self,
@@ -274,11 +282,13 @@ class _File:
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
         dataset = self._file.create_dataset(node, empty, dtype, chunks=chunk, maxshape=most, **blosc)
         _write_attributes(dataset, attributes)
+        self.check()
         return _ChunkWriter(self, node, dataset, axis, encoding)
 
     def array(self, node: str) -> StoredArray:
         """Return a closed data set."""
         self._file.flush()
+        self.check()
         return HDF5Array.from_dataset(
             LocalTree(self.path.parent), self.path.name, self._file[node], self._file[node + CRC][...]
         )
@@ -299,6 +309,8 @@ class _File:
         """Write the root's attributes and close the file."""
         _write_attributes(self._file, attributes)
         self._file.close()
+        self._output.close()
+        self.check()
 
 
 class _ChunkWriter:
@@ -338,14 +350,26 @@ class _ChunkWriter:
             self.dataset.id.write_direct_chunk(tuple(start if a == self.axis else 0 for a in range(len(shape))), data)
             self.checksums.append(crc32c(data, "hdf5"))
         self.held = []
+        self.store.check()
 
 
 def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
-    """Replace a node's attributes: text and numbers are written as they are, other values as JSON under `<name>:json`."""
+    """Replace a node's attributes: text and numbers are written as they are, other values as JSON under `<name>:json`.
+
+    Text has a fixed length. HDF5 would keep text of variable length in its global heaps, the only part of a file's structure that has no
+    checksum: with a few zeros there, HDF5 2.0 searches for ever.
+    """
     for name in list(node.attrs):
         del node.attrs[name]
     for name, value in attributes.items():
-        if isinstance(value, str | int | float):
+        if isinstance(value, int | float):
             node.attrs[name] = value
+        elif isinstance(value, str):
+            node.attrs.create(name, _fixed_text(value))
         else:
-            node.attrs[f"{name}:json"] = json.dumps(value)
+            node.attrs.create(f"{name}:json", _fixed_text(json.dumps(value)))
+
+
+def _fixed_text(text: str) -> NDArray[Any]:
+    h5py, data = import_extra("h5py", "hdf5"), text.encode()
+    return np.array(data, h5py.string_dtype("utf-8", max(1, len(data))))

@@ -13,7 +13,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.arrays import check_size
 from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.arrays.chunks import StoredArray, parallel, scratch
 from carlasc.storage.packed.arrays.columns import WIDE, Column, Packing, Points
@@ -97,6 +98,22 @@ class ArraySequence(PackedSequence["ArrayField"]):
             )
         super().__init__(path, location, attributes)
         self.tree = store.tree
+
+    def _check_grid(self, field: str, shape: tuple[int, ...]) -> None:
+        """Check that the chunks of a field of a grid have the shape that the grid's params.json says.
+
+        Raises:
+            FormatError: they have another one.
+        """
+        grid = self.grids.get(field.rpartition("/")[0])
+        if grid is None:  # written last, or not at all
+            check_size(shape, np.dtype("<u4"), f"{self.location}: field {field}")
+        elif shape != grid.size:
+            raise FormatError(
+                f"{self.location}: field {field}",
+                expected=f"grids of shape {grid.size}, as in params.json",
+                found=f"{shape}",
+            )
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame."""
@@ -200,20 +217,22 @@ class ArrayField:
 
     def _tasks(self, column: StoredColumn, frames: list[int]) -> list[_Task]:
         """Return the parts of a column to read, already fetched if the store is remote."""
-        tasks = column.tasks([self._position(frame) for frame in frames])
-        if not self.local:
-            with self._naming(frames):
+        positions = [self._position(frame) for frame in frames]
+        with self._naming(frames):
+            tasks = column.tasks(positions)
+            if not self.local:
                 column.fetch(tasks)
         return tasks
 
     @contextmanager
     def _naming(self, frames: list[int]) -> Iterator[None]:
-        """Add the field and the frames to the place of an error."""
-        try:
-            yield
-        except FormatError as error:
-            listed = ", ".join(map(str, frames))
-            raise error.within(f"{self.where}: field {self.packing.entry.name}, frame {listed}") from error
+        """Add the field and the frames to the place of an error; columns that do not fit each other are one too."""
+        where = f"{self.where}: field {self.packing.entry.name}, frame {', '.join(map(str, frames))}"
+        with reading(where, "the columns of a frame", "the store is damaged"):
+            try:
+                yield
+            except FormatError as error:
+                raise error.within(where) from error
 
     def _position(self, frame: int) -> int:
         if frame not in self._positions:
@@ -261,6 +280,8 @@ class StoredColumn:
         for position in positions:
             first, count = self.firsts[position], self.counts[position]
             chunks = min(count, 1) if self.is_grid else -(-count // step)
+            if not self.is_grid:
+                check_size((self.column.rows or 1, chunks, step), self.array.dtype, f"a frame of {self.array.name}")
             found.append(_Task(range(first, first + chunks), count))
         return found
 
@@ -300,6 +321,30 @@ class StoredColumn:
     def _decode_chunk(self, part: memoryview, number: int, out: NDArray[Any]) -> NDArray[Any]:
         self.array.decode(part, number, out)
         return out
+
+
+def check_frames(frames: NDArray[np.int64], where: str) -> NDArray[np.int64]:
+    """Return the numbers of frames if they rise from 0 or more.
+
+    Raises:
+        FormatError: they do not, or are not a row of numbers.
+    """
+    if frames.ndim != 1 or (np.diff(frames, prepend=-1) <= 0).any():
+        raise FormatError(where, expected="rising numbers of frames", found="others", advice="the store is damaged")
+    return frames
+
+
+def check_attributes(attributes: Mapping[str, Any], where: str) -> None:
+    """Check what the attributes of a field say of its values.
+
+    Raises:
+        FormatError: the step of its coordinates is not a length.
+    """
+    scale = attributes.get("scale_m")
+    if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
+        raise FormatError(
+            where, expected="a step of coordinates above 0, up to 1 m", found=repr(scale), advice="the store is damaged"
+        )
 
 
 def _empty(column: Column) -> NDArray[Any]:

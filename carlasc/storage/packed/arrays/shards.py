@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.packed.arrays.zarr_metadata import encoding_of
@@ -36,13 +36,17 @@ class ZarrArray(StoredArray):
         Raises:
             FormatError: its codecs or its chunks are not those that carlasc writes.
         """
-        where = tree.where(node)
-        try:
-            shape, dtype = tuple(metadata["shape"]), np.dtype(metadata["data_type"]).newbyteorder("<")
-            outer = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+        with reading(tree.where(node), "the codecs and chunks that carlasc writes"):
+            shape, dtype = _numbers(metadata["shape"], 0), np.dtype(metadata["data_type"]).newbyteorder("<")
+            if dtype.kind not in "uif":
+                raise ValueError(f"elements of {dtype.name}")
+            outer = _numbers(metadata["chunk_grid"]["configuration"]["chunk_shape"], 1)
             codecs, chunk = metadata["codecs"], outer
             if sharded := codecs[0]["name"] == "sharding_indexed":
-                chunk, codecs = tuple(codecs[0]["configuration"]["chunk_shape"]), codecs[0]["configuration"]["codecs"]
+                chunk = _numbers(codecs[0]["configuration"]["chunk_shape"], 1)
+                codecs = codecs[0]["configuration"]["codecs"]
+            if not len(shape) == len(outer) == len(chunk) > 0:
+                raise ValueError(f"shape {shape}, chunks {outer} of {chunk}")
             encoding = encoding_of(codecs)
             axis = next(
                 (axis for axis in range(len(shape)) if chunk[axis] < outer[axis] or outer[axis] < shape[axis]),
@@ -51,12 +55,8 @@ class ZarrArray(StoredArray):
                 else len(shape) - 1,  # of a single chunk: a grid's frames, or the elements of a column
             )
             found = cls(tree, node, dtype, shape, chunk, axis, encoding, metadata.get("attributes", {}))
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise FormatError(
-                where, expected="the codecs and chunks that carlasc writes", found=f"others ({error})"
-            ) from error
-        found.per_shard = outer[axis] // chunk[axis] if sharded else None
-        found._index_first = sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
+            found.per_shard = outer[axis] // chunk[axis] if sharded else None
+            found._index_first = sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
         found._indices = {}
         return found
 
@@ -118,22 +118,27 @@ class ZarrArray(StoredArray):
         files = [self.file(shard) for shard in missing]
         found = self.tree.read_ranges([(file, start, end) for file in files])
         for shard, file, data in zip(missing, files, found, strict=True):
-            self._indices[shard] = ShardIndex(memoryview(data), f"the index of {file}")
+            self._indices[shard] = ShardIndex(memoryview(data), self.per_shard or 1, f"the index of {file}")
 
 
 class ShardIndex:
     """Where the chunks of a shard are in its file. Only those that exist take memory."""
 
-    def __init__(self, data: memoryview, what: str) -> None:
+    def __init__(self, data: memoryview, per_shard: int, what: str) -> None:
         """Read an index.
 
         Args:
             data: the bytes of the index, with its checksum.
+            per_shard: number of chunks that the shard has room for.
             what: its name in errors.
 
         Raises:
-            FormatError: the checksum does not match.
+            FormatError: it is cut short, or the checksum does not match.
         """
+        if len(data) != index_bytes(per_shard):
+            raise FormatError(
+                what, expected=f"{index_bytes(per_shard)} bytes", found=str(len(data)), advice="the store is damaged"
+            )
         table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
         slots = np.flatnonzero(table[:, 0] != _ABSENT)
         self.slots = array("q", slots.astype("=i8").tobytes())  # looking up one number is faster than in NumPy's arrays
@@ -175,9 +180,11 @@ def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int
         FormatError: the index is damaged.
     """
     view = memoryview(data)
-    index = ShardIndex(view[: index_bytes(per_shard)], what)
-    found = {slot: index.place(slot) for slot in index.slots}
-    return {slot: view[place[0] : place[1]] for slot, place in found.items() if place is not None}
+    index = ShardIndex(view[: index_bytes(per_shard)], per_shard, what)
+    found = {slot: place for slot in index.slots if (place := index.place(slot)) is not None}
+    if any(end > len(view) for _, end in found.values()):
+        raise FormatError(what, expected="chunks inside the file", found="others", advice="the store is damaged")
+    return {slot: view[start:end] for slot, (start, end) in found.items()}
 
 
 def index_bytes(per_shard: int) -> int:
@@ -196,6 +203,17 @@ def without_checksum(data: memoryview, what: str) -> memoryview:
             what, problem="the checksum does not match", advice="the store is corrupted: fetch or pack it again"
         )
     return data[:-_CHECKSUM]
+
+
+def _numbers(values: Any, least: int) -> tuple[int, ...]:
+    """Return a list of whole numbers from JSON.
+
+    Raises:
+        ValueError: it is something else, or a number is below `least`, or does not fit into an int64.
+    """
+    if not isinstance(values, list) or not all(type(value) is int and least <= value < 2**63 for value in values):
+        raise ValueError(f"{values!r} for a shape")
+    return tuple(values)
 
 
 def _with_checksum(data: bytes) -> bytes:

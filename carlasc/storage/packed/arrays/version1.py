@@ -15,6 +15,8 @@ from carlasc.storage.packed.arrays.reading import (
     ArraySequence,
     ArrayStore,
     StoredColumn,
+    check_attributes,
+    check_frames,
     document_node,
     field_node,
 )
@@ -36,18 +38,23 @@ class OffsetsSequence(ArraySequence):
             raise FormatError(
                 where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
             )
+        check_attributes(attributes, where)
         packing = packing_of(layout.field_named(field), attributes=attributes)
         if attributes.get("kind") != packing.kind:
             raise FormatError(where, expected=f"a field of kind {packing.kind}", found=repr(attributes.get("kind")))
-        frames = self.store.read_small(f"{node}/frames").astype(np.int64)
+        frames = check_frames(self.store.read_small(f"{node}/frames").astype(np.int64), where)
 
         def open_columns() -> dict[str, StoredColumn]:
             nodes = {column: f"{node}/{column.name}" for column in packing.columns}
-            return {
+            found = {
                 column.name: _open_column(self.store, path, column, len(frames), packing.kind == "grid")
                 for column, path in nodes.items()
                 if self.store.attributes(path) is not None
             }
+            if packing.kind == "grid":
+                for stored in found.values():
+                    self._check_grid(field, stored.array.chunk[1:])
+            return found
 
         return ArrayField(where, packing, frames, open_columns, self.store.local)
 
@@ -56,6 +63,14 @@ def _open_column(store: ArrayStore, node: str, column: Column, frames: int, is_g
     """Read where each frame starts and ends in a column."""
     array = store.array(node)
     step = array.step
+    rest = tuple(n for axis, n in enumerate(array.chunk) if axis != array.axis)
+    if array.axis != (0 if is_grid else len(rest)) or not (is_grid or rest == ((column.rows,) if column.rows else ())):
+        raise FormatError(
+            f"{store.location}/{node}",
+            expected=f"{'one frame' if is_grid else f'{column.rows or 1} rows'} in each chunk",
+            found=f"chunks of shape {array.chunk}",
+            advice="the store is damaged",
+        )
     if is_grid:
         spans = np.stack([np.arange(frames), np.arange(frames) + 1], axis=1)
     else:

@@ -128,6 +128,10 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         raise _missing(result)
     about, replaces = root_of(root)
     sequences = dict(sorted(sequences.items()))
+    if (
+        root.get("complete") is True
+    ):  # a store that is brought up to date cannot be opened while its tables and its root disagree
+        target.put(METADATA, to_json(group_metadata(root | {"complete": False})))
     target.put_many(nodes.files | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()})
     all_nodes = dict(sorted(nodes.metadata.items()))
     target.put(METADATA, to_json(group_metadata(about | {"sequences": sequences}, all_nodes)))

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.arrays.fields import FieldLayout, open_field
@@ -24,6 +24,7 @@ from carlasc.storage.packed.arrays.reading import (
     ArraySequence,
     ArraySource,
     ArrayStore,
+    check_frames,
     document_node,
     field_node,
 )
@@ -50,7 +51,7 @@ class ZarrSource(ArraySource):
             import_extra(module, "zarr")
         super().__init__(ZarrStore(tree))
         self.block = (self.store.attributes("") or {}).get("block", 1)
-        if not isinstance(self.block, int) or self.block < 1:
+        if type(self.block) is not int or not 0 < self.block < 2**31:
             raise FormatError(
                 tree.location,
                 expected="a number of frames in block",
@@ -96,13 +97,16 @@ class ZarrStore(ArrayStore):
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""
         metadata = self._metadata(node)
-        return None if metadata is None else metadata.get("attributes", {})
+        if metadata is None:
+            return None
+        return _mapping(metadata.get("attributes", {}), f"{self.location}/{node}", "attributes")
 
     def read_small(self, node: str) -> NDArray[Any]:
         """Return an array of one chunk."""
         array = self.array(node)
         if 0 in array.shape:
-            return np.empty(array.shape, array.dtype)
+            with reading(f"{self.location}/{node}", "the shape of an array"):
+                return np.empty(array.shape, array.dtype)
         try:
             return array.read_chunk(0)[tuple(slice(n) for n in array.shape)]
         except FormatError as error:
@@ -133,12 +137,22 @@ class ZarrStore(ArrayStore):
             return self._root
         consolidated = self._root.get("consolidated_metadata")
         if consolidated:
-            return consolidated["metadata"].get(node)
+            where = self.tree.where(METADATA)
+            nodes = _mapping(_mapping(consolidated, where, "consolidated_metadata").get("metadata"), where, "metadata")
+            return None if node not in nodes else _mapping(nodes[node], f"{self.location}/{node}", "metadata")
         path = f"{node}/{METADATA}"
         return parse_json(bytes(self.tree.read(path)), self.tree.where(path)) if self.tree.is_file(path) else None
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key not in ("_root", "_sizes")}
+
+
+def _mapping(value: Any, where: str, name: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise FormatError(
+            where, expected=f"an object in {name}", found=type(value).__name__, advice="the store is damaged"
+        )
+    return value
 
 
 class ZarrSequence(ArraySequence):
@@ -183,10 +197,11 @@ class ZarrSequence(ArraySequence):
 
     def _read_counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
         where = f"{self.location}/counts"
-        frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
+        frames = check_frames(self.store.read_small(f"{self.group}/frames").astype(np.int64), where)
         counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
-        columns = list((self.store.attributes(f"{self.group}/counts") or {}).get("columns") or ())
-        if counts.shape != (len(frames), len(columns)) or (np.diff(frames, prepend=-1) <= 0).any():
+        columns = (self.store.attributes(f"{self.group}/counts") or {}).get("columns")
+        columns = columns if isinstance(columns, list) else []
+        if counts.shape != (len(frames), len(columns)) or not all(isinstance(name, str) for name in columns):
             raise FormatError(
                 where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, of rising frames", found="others",
                 advice="the store is damaged",
@@ -213,6 +228,8 @@ class ZarrSequence(ArraySequence):
         where = f"{self.store.location}/{node}"
         block = (self.store.attributes("") or {}).get("block", 1)
         found = FieldLayout.read(where, field, self.store.attributes(node), block)
+        if found.is_grid:
+            self._check_grid(field, tuple(found.attributes["shape"]))
         frames, counts = self._counts
         own = {name: counts[place] for name in found.columns if (place := f"{field_node(field)}/{name}") in counts}
         return open_field(

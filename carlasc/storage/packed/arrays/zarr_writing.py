@@ -30,7 +30,7 @@ from carlasc.storage.protocol import identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.targets import LocalTarget, Target
 
-_PUTS = 16  # objects that are written side by side to an object store
+_PUTS = 16  # objects that are written side by side
 _CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
 _PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
 _T = TypeVar("_T")
@@ -262,13 +262,9 @@ class ZarrWriter(SequenceWriter):
         fields[last].put_table(block, encoded[last])
 
     def _each(self, function: Callable[[_T], None], items: list[_T]) -> None:
-        """Call a function with several items: side by side where it waits for an object store."""
-        if isinstance(self.target, LocalTarget):
-            for item in items:
-                function(item)
-        else:
-            with ThreadPoolExecutor(_PUTS) as pool:
-                list(pool.map(function, items))
+        """Call a function with several items side by side, as it waits for an object store or for a disk."""
+        with ThreadPoolExecutor(_PUTS) as pool:
+            list(pool.map(function, items))
 
     def _flush(self) -> None:
         held, self._held = self._held, {}

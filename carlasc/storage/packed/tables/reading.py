@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import itertools
+import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -13,16 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
+from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.output import TABLES_MARK
 from carlasc.storage.packed.protocol import PackedSequence, PackedSource
 from carlasc.storage.packed.tables.columns import table_field
+from carlasc.storage.packed.tables.footers import check_footer
 from carlasc.storage.protocol import Sequence
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
+FOOTERS = "footers"  # its key with the checksums of the footers of the tables, which older stores do not have
 FRAMES = "frames.parquet"  # one row per frame
 DOCUMENTS = "documents.parquet"  # one row per text file
 
@@ -66,22 +70,47 @@ class ParquetSequence(PackedSequence["_Table"]):
         self.tree = tree
         self.folder = folder
         where = f"{folder}/{SEQUENCE}"
-        super().__init__(path, tree.where(folder), parse_json(bytes(tree.read(where)), tree.where(where)))
+        about = parse_json(bytes(tree.read(where)), tree.where(where))
+        super().__init__(path, tree.where(folder), about)
+        self._footers = about.get(FOOTERS)
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one row group."""
         table = self._field(field)
         per_voxel = layout.field_named(field).per == "voxel"
-        return table.read(frame, self.grids[field.rpartition("/")[0]].size if per_voxel else None)
+        grid = field.rpartition("/")[0]
+        if per_voxel and grid not in self.grids:
+            where = f"{self.location}/{layout.params_file(grid)}"
+            raise FormatError(where, expected="the geometry of the grid", found="none", advice="the store is damaged")
+        return table.read(frame, self.grids[grid].size if per_voxel else None)
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
         self._check_document(name)
-        with opened(self.tree, f"{self.folder}/{DOCUMENTS}") as file:
-            rows = file.read(use_threads=False).to_pylist()
-        return next(row["data"] for row in rows if row["name"] == name)
+        path = f"{self.folder}/{DOCUMENTS}"
+        self._check_footer(DOCUMENTS)
+        with opened(self.tree, path) as file:
+            for column in (
+                g.column(k)
+                for g in map(file.metadata.row_group, range(file.metadata.num_row_groups))
+                for k in range(g.num_columns)
+            ):
+                check_ratio(column.total_uncompressed_size, column.total_compressed_size, self.tree.where(path))
+            rows = file.read(["name", "data"], use_threads=False).to_pylist()
+            data = next((row["data"] for row in rows if row["name"] == name), None)
+        if not isinstance(data, bytes):
+            raise FormatError(
+                self.tree.where(path), expected=f"the text file {name}", found="none", advice="the store is damaged"
+            )
+        return data
+
+    def _check_footer(self, name: str) -> None:
+        if self._footers is not None:
+            found = self._footers.get(name) if isinstance(self._footers, dict) else None
+            check_footer(self.tree, f"{self.folder}/{name}", found)
 
     def _open_field(self, field: str) -> _Table:
+        self._check_footer(f"{field}.parquet")
         return _Table(self.tree, f"{self.folder}/{field}.parquet", field)
 
 
@@ -95,42 +124,69 @@ class _Table:
         self.where = tree.where(path)
         with opened(tree, path) as file:
             self._metadata = file.metadata
-            about = json.loads(file.metadata.metadata[b"carlasc"])
+            about = parse_json(file.metadata.metadata[b"carlasc"], self.where)
+            self._types = table_field(field).columns(check_attributes(about, self.where))
+            _check_types(file.schema_arrow, self._types, self.where)
         self.attributes = about
-        self.frames = np.array(about["frames"], np.int64)
-        groups = np.cumsum(np.array(about["rows"], np.int64) > 0) - 1  # an empty frame has none
-        self._groups = dict(zip(about["frames"], zip(groups.tolist(), about["rows"], strict=True), strict=True))
+        frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
+        if not frames or len(frames) != len(rows) or not _rise(frames):
+            raise FormatError(
+                self.where,
+                expected="rising frames, and the number of rows of each",
+                found="others",
+                advice="the store is damaged",
+            )
+        self.frames = np.array(frames, np.int64)
+        groups = np.cumsum(np.array(rows, np.int64) > 0) - 1  # an empty frame has none
+        self._groups = dict(zip(frames, zip(groups.tolist(), rows, strict=True), strict=True))
 
     def read(self, frame: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
         if frame not in self._groups:
             raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
-        group, rows = self._groups[frame]
-        kind = table_field(self.field)
-        columns = {
-            name: np.empty(0, dtype if dtype != "binary" else "u1")
-            for name, dtype in kind.columns(self.attributes).items()
-        }
+        rows = self._groups[frame][1]
+        where = f"{self.where}: field {self.field}, frame {frame}"
+        most = None if shape is None else math.prod(shape)
+        if most is not None and rows != most:
+            raise FormatError(where, expected=f"{most} voxels", found=str(rows))
         if rows:
-            try:
-                with opened(self.tree, self.path, self._metadata) as file:
-                    table = file.read_row_group(group, columns=list(columns), use_threads=False)
-            except FormatError as error:
-                raise error.within(f"field {self.field}, frame {frame}") from error
-            if table.num_rows != rows:
+            columns = self._read_group(frame, most is None)
+        else:
+            columns = {name: np.empty(0, "u1" if type_ == "binary" else type_) for name, type_ in self._types.items()}
+        with reading(where, "values of the field", "the store is damaged"):
+            array = table_field(self.field).join(columns, self.attributes)
+            return array if shape is None else array.reshape(shape)
+
+    def _read_group(self, frame: int, bounded: bool) -> dict[str, NDArray[Any]]:
+        """Return the columns of a frame. Its numbers of rows and bytes are compared with the footer before they are unpacked.
+
+        `bounded` says that nothing but the size of the largest scan bounds them.
+        """
+        (group, rows), where = self._groups[frame], f"{self.where}: field {self.field}, frame {frame}"
+        with reading(where, "the rows of a frame", "is it truncated or corrupted?"):
+            about = self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
+            if about is None or about.num_rows != rows:
+                found = "none" if about is None else str(about.num_rows)
+                raise FormatError(where, expected=f"{rows} rows", found=found)
+            if bounded:
+                for type_ in self._types.values():
+                    check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)
+            for column in map(about.column, range(about.num_columns)):
+                if column.path_in_schema in self._types:
+                    check_ratio(column.total_uncompressed_size, column.total_compressed_size, where)
+        try:
+            with opened(self.tree, self.path, self._metadata) as file:
+                table = file.read_row_group(group, columns=list(self._types), use_threads=False)
+                columns = {name: _to_numpy(table[name]) for name in self._types}
+        except FormatError as error:
+            raise error.within(f"field {self.field}, frame {frame}") from error
+        for name, column in columns.items():
+            if len(column) != rows or column.dtype != (object if self._types[name] == "binary" else self._types[name]):
                 raise FormatError(
-                    f"{self.where}: field {self.field}, frame {frame}",
-                    expected=f"{rows} rows",
-                    found=str(table.num_rows),
+                    where,
+                    expected=f"{rows} values of {self._types[name]} in {name}",
+                    found=f"{len(column)} of {column.dtype}",
                 )
-            columns = {name: _to_numpy(table[name]) for name in columns}
-        array = kind.join(columns, self.attributes)
-        if shape is not None and array.size != int(np.prod(shape)):
-            raise FormatError(
-                f"{self.where}: field {self.field}, frame {frame}",
-                expected=f"{np.prod(shape)} voxels",
-                found=str(array.size),
-            )
-        return array if shape is None else array.reshape(shape)
+        return columns
 
 
 @contextmanager
@@ -144,18 +200,53 @@ def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
     where = tree.where(path)
     try:
         place = tree.open(path) if isinstance(tree, RemoteTree) else where
-        with parquet.ParquetFile(place, metadata=metadata, page_checksum_verification=True) as file:
+        with (
+            reading(where, "a Parquet file", "is it truncated or corrupted?"),
+            parquet.ParquetFile(place, metadata=metadata, page_checksum_verification=True) as file,
+        ):
             yield file
-    except FileNotFoundError as error:
-        raise FormatError(
-            where, expected="the table that the sequence lists", found="none", advice="the store is damaged"
-        ) from error
-    except FormatError:
+    except FormatError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            raise FormatError(
+                where, expected="the table that the sequence lists", found="none", advice="the store is damaged"
+            ) from error
         raise
-    except (OSError, ValueError) as error:  # pyarrow's errors are subclasses of these
+
+
+def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
+    """Return what the footer of a table says of its values.
+
+    Raises:
+        FormatError: it does not say it, or the step of coordinates is not a length, or labels do not have one or two bytes.
+    """
+    scale, label_bytes = about.get("scale_m"), about.get("label_bytes", 1)
+    if ("scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)) or label_bytes not in (1, 2):
         raise FormatError(
-            where, problem=f"cannot be read as Parquet: {error}", advice="is it truncated or corrupted?"
-        ) from error
+            where,
+            expected="a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
+            found=f"{scale!r} and {label_bytes!r}",
+            advice="the store is damaged",
+        )
+    return {**about, "label_bytes": label_bytes}
+
+
+def _check_types(schema: Any, types: Mapping[str, str], where: str) -> None:
+    found = {name: str(schema.field(name).type) if name in schema.names else "nothing" for name in types}
+    # pyarrow calls float32 "float" and float64 "double"
+    short = {"float32": "float", "float64": "double", "float16": "halffloat"}
+    for name, type_ in types.items():
+        if found[name] != short.get(type_, type_):
+            raise FormatError(where, expected=f"{type_} in {name}", found=found[name], advice="the store is damaged")
+
+
+def _counts(values: object) -> list[int]:
+    """Return a list of numbers from JSON; an empty one where it is something else."""
+    right = isinstance(values, list) and all(type(value) is int and 0 <= value < 2**48 for value in values)
+    return values if right else []  # type: ignore[return-value]
+
+
+def _rise(values: list[int]) -> bool:
+    return all(one < other for one, other in itertools.pairwise(values))
 
 
 def _to_numpy(column: Any) -> NDArray[Any]:

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.files import to_json, write_atomic
+from carlasc.storage.durability import sync_tree
+from carlasc.storage.files import parse_json, remove_stale, to_json, write_atomic
 from carlasc.storage.packed.output import (
     TABLES_MARK,
     UNFINISHED_MARK,
+    PatientFile,
     put_in_place,
     refuse_existing,
     remove,
@@ -31,7 +33,8 @@ from carlasc.storage.packed.protocol import (
     node_of,
 )
 from carlasc.storage.packed.tables.columns import statistics, table_field
-from carlasc.storage.packed.tables.reading import DOCUMENTS, FRAMES, SEQUENCE
+from carlasc.storage.packed.tables.footers import footer_checksums
+from carlasc.storage.packed.tables.reading import DOCUMENTS, FOOTERS, FRAMES, SEQUENCE
 
 _LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
 _PAGE = 8 << 20  # bytes: one page holds a scan's column
@@ -63,9 +66,11 @@ class ParquetSink(PackedSink):
         if not (self._part / UNFINISHED_MARK).is_file() or (self._part / UNFINISHED_MARK).read_bytes() != run:
             remove(self._part)
             write_atomic(self._part / UNFINISHED_MARK, run)
+        remove_stale(self._part)
         done = sorted(self._part.rglob(SEQUENCE))
         self._sequences = {
-            json.loads(file.read_bytes())["path"]: file.parent.relative_to(self._part).as_posix() for file in done
+            parse_json(file.read_bytes(), str(file))["path"]: file.parent.relative_to(self._part).as_posix()
+            for file in done
         }
 
     def finished(self, path: str) -> bool:
@@ -122,20 +127,20 @@ class ParquetWriter(PackedWriter):
             table.close()
         self._write_frames()
         self._write_documents()
-        write_atomic(self._folder / SEQUENCE, to_json(self.about()))
+        sync_tree(self._folder)  # before the mark that says so
+        write_atomic(self._folder / SEQUENCE, to_json(self.about() | {FOOTERS: footer_checksums(self._folder)}))
         self._finished[self.path] = self._name
 
     def _write_documents(self) -> None:
         """Write the table with one row per text file: its name and its bytes."""
-        pa, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
+        pa = import_extra("pyarrow", "parquet")
         columns = {"name": pa.array(list(self.contents), pa.string())}
         columns["data"] = pa.array(list(self.contents.values()), pa.binary())
-        self._folder.mkdir(parents=True, exist_ok=True)
-        parquet.write_table(pa.table(columns), self._folder / DOCUMENTS, compression="zstd", write_page_checksum=True)
+        _write_table(pa.table(columns), self._folder / DOCUMENTS)
 
     def _write_frames(self) -> None:
         """Write the table with one row per frame: pose, time, statistics."""
-        pa, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
+        pa = import_extra("pyarrow", "parquet")
         frames = sorted(self._statistics)
         columns: dict[str, Any] = {"frame": pa.array(frames, pa.int64())}
         for name, document, decode in (
@@ -147,7 +152,7 @@ class ParquetWriter(PackedWriter):
                 rows = [lines[frame if frames[-1] < len(lines) else frames.index(frame)] for frame in frames]
             except (KeyError, FormatError, IndexError):
                 continue  # no such file, or not numbers: the text is kept as it is, and its reader reports the error
-            values = np.array(rows, np.float64).reshape(len(frames), -1)
+            values = np.array(rows, np.float64).reshape(len(frames), 1 if name == "time_s" else 16)
             columns[name] = (
                 pa.array(values[:, 0])
                 if name == "time_s"
@@ -155,8 +160,14 @@ class ParquetWriter(PackedWriter):
             )
         for name in sorted({name for row in self._statistics.values() for name in row}):
             columns[name] = pa.array([self._statistics[frame].get(name) for frame in frames])
-        self._folder.mkdir(parents=True, exist_ok=True)
-        parquet.write_table(pa.table(columns), self._folder / FRAMES, compression="zstd", write_page_checksum=True)
+        _write_table(pa.table(columns), self._folder / FRAMES)
+
+
+def _write_table(table: Any, path: Path) -> None:
+    file = PatientFile(path, path)
+    import_extra("pyarrow.parquet", "parquet").write_table(table, file, compression="zstd", write_page_checksum=True)
+    file.close()
+    file.check()
 
 
 class _TableWriter(FieldWriter):
@@ -181,6 +192,7 @@ class _TableWriter(FieldWriter):
         if count:
             arrays = [pa.array(np.full(count, frame, np.int64)), *map(pa.array, columns.values())]
             self._writer.write_table(pa.table(arrays, schema=self._schema), row_group_size=count)
+            self._file.check()
         self.rows.append(count)
 
     def _start(self, pa: Any, array: NDArray[Any]) -> None:
@@ -196,9 +208,9 @@ class _TableWriter(FieldWriter):
             [("frame", pa.int64())] + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
         split = {name: "BYTE_STREAM_SPLIT" for name in types if name in self.kind.split_bytes}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = PatientFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
-            self.path, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
+            self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
             use_dictionary=[name for name in ("frame", *types) if name not in split and not is_picture], column_encoding=split or None,
             data_page_size=_PAGE, dictionary_pagesize_limit=_PAGE, write_page_checksum=True, write_statistics=["frame"],
         )  # fmt: skip
@@ -208,3 +220,5 @@ class _TableWriter(FieldWriter):
         about = self.attributes | {"frames": list(self.frames), "rows": self.rows}
         self._writer.add_key_value_metadata({"carlasc": json.dumps(about)})
         self._writer.close()
+        self._file.close()
+        self._file.check()

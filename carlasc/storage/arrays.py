@@ -1,0 +1,286 @@
+"""Arrays in .npy and .npz files, which anybody may have made.
+
+Type, shape and size of an array are in its header. They are compared with what the file must hold before any value is read, and the header
+alone is unpacked for that: a small file that claims, or unpacks to, more than it may hold costs neither memory nor time. No pickle is read.
+The format is that of `numpy.lib.format`; .npz files are zips of such files (PKWARE's APPNOTE).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, reading
+
+_LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
+_PIECE = 1 << 18  # bytes that are unpacked at a time
+_SMALL = 1 << 26  # bytes: an array of less is unpacked however well it is packed, such as one of zeros
+_MOST_RATIO = 100  # a larger one has at most so many times the bytes that it takes in the zip; Deflate reaches 1032
+_MOST_BYTES = 1 << 28  # of one frame of anything but a grid: 20 million points, more than any sensor's scan
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that NumPy writes
+_ENCRYPTED = 1  # flag
+_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+_ORDERS = ("<", ">")
+WHOLE_NUMBERS = ("?", "i1", "u1", *(f"{order}{kind}{size}" for order in _ORDERS for kind in "iu" for size in (2, 4, 8)))
+"""Types of whole numbers, for files of other programs, which choose the type themselves."""
+NUMBERS = (*WHOLE_NUMBERS, *(f"{order}f{size}" for order in _ORDERS for size in (2, 4, 8)))
+"""The same of all real numbers."""
+
+
+@dataclass(frozen=True)
+class ArrayFormat:
+    """What an array of a file must be.
+
+    Attributes:
+        dtypes: NumPy's names of the types that it may have, with the byte order.
+        shape: length of each axis; None allows any length. A shape of None allows every shape.
+        most: largest number of elements, where the format or another file says it.
+    """
+
+    dtypes: tuple[str, ...]
+    shape: tuple[int | None, ...] | None
+    most: int | None = None
+
+
+@dataclass(frozen=True)
+class _Header:
+    """The header of a .npy file, as it was checked."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    fortran_order: bool
+    start: int  # first byte of the values
+
+    @property
+    def size(self) -> int:
+        """Number of bytes of the values."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    def array(self, values: bytes | memoryview) -> NDArray[Any]:
+        """Return the array that has these bytes, in C order, without a copy where that is its order."""
+        flat = np.frombuffer(values, self.dtype, math.prod(self.shape))
+        return np.asarray(flat.reshape(self.shape, order="F" if self.fortran_order else "C"), order="C")
+
+
+def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> NDArray[Any]:
+    """Return the array of a .npy file.
+
+    Args:
+        data: the whole file.
+        expected: what it must hold.
+        where: the file, for errors.
+
+    Returns:
+        The array, in C order. It may be read-only.
+
+    Raises:
+        FormatError: the file has another type, shape or size, or is no .npy file.
+    """
+    header = _read_header(io.BytesIO(data[:_LONGEST_HEADER]), expected, where)
+    if len(data) - header.start != header.size:
+        raise FormatError(
+            where,
+            expected=f"{header.start + header.size} bytes ({_text(header.shape)} {header.dtype.name})",
+            found=str(len(data)),
+            advice="the file is cut short, or something was added",
+        )
+    return header.array(memoryview(data)[header.start :])
+
+
+def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
+    """Return the array of a .npy file on this machine. A file that is longer than its header says is not read.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: the file has another type, shape or size, cannot be read, or is no .npy file.
+    """
+    with _opened(path) as file:
+        header = _read_header(file, expected, str(path))
+        found = os.fstat(file.fileno()).st_size
+        if found != header.start + header.size:
+            raise FormatError(
+                path,
+                expected=f"{header.start + header.size} bytes ({_text(header.shape)} {header.dtype.name})",
+                found=str(found),
+                advice="the file is cut short, or something was added",
+            )
+        file.seek(header.start)
+        return header.array(file.read(header.size))
+
+
+def check_ratio(size: int, packed: int, where: str) -> None:
+    """Refuse what would unpack to far more than it takes, where nothing else says how much it may be.
+
+    Args:
+        size: bytes that it unpacks to.
+        packed: bytes that it takes.
+        where: the file, for errors.
+
+    Raises:
+        FormatError: it is larger than any array that is packed so well.
+    """
+    if size > max(_SMALL, _MOST_RATIO * packed):
+        raise FormatError(
+            where,
+            expected=f"at most {_MOST_RATIO} times the {packed} bytes that it takes",
+            found=f"{size} bytes",
+            advice="it was made to fill the memory: do not use this file",
+        )
+
+
+def check_size(shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
+    """Check that an array whose size the format does not bound is not larger than any that it is made for.
+
+    Raises:
+        FormatError: it is; names it `what`.
+    """
+    if math.prod(shape) * dtype.itemsize > _MOST_BYTES:
+        raise FormatError(
+            what,
+            expected=f"at most {_MOST_BYTES} bytes",
+            found=f"{dtype.name} of shape {_text(shape)}",
+            advice="the store is damaged, or was made to fill the memory",
+        )
+
+
+class NpzFile:
+    """The arrays of an open .npz file.
+
+    Attributes:
+        names: names of the arrays.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, where: str) -> None:
+        self._archive, self._where = archive, where
+        self._members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        self.names = tuple(self._members)
+
+    def read(self, name: str, expected: ArrayFormat) -> NDArray[Any]:
+        """Return an array, in C order.
+
+        Raises:
+            FormatError: it does not exist, has another type, shape or size, is packed in a way that NumPy does not use, or is damaged.
+        """
+        member, where = self._members.get(name), f"{self._where}: {name}"
+        if member is None:
+            raise FormatError(
+                self._where, expected=f"an array {name}", found=", ".join(self.names) or "an archive without arrays"
+            )
+        if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
+            found = "an encrypted one" if member.flag_bits & _ENCRYPTED else f"compression {member.compress_type}"
+            raise FormatError(where, expected="a stored or deflated array", found=found)
+        with reading(where, "a .npy array in a whole zip"), self._archive.open(member) as stream:
+            header = _read_header(stream, expected, where)
+            self._check_size(header, member, where)
+            return header.array(self._unpack(stream, header, where))
+
+    def _check_size(self, header: _Header, member: zipfile.ZipInfo, where: str) -> None:
+        if member.file_size != header.start + header.size:
+            raise FormatError(
+                where,
+                expected=f"{header.start + header.size} bytes ({_text(header.shape)} {header.dtype.name})",
+                found=str(member.file_size),
+                advice="the file is damaged",
+            )
+        check_ratio(header.size, member.compress_size, where)
+
+    @staticmethod
+    def _unpack(stream: IO[bytes], header: _Header, where: str) -> memoryview:
+        values = np.empty(header.size, np.uint8)
+        view, place = values.data, 0
+        while place < header.size and (part := stream.read(min(_PIECE, header.size - place))):
+            view[place : place + len(part)] = part
+            place += len(part)
+        stream.read(1)  # reaches the end, where the checksum is compared
+        if place != header.size:
+            raise FormatError(
+                where, expected=f"{header.size} bytes of values", found=str(place), advice="the file is damaged"
+            )
+        return view
+
+
+@contextmanager
+def open_npz(source: str | Path | bytes | memoryview, where: str = "") -> Iterator[NpzFile]:
+    """Open an .npz file: its path, or its bytes.
+
+    Args:
+        source: the path or the bytes.
+        where: the file, for errors; the path where that is given.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it is no zip, or damaged, or cannot be read.
+    """
+    if isinstance(source, bytes | memoryview):
+        with _archive(io.BytesIO(source), where) as archive:
+            yield archive
+    else:
+        with _opened(source) as file, _archive(file, where or str(source)) as archive:
+            yield archive
+
+
+@contextmanager
+def _archive(file: IO[bytes], where: str) -> Iterator[NpzFile]:
+    with reading(where, "an .npz file"):
+        archive = zipfile.ZipFile(file)
+        opened = NpzFile(archive, where)
+    with archive:
+        yield opened
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[IO[bytes]]:
+    try:
+        file = Path(path).open("rb")  # noqa: SIM115 (closed below: only what opening raises is caught here)
+    except FileNotFoundError as error:
+        raise MissingDataError(path, expected="a file", found="nothing") from error
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        raise FormatError(path, problem=f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    with file:
+        yield file
+
+
+def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Header:
+    """Read the header of a .npy file, and compare it with what the file must hold.
+
+    Only its text is interpreted, by NumPy, as a literal of Python of at most 10,000 characters: no code is run.
+    """
+    with reading(where, "a .npy array"):
+        version = np.lib.format.read_magic(stream)
+        if version not in _READERS:
+            raise ValueError(f"version {version} of the .npy format")
+        shape, fortran_order, dtype = _READERS[version](stream)
+        start = stream.tell()
+    # An empty array of shape (0,) is taken for one of (0, K): the authors of CarlaSC write an empty list of actors so.
+    if len(shape) == 1 and shape[0] == 0 and expected.shape is not None and len(expected.shape) == 2:
+        shape = (0, expected.shape[1] or 0)
+    if dtype not in tuple(map(np.dtype, expected.dtypes)):
+        names = list(dict.fromkeys(np.dtype(name).name for name in expected.dtypes))
+        wanted = " or ".join(names) if len(names) < 4 else "numeric"
+        raise FormatError(where, expected=f"{wanted} values", found=dtype.name)
+    fits = expected.shape is None or (
+        len(shape) == len(expected.shape)
+        and all(length in (None, found) for length, found in zip(expected.shape, shape, strict=True))
+    )
+    if not fits or min(shape, default=0) < 0:
+        raise FormatError(where, expected=f"an array of {_text(expected.shape or ())} values", found=_text(shape))
+    if math.prod(shape) * dtype.itemsize >= 2**63:
+        raise FormatError(where, expected="an array that a computer can hold", found=_text(shape))
+    if expected.most is not None and math.prod(shape) > expected.most:
+        raise FormatError(where, expected=f"at most {expected.most} values", found=_text(shape))
+    return _Header(dtype, shape, fortran_order, start)
+
+
+def _text(shape: tuple[int | None, ...]) -> str:
+    return " x ".join("N" if length is None else str(length) for length in shape) or "one value"
