@@ -1,0 +1,91 @@
+"""Whether a folder that was written with disturbances is the same as one that was written without."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+import carlasc
+from carlasc.errors import CarlascError
+from faults.commands import MESSAGES
+
+STORES = (".zarr", ".h5", ".parquet")
+Content = dict[str, bytes | None]
+"""Every path below a folder, and the bytes of each file; None for a folder or a link."""
+
+
+def content_of(folder: Path) -> Content:
+    """Return what is in a folder, without the messages of commands."""
+    found: Content = {}
+    for path in sorted(folder.rglob("*")):
+        if path.name != MESSAGES:
+            is_file = path.is_file() and not path.is_symlink()
+            found[path.relative_to(folder).as_posix()] = (
+                _without_times(path.name, path.read_bytes()) if is_file else None
+            )
+    return found
+
+
+def _without_times(name: str, data: bytes) -> bytes:
+    """Return bytes that depend on no time: the tracks that a run keeps for the next one hold a key of the times of folders."""
+    if name != "tracks.npz" or not data:
+        return data
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        arrays = {member: file[member] for member in file.files}
+    about = json.loads(arrays.pop("about").tobytes())
+    digests = {member: hashlib.sha256(array.tobytes()).hexdigest() for member, array in arrays.items()}
+    return json.dumps([about["summary"], digests]).encode()
+
+
+def differences(expected: Content, found: Content) -> list[str]:
+    """Describe how a folder differs: one line per file that is missing, too many, or has other bytes."""
+    missing = [f"{name} is missing" for name in expected if name not in found]
+    left = [f"{name} is left over" for name in found if name not in expected]
+    return missing + left + changed(expected, found)
+
+
+def changed(expected: Content, found: Content) -> list[str]:
+    """Describe the files that have other bytes than they should."""
+    return [
+        f"{name} has other bytes: {_size(found[name])} instead of {_size(content)}"
+        for name, content in expected.items()
+        if name in found and found[name] != content
+    ]
+
+
+def arrays_of(store: Path) -> dict[str, str]:
+    """Return a digest of every array that can be read from a store, by sequence, field and frame.
+
+    Raises:
+        CarlascError: it cannot be opened, or an array cannot be read.
+    """
+    return {
+        f"{path}/{field}/{frame}": hashlib.sha256(
+            np.ascontiguousarray(sequence.read(field, frame)).tobytes()
+        ).hexdigest()
+        for path, sequence in carlasc.open(store).sequences().items()
+        for field in sequence.fields()
+        for frame in sequence.frames(field).tolist()
+    }
+
+
+def wrong_arrays(store: Path, expected: dict[str, str]) -> list[str]:
+    """Describe the arrays of a store that are not those of the finished one. A store that is not finished may refuse to be opened."""
+    try:
+        source = carlasc.open(store)
+        source.sequences()
+    except CarlascError:
+        return []
+    try:
+        found = arrays_of(store)
+    except CarlascError as error:
+        return [f"the store opens, but {error}"]
+    return [f"{name} is another array" for name, digest in found.items() if expected.get(name) != digest]
+
+
+def _size(content: bytes | None) -> str:
+    return "no file" if content is None else str(len(content))
