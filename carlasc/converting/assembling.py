@@ -161,9 +161,9 @@ def _thinned(path: NDArray[np.float64], sensor: Sensor, scan_T_points: Transform
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     if length[-1] < _APART_M:
         return np.tile(_origin(sensor, scan_T_points), (len(path), 1))
-    parts = int(np.ceil(length[-1] / _APART_M))
-    part = np.minimum((length / length[-1] * parts).astype(int), parts - 1)
-    counts = np.maximum(np.bincount(part), 1)
+    parts = np.ceil(length[-1] / _APART_M)
+    _, part = np.unique(np.minimum(np.floor(length / length[-1] * parts), parts - 1), return_inverse=True)
+    counts = np.bincount(part)
     middle = np.stack([np.bincount(part, path[:, axis]) / counts for axis in range(3)], axis=1)
     return middle[part].astype(np.float32)
 

@@ -58,7 +58,7 @@ def _items(path: Path) -> list[ElementTree.Element]:
         raise FormatError(path, expected="XML in UTF-8 without entities", found=found, advice="copy the file again")
     try:
         root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # LookupError: an encoding that nobody knows
         raise FormatError(path, expected="XML", found=f"damage: {error}", advice="copy the file again") from error
     tracklets = root.find("tracklets")
     if tracklets is None:

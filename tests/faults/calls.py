@@ -133,7 +133,8 @@ def _try_call(
     same = {name: data for name, data in found.items() if not _is_temporary(name)}
     if kind == Kind.UNLINK:
         same = _without_refused(same)
-    if code == 1 and command.name in GOES_ON and Path(path).relative_to(case).parts[0] in command.inputs:
+    of_input = bool({*Path(path).relative_to(case).parts[:1]} & {*command.inputs})
+    if code == 1 and command.name in GOES_ON and of_input:
         return [f"{what}: {fault}" for fault in faults]
     finished = not differences(undisturbed.after, same)
     if code == 0 and not finished:
@@ -178,7 +179,7 @@ def _names(line: str, path: str, case: Path) -> bool:
     relative = Path(path).relative_to(case).as_posix()
     final = re.sub(r"\.([^/]+)\.[^./]+-[0-9]+\.[0-9a-f]{8}\.part$", r"\1", relative)
     names = {final, *(parent.as_posix() for parent in Path(final).parents if parent != Path())}
-    return any(name.removesuffix(".part") in line for name in names)
+    return any(name.removesuffix(".part").removesuffix(".old") in line for name in names)
 
 
 def _without_refused(content: Content) -> Content:
