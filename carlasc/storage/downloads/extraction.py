@@ -37,7 +37,8 @@ def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> 
         StorageError: the disk is full, or the folder cannot be written to.
     """
     with _opened(archive) as opened:
-        members = [member for member in opened.infolist() if not member.is_dir()]
+        with _reading(archive):  # zipfile has no answer for a member without a name
+            members = [member for member in opened.infolist() if not member.is_dir()]
         for member in members:
             check_member(member, archive)
         check_ratio(sum(member.file_size for member in members), archive.stat().st_size, str(archive))
