@@ -25,6 +25,7 @@ Velocity = tuple[float, float, float]
 _MAX_GAP = 10  # frames for which an actor may be hidden; after a longer gap a new path begins
 _MAX_SIGHTINGS = 400  # of one path
 _MAX_POINTS = 1000  # of one sighting
+_FARTHEST_M = 1e4  # no LiDAR sees so far: such numbers are damage, also infinity and NaN
 _BATCH = 32  # paths that are estimated together
 
 
@@ -57,7 +58,7 @@ def find_actors(
     if labels is None or instances is None:
         return ()
     wanted = np.flatnonzero((instances > 0) & np.isin(labels, sorted(classes.moving or classes.movable)))
-    wanted = wanted[np.isfinite(points[wanted, :3]).all(axis=1)]
+    wanted = wanted[(np.abs(points[wanted, :3]) < _FARTHEST_M).all(axis=1)]
     order = wanted[np.argsort(instances[wanted], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(instances[order])) + 1) if len(order) else []
     return tuple(

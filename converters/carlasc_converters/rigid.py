@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import poses_from
+from carlasc.core.geometry import check_rigid, poses_from
 from carlasc.errors import FormatError
 
 _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
@@ -20,7 +20,7 @@ def poses_of(quaternions: NDArray[np.floating], translations: NDArray[np.floatin
         where: the file, for errors.
 
     Raises:
-        FormatError: a quaternion does not have length 1.
+        FormatError: a quaternion does not have length 1, or a number is not finite.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= _UNIT_TOLERANCE
@@ -28,4 +28,4 @@ def poses_of(quaternions: NDArray[np.floating], translations: NDArray[np.floatin
         row = int(np.argmin(valid))
         found = f"{np.asarray(quaternions[row], np.float64).tolist()} in row {row}"
         raise FormatError(where, expected="a rotation: a quaternion w, x, y, z of length 1", found=found)
-    return poses_from(quaternions, translations)
+    return check_rigid(poses_from(quaternions, translations), where, 4 * _UNIT_TOLERANCE)
