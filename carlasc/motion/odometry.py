@@ -99,6 +99,7 @@ def follow_scans(
     config: Any = import_extra("kiss_icp.config", "kitti").KISSConfig()
     config.data.deskew = False
     config.data.max_range, config.data.min_range = max_range_m, min_range_m
+    config.registration.max_num_threads = 1  # several add in another order each time, which changes the last digits
     config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
     scans = iter(scans)
     start = list(islice(scans, _START))
