@@ -82,7 +82,7 @@ def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.
         x, y = float(points[i, 0]), float(points[i, 1])
         flat = math.sqrt(x * x + y * y)
         s = int((fast_azimuth(x, y) + math.pi) * (_SECTORS / (2 * math.pi))) % _SECTORS if flat > 0 else 0
-        r = min(int(flat / _RING_M), _RINGS - 1)
+        r = int(min(flat / _RING_M, _RINGS - 1.0))  # in this order: a far point's ring may be no int
         sector[i], ring[i] = s, r
         if flat > _BLIND_M and (lowest[s, r] < 0 or points[i, 2] < points[lowest[s, r], 2]):
             lowest[s, r] = i
