@@ -20,7 +20,7 @@ _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
 # that turn the direction of writing (Unicode's Bidi_Control), ends of lines and of paragraphs, and halves of characters, which no
 # terminal can show: Python uses them for bytes of file names that are not UTF-8.
 _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_LONGEST = 600  # characters of a part of a message; other libraries put whole headers into theirs
+_LONGEST = 400  # characters of a part of a message; other libraries put whole headers into theirs
 _QUERY = re.compile(r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*")  # a signature or a token
 
 

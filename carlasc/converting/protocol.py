@@ -30,6 +30,8 @@ from carlasc.errors import ArgumentError, FormatError
 
 Split = Literal["Train", "Val", "Test"]
 
+_LATEST_S = 1e11  # no clock in seconds says so; milliseconds since 1970 are more
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -105,6 +107,27 @@ class VoxelContent:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
+def check_seconds(seconds: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """Return times, (N,), after checking that they can be seconds: finite, and no count of milliseconds or nanoseconds since 1970.
+
+    Args:
+        seconds: the times.
+        where: what the error is about.
+
+    Raises:
+        FormatError: a time is not finite, or too large.
+    """
+    wrong = np.flatnonzero(~(np.abs(seconds) < _LATEST_S))
+    if len(wrong):
+        raise FormatError(
+            where,
+            expected=f"times in seconds, below {_LATEST_S:.0e}",
+            found=f"{seconds[wrong[0]]:g} at row {wrong[0]}",
+            advice="convert milliseconds or nanoseconds to seconds, or copy the file of times again",
+        )
+    return seconds
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Where the vehicle was.
@@ -114,7 +137,7 @@ class Trajectory:
         seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose i is that of frame i.
 
     Raises:
-        FormatError: shapes do not match, a pose is not rigid, or times do not increase.
+        FormatError: shapes do not match, a pose is not rigid, times do not increase, or one is no number of seconds.
     """
 
     world_T_vehicle: NDArray[np.float64]
@@ -129,6 +152,8 @@ class Trajectory:
         if self.seconds is not None and not (np.diff(self.seconds) > 0).all():
             row = int(np.argmin(np.diff(self.seconds))) + 1
             raise FormatError("poses", expected="times that increase", found=f"none at pose {row}")
+        if self.seconds is not None:
+            check_seconds(self.seconds, "poses")
 
     def at(self, seconds: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return (..., 4, 4) world_T_vehicle at some times (...,), by the clock of `seconds`, which must be known.

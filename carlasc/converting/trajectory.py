@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, assemble
-from carlasc.converting.protocol import Converter, Recording, Trajectory
+from carlasc.converting.protocol import Converter, Recording, Trajectory, check_seconds
 from carlasc.core.geometry import relative_to
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
@@ -31,7 +31,7 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
     """Return (F,) seconds by frame number, by the recording's own clock, from the times that it gives; 10 Hz from 0 if it gives none.
 
     Raises:
-        FormatError: a frame has no time.
+        FormatError: a frame has no time, or a time is no number of seconds.
     """
     frames = recording.frames[-1].number + 1
     if times is None:
@@ -43,7 +43,7 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
             found=f"{len(times)} times",
             advice="copy the file of times again",
         )
-    return np.asarray(times[:frames], np.float64)
+    return check_seconds(np.asarray(times[:frames], np.float64), recording.location)
 
 
 def read_trajectory(
@@ -55,7 +55,7 @@ def read_trajectory(
 
     Raises:
         MissingDataError: the file of poses does not exist, and they are not to be estimated.
-        FormatError: a frame has no pose.
+        FormatError: a frame has no pose, or there is one pose for all of them.
     """
     trajectory = None if pose_source == KISS_ICP else recording.poses(force=force)
     if trajectory is None:
@@ -74,6 +74,13 @@ def read_trajectory(
                 advice=f"copy it again, or {_ESTIMATE}",
             )
         return at_frames(trajectory.world_T_vehicle[: last + 1], times)
+    if len(trajectory.seconds) == 1 < len(recording.frames):
+        raise FormatError(
+            recording.location,
+            expected=f"poses over the time of {len(recording.frames)} scans",
+            found="one pose",
+            advice=f"copy the file of poses again, or {_ESTIMATE}",
+        )
     return trajectory
 
 
@@ -88,7 +95,7 @@ def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.f
     """Return (F, 4, 4) first_T_scan by frame number. Poses of the frames are taken as they are, others are interpolated."""
     given = trajectory.world_T_vehicle
     same = trajectory.seconds is not None and np.array_equal(trajectory.seconds, times)
-    poses = (given if same or len(given) == 1 else trajectory.at(times)) @ recording.vehicle_T_scan
+    poses = (given if same else trajectory.at(times)) @ recording.vehicle_T_scan
     return relative_to(poses[0], poses)
 
 

@@ -15,6 +15,8 @@ Floating = TypeVar("Floating", bound=np.floating[Any])
 Transform = NDArray[np.float64]
 """(4, 4) float64, last row 0 0 0 1."""
 
+_FARTHEST_M = 1e9  # no place on Earth is so far from the origin of any map
+
 
 def rotation_z(yaw_rad: float) -> Transform:
     """Return the (4, 4) rotation by `yaw_rad` about z. A positive angle turns x towards y."""
@@ -164,7 +166,7 @@ def inverse_of(transform: Transform) -> Transform:
 
 
 def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 1e-3) -> NDArray[np.float64]:
-    """Check that transforms are finite, rigid and proper.
+    """Check that transforms are finite, rigid and proper, and that their positions can be places on Earth.
 
     Args:
         transforms: (4, 4) or (F, 4, 4).
@@ -186,6 +188,10 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
         where = name if poses.ndim == 2 else f"{name}: transform {index}"
         if not np.isfinite(pose).all():
             raise FormatError(where, expected="finite numbers", found="NaN or infinity")
+        if np.abs(pose[:3, 3]).max() > _FARTHEST_M:
+            raise FormatError(
+                where, expected=f"a position within {_FARTHEST_M:.0e} m", found=f"{np.abs(pose[:3, 3]).max():g} m"
+            )
         rotation = pose[:3, :3]
         deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max())
         if deviation > tolerance:
@@ -204,7 +210,7 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
 
 def _are_rigid(poses: NDArray[np.float64], tolerance: float) -> bool:
     """Return whether all of (F, 4, 4) transforms are finite, rigid and proper."""
-    if not np.isfinite(poses).all():
+    if not np.isfinite(poses).all() or np.abs(poses[:, :3, 3]).max(initial=0.0) > _FARTHEST_M:
         return False
     rotations = poses[:, :3, :3]
     deviation = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0)

@@ -180,6 +180,22 @@ def test_times_are_those_of_the_recording_or_a_tenth_of_a_second_apart():
         times_of(recording_of(poses, np.array([3.0])))
 
 
+@pytest.mark.parametrize("wrong", [1.7e18, -1e308, np.inf, np.nan])
+def test_times_that_are_no_seconds_are_refused(wrong):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    with pytest.raises(FormatError, match=r"memory: expected times in seconds, below 1e\+11, found .* at row 1"):
+        times_of(recording_of(poses, np.array([0.0, wrong])))
+    with pytest.raises(FormatError, match="poses: expected times"):
+        Trajectory(poses, np.array([0.0, abs(wrong)]))
+
+
+def test_one_pose_with_a_time_is_not_that_of_many_scans():
+    recording = recording_of(None)
+    recording.poses = lambda *, force=False: Trajectory(np.eye(4)[None], np.array([0.0]))
+    with pytest.raises(FormatError, match="memory: expected poses over the time of 2 scans, found one pose: copy"):
+        read_trajectory(recording, times_of(recording), "auto", force=False)
+
+
 def test_poses_at_their_own_times_are_interpolated():
     recording = recording_of(None)
     turning = np.stack([rotation_z(0.0), translation((2, 0, 0)) @ rotation_z(0.4)])

@@ -47,6 +47,7 @@ def test_poses_are_relative_to_the_first():
     ("spoil", "message"),
     [
         (lambda t: t.__setitem__((0, 3), np.nan), "NaN or infinity"),
+        (lambda t: t.__setitem__((1, 3), -1e12), "expected a position within 1e\\+09 m, found 1e\\+12 m"),
         (lambda t: t.__imul__(2), "rigid transform"),
         (lambda t: t.__setitem__((3, 0), 1), "rigid transform"),
         (lambda t: t.__setitem__((slice(None), 1), -t[:, 1]), "reflection"),
