@@ -135,6 +135,7 @@ class Trajectory:
     Attributes:
         world_T_vehicle: (K, 4, 4) float64, right-handed.
         seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose i is that of frame i.
+        where: what errors name: the file that the poses come from.
 
     Raises:
         FormatError: shapes do not match, a pose is not rigid, times do not increase, or one is no number of seconds.
@@ -142,18 +143,21 @@ class Trajectory:
 
     world_T_vehicle: NDArray[np.float64]
     seconds: NDArray[np.float64] | None = None
+    where: str = "poses"
 
     def __post_init__(self) -> None:
-        check_rigid(self.world_T_vehicle, "poses")
+        check_rigid(self.world_T_vehicle, self.where)
         if self.seconds is not None and len(self.seconds) != len(self.world_T_vehicle):
             raise FormatError(
-                "poses", expected=f"a time for each of {len(self.world_T_vehicle)}", found=f"{len(self.seconds)} times"
+                self.where,
+                expected=f"a time for each of {len(self.world_T_vehicle)}",
+                found=f"{len(self.seconds)} times",
             )
         if self.seconds is not None and not (np.diff(self.seconds) > 0).all():
             row = int(np.argmin(np.diff(self.seconds))) + 1
-            raise FormatError("poses", expected="times that increase", found=f"none at pose {row}")
+            raise FormatError(self.where, expected="times that increase", found=f"none at pose {row}")
         if self.seconds is not None:
-            check_seconds(self.seconds, "poses")
+            check_seconds(self.seconds, self.where)
 
     def at(self, seconds: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return (..., 4, 4) world_T_vehicle at some times (...,), by the clock of `seconds`, which must be known.

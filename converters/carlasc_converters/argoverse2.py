@@ -146,10 +146,7 @@ class Argoverse2Log(Recording):
             return None
         table = read_columns(self._poses, ("timestamp_ns", *_QUATERNION, *_TRANSLATION))
         poses = poses_of(_stack(table, _QUATERNION), _stack(table, _TRANSLATION), str(self._poses))
-        try:
-            return Trajectory(poses, self._seconds(table["timestamp_ns"]))
-        except FormatError as error:
-            raise error.within(self._poses) from error
+        return Trajectory(poses, self._seconds(table["timestamp_ns"]), str(self._poses))
 
     def times(self) -> NDArray[np.float64]:
         """Return seconds after the first frame."""

@@ -145,10 +145,7 @@ class CarlaOccRecording(Recording):
         if missing := sorted({frame.number for frame in self.frames} - set(rows[:, 0].astype(int).tolist())):
             raise FormatError(path, expected=f"a pose for frame {missing[0]}", found=f"none for {len(missing)} frames")
         poses = check_rigid(rows[:, 1:].reshape(-1, 4, 4), str(path))
-        try:
-            return Trajectory(poses, rows[:, 0] * _PERIOD_S)
-        except FormatError as error:
-            raise error.within(path) from error
+        return Trajectory(poses, rows[:, 0] * _PERIOD_S, str(path))
 
     def times(self) -> NDArray[np.float64]:
         """Return the times of a simulation with ten frames per second."""

@@ -88,7 +88,8 @@ class KittiRecording(Recording):
             return None
         camera_poses = layout.decode_poses(read_bytes(path), str(path))
         camera_T_lidar = self._calibration(path, force=force)
-        return Trajectory(multiply(inverse_of(camera_T_lidar), check_rigid(camera_poses, str(path)), camera_T_lidar))
+        poses = multiply(inverse_of(camera_T_lidar), check_rigid(camera_poses, str(path)), camera_T_lidar)
+        return Trajectory(poses, where=str(path))
 
     def _pose_files(self) -> tuple[Path, ...]:
         """Return where poses may be: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""

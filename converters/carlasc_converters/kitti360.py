@@ -208,7 +208,7 @@ def read_trajectory(files: Files, times: NDArray[np.float64], *, force: bool = F
     before = frames[:1] - 1 if frames[0] > 1 else frames[:0]
     after = frames[-1:] + 1 if frames[-1] < len(times) - 2 else frames[:0]
     held = np.concatenate([world_T_lidar[: len(before)], world_T_lidar, world_T_lidar[-1:][: len(after)]])
-    return Trajectory(held, times[np.concatenate([before, frames, after])])
+    return Trajectory(held, times[np.concatenate([before, frames, after])], str(files.poses))
 
 
 def _read_poses(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -107,7 +107,7 @@ class RawDrive(Recording):
             self._lidar_T_imu(force)
         )
         later = seconds > np.concatenate([[-np.inf], np.maximum.accumulate(seconds)[:-1]])
-        return Trajectory(world_T_lidar[later], seconds[later])
+        return Trajectory(world_T_lidar[later], seconds[later], str(path))
 
     def _packet(self, number: int) -> NDArray[np.float64]:
         path = self.folder / "oxts" / "data" / f"{number:010d}.txt"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, check_rigid, invert
+from carlasc.core.geometry import Transform, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW, BoxRows, class_of
 from carlasc_converters.kitti_files import (
@@ -109,8 +109,10 @@ class TrackingSequence(Recording):
                 found=f"{len(packets)} lines",
                 advice='copy it again, or estimate poses from the scans with `poses="kiss-icp"`',
             )
-        poses = check_rigid(world_T_imu(packets) @ invert(self._lidar_T_imu(force)), str(path))
-        return Trajectory(poses, np.asarray(self._numbers) * PERIOD_S) if by_order else Trajectory(poses[: last + 1])
+        poses = world_T_imu(packets) @ invert(self._lidar_T_imu(force))
+        if by_order:
+            return Trajectory(poses, np.asarray(self._numbers) * PERIOD_S, str(path))
+        return Trajectory(poses[: last + 1], where=str(path))
 
     def _lidar_T_imu(self, force: bool) -> Transform:
         if force and not self._file("calib").is_file():

@@ -157,10 +157,11 @@ class NuScenesScene(Recording):
     def poses(self, *, force: bool = False) -> Trajectory:
         """Return the poses of the vehicle at all LiDAR scans of the scene, at their own times."""
         rows = [scan.pose for scan in self.scene.scans]
-        try:
-            return Trajectory(self._global_T_vehicle(rows), self._seconds(self.tables.poses[0][rows]))
-        except FormatError as error:
-            raise error.within(f"{self.tables.path('ego_pose')}: {self.scene.name}") from error
+        return Trajectory(
+            self._global_T_vehicle(rows),
+            self._seconds(self.tables.poses[0][rows]),
+            f"{self.tables.path('ego_pose')}: {self.scene.name}",
+        )
 
     def _global_T_vehicle(self, rows: Sequence[int]) -> NDArray[np.float64]:
         """Return (N, 4, 4) poses of rows of the poses in the tables."""

@@ -117,7 +117,7 @@ class ParisCarlaTown(Recording):
 
     def poses(self, *, force: bool = False) -> Trajectory:
         """Return the pose of each scan: see `notes`."""
-        return Trajectory(self._poses, self._middles[1])
+        return Trajectory(self._poses, self._middles[1], str(self.path))
 
     def times(self) -> NDArray[np.float64]:
         """Return the time of the middle point of each scan."""

@@ -145,7 +145,8 @@ class SynthCityArea(Recording):
     def poses(self, *, force: bool = False) -> Trajectory:
         """Return where the tiles are in the city: 1.8 m above their ground, x along the x of the city."""
         heights = [frame.height_m for frame in self.frames if isinstance(frame, SynthCityFrame)]
-        return Trajectory(np.array([translation((x, y, z)) for (x, y), z in zip(self._centers, heights, strict=True)]))
+        poses = np.array([translation((x, y, z)) for (x, y), z in zip(self._centers, heights, strict=True)])
+        return Trajectory(poses, where=self.location)
 
     def notes(self) -> list[str]:
         """Return what the data lack."""

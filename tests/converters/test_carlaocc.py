@@ -204,7 +204,7 @@ def move_rows(folder: Path) -> None:
         (cut_scan, "0000.ply: expected"),
         (empty_scan, "0000.ply: expected points, found none"),
         (drop_pose, "lidar.txt: expected a pose for frame 2, found none for 1 frames"),
-        (repeat_pose, "lidar.txt: poses: expected times that increase, found none at pose 3"),
+        (repeat_pose, "lidar.txt: expected times that increase, found none at pose 3"),
         (shorten_pose, "lidar.txt: expected 17 numbers per line: frame and 4 x 4 pose, found 16"),
         (
             cut_grid,

@@ -399,7 +399,7 @@ def test_poses_whose_times_stand_still_are_named(tables):
     rows = json.loads((tables / "ego_pose.json").read_text())
     write_table(tables / "ego_pose.json", [row | {"timestamp": nusc.START_US} for row in rows])
     with pytest.raises(
-        FormatError, match=r"ego_pose.json: scene-0103: poses: expected times that increase, found none at"
+        FormatError, match=r"ego_pose.json: scene-0103: expected times that increase, found none at"
     ):
         recording(tables).poses()
 

@@ -1,8 +1,8 @@
 """Damaged files: every reader is given files with random changes, and may raise nothing but a CarlascError of one line.
 
 A child process reads thousands of cases, one after the other, with a limit of memory and of time for each; the parent learns of its
-death. Case `number` of a target depends on the seed, the target and the number alone: `python -m faults.mutations TARGET SEED NUMBER`
-repeats one.
+death. Compiled loops check each index, as one out of bounds may do damage that no error shows. Case `number` of a target depends on the
+seed, the target and the number alone: `python -m faults.mutations TARGET SEED NUMBER` repeats one.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
@@ -49,6 +51,13 @@ _OBEYED = (
     "Cs",
 )  # categories of characters that end a line or that a terminal obeys, and halves of characters
 _TURNED = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # those that turn the direction of writing
+_CHECKING = {
+    "NUMBA_BOUNDSCHECK": "1",
+    "NUMBA_CACHE_DIR": str(
+        Path(__file__).parents[2] / "build" / "checked-loops"
+    ),  # apart from loops that check nothing
+    "OMP_NUM_THREADS": "1",
+}
 _FOUND, _UNREADABLE = "found.txt", "the files cannot be read"
 
 
@@ -105,23 +114,30 @@ class Reading:
             self.complaint = f"a message that names no file: {message[:200]!r} {_place_of(error)}"
 
 
-def run(count: int, seed: int, folder: Path, targets: Iterable[Target] = TARGETS) -> Outcome:
-    """Read `count` damaged cases, divided among the targets.
+def run(count: int, seed: int, folder: Path) -> Outcome:
+    """Read `count` damaged cases, divided among the targets, in as many processes as there are processors.
 
     Args:
         count: number of cases in all.
         seed: of the random changes.
-        folder: for what is written; files of cases are in memory where the machine has a folder there.
-        targets: what is read.
+        folder: is not used: files of cases are in memory where the machine has a folder there.
     """
     started = time.monotonic()
-    chosen = [target for target in targets if target.is_available()]
-    tried, found = 0, []
-    with _place_in_memory(folder) as place:
-        for target, cases in shares(count, chosen):
-            number, faults = run_target(target, range(cases), seed, place)
-            tried, found = tried + number, [*found, *faults]
-    return Outcome("mutations", tried, found, time.monotonic() - started)
+    chosen = shares(count, [target for target in TARGETS if target.is_available()])
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        said = list(pool.map(lambda part: run_apart(part[0].name, seed, part[1]), chosen))
+    found = [line.strip() for lines in said for line in lines.splitlines() if line.startswith(" ")]
+    return Outcome("mutations", count, found, time.monotonic() - started)
+
+
+def run_apart(names: str, seed: int, count: int) -> str:
+    """Read cases of some targets in a process of its own, and return what it prints: a line for each, and faults after two spaces."""
+    command = [sys.executable, "-m", "faults.mutations", names, str(seed), "x", str(count)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 1) or done.stdout.count(" cases, ") != len(names.split(",")):
+        raise RuntimeError(f"{names}: exit status {done.returncode}: {done.stderr}")
+    return done.stdout
 
 
 def shares(count: int, targets: Sequence[Target]) -> list[tuple[Target, int]]:
@@ -326,6 +342,8 @@ def _place_in_memory(folder: Path) -> Iterator[Path]:
 
 def main() -> int:
     """Repeat one case, `python -m faults.mutations TARGET SEED NUMBER`, or run many: `TARGET,...|all SEED x COUNT`."""
+    if not _CHECKING.items() <= os.environ.items():
+        os.execve(sys.executable, [sys.executable, "-m", "faults.mutations", *sys.argv[1:]], os.environ | _CHECKING)
     faults = 0
     names, seed, many = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "x"
     chosen = [target for target in TARGETS if names == "all" or target.name in names.split(",")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,25 +14,16 @@ import pytest
 from carlasc.errors import FormatError
 from faults import coverage, mutations
 from faults.damage import change, damage
-from faults.mutations import run_target, shares
+from faults.mutations import run_apart, run_target, shares
 from faults.targets import TARGETS, Target
 
 QUICK = ("folder", "zip", "zarr", "parquet", "capture", "results", "kitti", "nuscenes")
 SEED = 7
 
 
-def fuzz(names: str, count: int) -> str:
-    """Run cases in a process of their own, as this one may have threads, and return what is printed."""
-    command = [sys.executable, "-m", "faults.mutations", names, str(SEED), "x", str(count)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 def test_a_few_damaged_files_of_the_common_kinds_are_read_or_refused() -> None:
     available = [target.name for target in TARGETS if target.name in QUICK and target.is_available()]
-    assert fuzz(",".join(available), 300).count(" 0 kinds of faults") == len(available) >= 6
+    assert run_apart(",".join(available), SEED, 300).count(" 0 kinds of faults") == len(available) >= 6
 
 
 @pytest.mark.slow
@@ -42,7 +32,7 @@ def test_damaged_files_of_every_kind_are_read_or_refused(name: str) -> None:
     target = next(target for target in TARGETS if target.name == name)
     if not target.is_available():
         pytest.skip(f"{' or '.join(target.needs)} is not installed")
-    assert " 0 kinds of faults" in fuzz(name, 20 * target.weight)
+    assert " 0 kinds of faults" in run_apart(name, SEED, 20 * target.weight)
 
 
 @pytest.mark.slow
