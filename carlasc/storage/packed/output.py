@@ -31,7 +31,10 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
     kind = "folder" if path.is_dir() else "file"
     if not overwrite:
         raise ConflictError(
-            path, expected="nothing there", found=f"a {kind}", advice="choose another name, or give `overwrite=True`"
+            path,
+            expected="nothing there",
+            found=f"a {kind}",
+            advice="choose another name, remove it, or give `overwrite=True` where there is such an option",
         )
     if not _is_store(path):
         raise ConflictError(

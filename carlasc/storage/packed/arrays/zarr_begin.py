@@ -92,7 +92,7 @@ class Root:
                 self._target.location,
                 expected="nothing there, or a store with the same options",
                 found=f"one with {', '.join(f'{name} {root.get(name)}' for name in differs if name != 'type')}",
-                advice="choose another name, or give `overwrite=True`",
+                advice="choose another name, remove it, or give `overwrite=True` where there is such an option",
             )
         return False
 
