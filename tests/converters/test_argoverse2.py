@@ -290,9 +290,7 @@ def test_poses_that_are_none_and_times_that_stand_still_are_named(log):
     path = log / "city_SE3_egovehicle.feather"
     table = read_table(path)
     change(path, timestamp_ns=np.where(table["timestamp_ns"] == START_NS, START_NS - 10_000_000, table["timestamp_ns"]))
-    with pytest.raises(
-        FormatError, match=r"city_SE3_egovehicle.feather: expected times that increase, found none at"
-    ):
+    with pytest.raises(FormatError, match=r"city_SE3_egovehicle.feather: expected times that increase, found none at"):
         recording(log).poses()
     change(path, **(table | {"qw": table["qw"] * 2}))
     with pytest.raises(

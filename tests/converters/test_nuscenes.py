@@ -398,9 +398,7 @@ def test_a_value_of_another_type_is_named(tables, table, key, value, expected):
 def test_poses_whose_times_stand_still_are_named(tables):
     rows = json.loads((tables / "ego_pose.json").read_text())
     write_table(tables / "ego_pose.json", [row | {"timestamp": nusc.START_US} for row in rows])
-    with pytest.raises(
-        FormatError, match=r"ego_pose.json: scene-0103: expected times that increase, found none at"
-    ):
+    with pytest.raises(FormatError, match=r"ego_pose.json: scene-0103: expected times that increase, found none at"):
         recording(tables).poses()
 
 

@@ -51,11 +51,10 @@ _OBEYED = (
     "Cs",
 )  # categories of characters that end a line or that a terminal obeys, and halves of characters
 _TURNED = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # those that turn the direction of writing
+_ROOT = Path(__file__).parents[2]
 _CHECKING = {
     "NUMBA_BOUNDSCHECK": "1",
-    "NUMBA_CACHE_DIR": str(
-        Path(__file__).parents[2] / "build" / "checked-loops"
-    ),  # apart from loops that check nothing
+    "NUMBA_CACHE_DIR": str(_ROOT / "build" / "checked-loops"),  # apart from the loops that check nothing
     "OMP_NUM_THREADS": "1",
 }
 _FOUND, _UNREADABLE = "found.txt", "the files cannot be read"
@@ -133,7 +132,8 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
 def run_apart(names: str, seed: int, count: int) -> str:
     """Read cases of some targets in a process of its own, and return what it prints: a line for each, and faults after two spaces."""
     command = [sys.executable, "-m", "faults.mutations", names, str(seed), "x", str(count)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    paths = [str(_ROOT / "tests"), str(_ROOT / "examples"), *filter(None, sys.path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in (0, 1) or done.stdout.count(" cases, ") != len(names.split(",")):
         raise RuntimeError(f"{names}: exit status {done.returncode}: {done.stderr}")
