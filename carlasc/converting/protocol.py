@@ -26,11 +26,10 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import Transform, check_rigid, slerp
 from carlasc.core.grids import GridSpec
+from carlasc.core.times import check_seconds
 from carlasc.errors import ArgumentError, FormatError
 
 Split = Literal["Train", "Val", "Test"]
-
-_LATEST_S = 1e11  # no clock in seconds says so; milliseconds since 1970 are more
 
 
 @dataclass(frozen=True)
@@ -105,27 +104,6 @@ class VoxelContent:
     labels: NDArray[np.unsignedinteger]
     known: NDArray[np.bool_]
     files: Mapping[str, bytes] = field(default_factory=dict)
-
-
-def check_seconds(seconds: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Return times, (N,), after checking that they can be seconds: finite, and no count of milliseconds or nanoseconds since 1970.
-
-    Args:
-        seconds: the times.
-        where: what the error is about.
-
-    Raises:
-        FormatError: a time is not finite, or too large.
-    """
-    wrong = np.flatnonzero(~(np.abs(seconds) < _LATEST_S))
-    if len(wrong):
-        raise FormatError(
-            where,
-            expected=f"times in seconds, below {_LATEST_S:.0e}",
-            found=f"{seconds[wrong[0]]:g} at row {wrong[0]}",
-            advice="convert milliseconds or nanoseconds to seconds, or copy the file of times again",
-        )
-    return seconds
 
 
 @dataclass(frozen=True)

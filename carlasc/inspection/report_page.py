@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.reporting.actors import Actor
 from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
 from carlasc.inspection.reports import ReportResult
@@ -94,10 +95,11 @@ def _held_out(values: Mapping[str, Any]) -> str:
 def _section(name: str, report: Report) -> str:
     coverage = report.coverage
     classes = sorted(((label, count) for label, count in coverage.classes.items()), key=lambda pair: -pair[1])
-    size = " x ".join(f"{float(cells):g}" for cells in report.settings.get("grid_size", ()))
+    spec = GridSpec.from_params(report.settings, name)
+    size = " x ".join(map(str, spec.size))
     parts = [
         f"<h2>{escape(name)}</h2>",
-        f'<p class="note">{escape(str(report.settings.get("coordinates", "")))} grid of {escape(size)} voxels</p>',
+        f'<p class="note">{spec.coordinates} grid of {size} voxels</p>',
         _table([], [[label, text] for label, text in describe(report)]),
         "<h3>Known voxels by class</h3>",
         '<p class="note">The length of a bar is the square root of the share.</p>',

@@ -23,6 +23,7 @@ from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
+from carlasc.core.times import check_seconds
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
@@ -194,12 +195,26 @@ class Sequence(ABC):
         return layout.decode_times(self.read_document(layout.TIMES), f"{self.location}/{layout.TIMES}")
 
     def read_pose(self, frame: int) -> Transform:
-        """Return (4, 4) first_T_sensor of a frame."""
-        return self.poses[self.line_of(frame, len(self.poses), layout.POSES)]
+        """Return (4, 4) first_T_sensor of a frame.
+
+        Raises:
+            FormatError: there is no line for it, or a number of it is not finite.
+        """
+        line = self.line_of(frame, len(self.poses), layout.POSES)
+        pose = self.poses[line]
+        if not np.isfinite(pose).all():
+            where = f"{self.location}/{layout.POSES}: line {line + 1}"
+            raise FormatError(where, expected="finite numbers", found="NaN or infinity", advice="copy the file again")
+        return pose
 
     def read_time(self, frame: int) -> float:
-        """Return the time of a frame in seconds since the first frame."""
-        return float(self.times[self.line_of(frame, len(self.times), layout.TIMES)])
+        """Return the time of a frame in seconds since the first frame.
+
+        Raises:
+            FormatError: there is no line for it, or it is no number of seconds.
+        """
+        line = self.line_of(frame, len(self.times), layout.TIMES)
+        return float(check_seconds(self.times[line : line + 1], f"{self.location}/{layout.TIMES}: line {line + 1}")[0])
 
     def line_of(self, frame: int, lines: int, document: str) -> int:
         """Return the number of the line of a text file that belongs to a frame.

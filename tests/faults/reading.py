@@ -11,6 +11,7 @@ from typing import Any
 import carlasc
 from carlasc.captures import find_captures
 from carlasc.converting import convert, load_converter
+from carlasc.converting.registry import exporter_names
 from carlasc.storage import Sequence
 from faults.writing import REGRID_SPEC
 
@@ -91,6 +92,38 @@ def show(root: Path, attempt: Attempt) -> None:
     """Write the page of a scene."""
     with tempfile.TemporaryDirectory() as out:
         attempt(lambda: carlasc.view(root, Path(out) / "page.html"))
+
+
+def draw(root: Path, attempt: Attempt) -> None:
+    """Draw a picture of the first frame."""
+    with tempfile.TemporaryDirectory(dir=root.parent) as out:
+        attempt(lambda: carlasc.render(root, Path(out) / "a.png", size=(96, 64), still=True))
+
+
+def pack_again(root: Path, attempt: Attempt) -> None:
+    """Pack a data set into a store of each kind."""
+    with tempfile.TemporaryDirectory(dir=root.parent) as out:
+        for ending in (".zarr", ".h5", ".parquet"):
+            attempt(lambda ending=ending: carlasc.pack(root, Path(out) / f"a{ending}", workers=1))
+
+
+def unpack_again(root: Path, attempt: Attempt) -> None:
+    """Unpack the store in a folder."""
+    with tempfile.TemporaryDirectory(dir=root.parent) as out:
+        attempt(lambda: carlasc.unpack(the_only(root), Path(out) / "a", workers=1))
+
+
+def export_again(root: Path, attempt: Attempt) -> None:
+    """Export a data set to each of the formats."""
+    for name in exporter_names():
+        with tempfile.TemporaryDirectory(dir=root.parent) as out:
+            attempt(lambda name=name, out=out: carlasc.export(name, root, out, workers=1))
+
+
+def regrid_captures(root: Path, attempt: Attempt) -> None:
+    """Make the grids of a capture."""
+    with tempfile.TemporaryDirectory(dir=root.parent) as out:
+        attempt(lambda: carlasc.regrid(root, REGRID_SPEC, out, workers=1))
 
 
 def read_captures(root: Path, attempt: Attempt) -> None:

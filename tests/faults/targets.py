@@ -44,6 +44,13 @@ TARGETS = (
     Target("checks", writing.write_folder, reading.check_source),
     Target("dataset", writing.write_folder, reading.train_on),
     Target("page", writing.write_folder, reading.show),
+    Target("pictures", writing.write_few, reading.draw, weight=1),
+    Target(
+        "packing", writing.write_folder, reading.pack_again, ("numcodecs", "pcodec", "h5py", "hdf5plugin", "pyarrow"), 2
+    ),
+    Target("unpacking", writing.write_packed(".zarr"), reading.unpack_again, ("numcodecs", "pcodec"), 2),
+    Target("exporting", writing.write_few, reading.export_again, ("h5py",), 1),
+    Target("regrid-captures", writing.write_capture_files, reading.regrid_captures, weight=4),
     Target("reports", writing.write_regridded, reading.read_reports, weight=4),
     Target("tracks", writing.write_regridded, reading.tracks_in),
     Target("regrid", writing.write_regridded, reading.regrid_again, weight=1),

@@ -218,6 +218,7 @@ def test_a_report_survives_its_json(made):
         ({"format": None}, "remake"),
         ({"coverage": {}}, "something else"),
         ({"frames": [3]}, "something else"),
+        ({"settings": {"grid_size": [8.0, {}, 4.0]}}, "^report: .*dict"),
         ({"actors": [{"label": "Vehicle"}]}, "something else"),
     ],
 )

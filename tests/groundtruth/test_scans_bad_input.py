@@ -6,6 +6,7 @@ from helpers import passing
 
 import carlasc
 from carlasc import FromScans
+from carlasc.core.boxes import Boxes
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, layout
@@ -161,3 +162,28 @@ def test_a_tube_takes_no_motion(motion):
 def test_choices_that_do_not_exist_are_named(name, value):
     with pytest.raises(ArgumentError, match=f"^{name}: expected one of .*, found '{value}'"):
         FromScans(**{name: value})
+
+
+def add_boxes(street, label=VEHICLE):
+    """Write one box in each frame, of a class."""
+    box = Boxes.from_poses(
+        np.array([9], np.uint32), np.array([label], np.uint32), np.eye(4)[None], np.full((1, 3), 2.0), np.ones(1, bool)
+    )
+    for frame in range(FRAMES):
+        FolderSink(street.parents[1]).sequence("Val/Street/cartesian").write("boxes", frame, box.to_table())
+
+
+def test_boxes_of_frames_without_a_scan_are_left_out(street):
+    add_boxes(street)
+    for path in (street / "cartesian").glob(f"*/{FRAME - 2:06d}.*"):
+        if path.parent.name != "boxes":
+            path.unlink()
+    (sequence,) = carlasc.open(street).sequences().values()
+    assert set(sequence.frames("boxes").tolist()) - set(sequence.frames("points").tolist()) == {FRAME - 2}
+    make(street, motion="boxes")
+
+
+def test_a_box_of_a_class_that_does_not_exist_is_named(street):
+    add_boxes(street, 4_294_967_295)
+    with pytest.raises(FormatError, match="boxes of frame 0: expected class ids 0..24 .*, found 4294967295 on 1 of 1"):
+        make(street, motion="boxes")

@@ -187,3 +187,21 @@ def test_a_pipe_and_a_device_are_no_scans(tmp_path):
             FormatError, match=rf"00000{frame}\.bin: expected a file, found a folder, a pipe or a device"
         ):
             sequence.read("points", frame)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1.7e18"])
+def test_a_frame_whose_time_or_pose_is_no_number_is_refused_alone(tmp_path: Path, value: str) -> None:
+    root = write_dataset(tmp_path)
+    folder = next(root.rglob(WHOLE))
+    for name in ("times.txt", "poses.txt"):
+        first, second, *rest = (folder / name).read_text().splitlines()
+        wrong = f"{second.rpartition(' ')[0]} {value}"
+        (folder / name).write_text("\n".join([first, wrong, *rest]) + "\n")
+    (sequence,) = FolderSource(folder).sequences().values()
+    assert np.isfinite(sequence.read_pose(0)).all()
+    assert np.isfinite(sequence.read_time(0))
+    with pytest.raises(FormatError, match=f"times.txt: line 2: expected times in seconds, below .*, found {value[:3]}"):
+        sequence.read_time(1)
+    if value != "1.7e18":
+        with pytest.raises(FormatError, match="poses.txt: line 2: expected finite numbers, found NaN or infinity"):
+            sequence.read_pose(1)

@@ -225,11 +225,17 @@ def _with_members(track: Track, segments: list[Segment]) -> Track:
 
 
 def _box_tracks(feed: ScanFeed) -> list[Track]:
-    """Return the tracks of the sequence's boxes, if motion is taken from them."""
+    """Return the tracks of the sequence's boxes, if motion is taken from them. Boxes without a scan have no time.
+
+    Raises:
+        FormatError: the class of a box is not in the table.
+    """
     if "boxes" not in feed.motion:
         return []
-    frames = feed.sequence.frames("boxes").tolist()
+    frames = [frame for frame in feed.sequence.frames("boxes").tolist() if frame in feed.times]
     boxes = {frame: found for frame in frames if (found := feed.sequence.boxes(frame)) is not None}
+    for frame, found in boxes.items():
+        feed.classes.check(found.labels, f"{feed.sequence.location}: boxes of frame {frame}")
     return tracks_from_boxes(boxes, {frame: feed.pose(frame) for frame in boxes}, feed.times)
 
 

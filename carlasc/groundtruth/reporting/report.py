@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
+from carlasc.core.grids import GridSpec
 from carlasc.core.plain import from_plain
 from carlasc.errors import FormatError, reading
 from carlasc.groundtruth.reporting.actors import Actor, actors_of
@@ -267,6 +268,7 @@ class Report:
                 advice="upgrade carlasc" if newer else "make it again with `remake=True`",
             )
         with reading(where, "a report", "make it again with `remake=True`"):
+            GridSpec.from_params(values["settings"], where)
             inputs, outputs = (from_plain(values[part], Mapping[str, Digests], part) for part in ("inputs", "outputs"))
             return cls(
                 grid=from_plain(values["grid"], str, "grid"),

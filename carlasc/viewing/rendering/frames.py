@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, transform_points
+from carlasc.core.geometry import Transform, check_rigid, transform_points
 from carlasc.errors import ArgumentError
+from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
 from carlasc.viewing.remapping import RemappedSequence
 from carlasc.viewing.rendering.cameras import Viewpoint
@@ -140,9 +141,11 @@ def view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transfor
 
     Raises:
         MissingDataError: the sequence has no poses.
+        FormatError: the middle one is none.
     """
     sequence = reader.data.sequence
-    world_T_middle = sequence.read_pose(reader.frames[len(reader.frames) // 2])
+    middle = reader.frames[len(reader.frames) // 2]
+    world_T_middle = check_rigid(sequence.read_pose(middle), f"{sequence.location}/{layout.POSES}: frame {middle}")
     middle_T_world = np.linalg.inv(world_T_middle)
     seen = [transform_points(middle_T_world @ sequence.read_pose(frame), extent) for frame in reader.frames]
     points = np.concatenate(seen)
