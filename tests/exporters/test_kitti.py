@@ -65,30 +65,6 @@ def test_right_handed_sequences_are_not_mirrored(tmp_path):
     assert np.array_equal(written, REMAPS["carla_to_semantickitti"](labels))
 
 
-def plain_occlusion(occupied, spec):
-    """Sample every line finely: what the walk must agree with, but for lines that graze a voxel."""
-    occluded = np.zeros(spec.size, bool)
-    centers = spec.centers()
-    for cell in np.ndindex(spec.size):
-        line = centers[cell] * np.linspace(1, 0, 2000)[:, None]
-        index = np.floor((line - spec.lower) / spec.voxel_size).astype(int)
-        inside = ((index >= 0) & (index < spec.size)).all(axis=1)
-        stop = len(inside) if inside.all() else int(np.argmin(inside))
-        occluded[cell] = occupied[tuple(index[:stop].T)].any()
-    return occluded
-
-
-def test_occlusion_agrees_with_finely_sampled_lines():
-    rng = np.random.default_rng(0)
-    spec = GridSpec("cartesian", (9, 8, 5), (0.05, -4.1, -1.93), (9.05, 3.9, 0.57))
-    for share in (0.02, 0.15):
-        occupied = rng.random(spec.size) < share
-        different = occluded_voxels(occupied, spec) != plain_occlusion(occupied, spec)
-        assert different.mean() < 0.01
-    assert not occluded_voxels(np.zeros(spec.size, bool), spec).any()
-    assert occluded_voxels(np.ones(spec.size, bool), spec).all()
-
-
 @given(arrays(bool, (3, 5, 2)))
 @settings(max_examples=25, deadline=None)
 def test_bits_come_back_first_voxel_in_the_highest_bit(mask):

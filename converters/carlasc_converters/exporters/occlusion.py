@@ -2,18 +2,56 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
 
+_BITS = 32  # voxels of a column that one integer stands for
+_PARTS = 2048  # of the way to the sensor; a power of two, so that the part of a fraction is exact
+
+
+class _Columns(NamedTuple):
+    """The occupied voxels of a grid, by column.
+
+    Attributes:
+        runs: (2 R,) int32, per run of occupied voxels the face below the first and the face above the last, column by column.
+        first: (X * Y + 1,) int32, place of the runs of each column in `runs`.
+    """
+
+    runs: NDArray[np.int32]
+    first: NDArray[np.int32]
+
+
+class _Heights(NamedTuple):
+    """The heights of the lines of up to 32 voxels of any column: each time that one of them passes a horizontal face begins a stage.
+
+    Attributes:
+        times: (N + 1,) float64, the fraction of the way to the sensor at which each stage ends; infinite for the last one.
+        stages: (_PARTS,) int32, the stage at the beginning of each part of the way.
+        below: (N + 1, Z + 1) uint32, per stage and face the voxels whose lines are below it, as bits.
+        up: the voxels whose lines go up, as bits.
+        down: the other voxels, as bits.
+    """
+
+    times: NDArray[np.float64]
+    stages: NDArray[np.int32]
+    below: NDArray[np.uint32]
+    up: np.uint32
+    down: np.uint32
+
 
 def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.bool_]:
     """Return the occupied voxels, and the voxels whose line to the sensor passes through an occupied one.
 
-    The line goes from the centre of a voxel to the sensor, which is at the origin, from voxel to voxel (Amanatides and Woo 1987).
-    It ends at the sensor, or where it leaves the grid.
+    The line goes from the centre of a voxel to the sensor, which is at the origin, from voxel to voxel (Amanatides and Woo 1987): through
+    the face that comes first, of equally near ones x before y before z. It ends at the sensor, or where it leaves the grid.
+
+    The lines of all voxels of a column pass the same columns at the same times, and the times at which a line passes horizontal faces
+    depend on the height of its voxel alone. So one walk in 2-D serves a column, and the bits of an integer stand for its voxels.
 
     Args:
         occupied: (X, Y, Z) bool.
@@ -23,50 +61,110 @@ def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.b
         (X, Y, Z) bool.
     """
     sensor = -np.array(spec.lower) / spec.voxel_size
-    occluded: NDArray[np.bool_] = _occlude(np.ascontiguousarray(occupied), sensor)
-    return occluded
-
-
-@numba.njit(cache=True)
-def _occlude(occupied: NDArray[np.bool_], sensor: NDArray[np.float64]) -> NDArray[np.bool_]:
+    columns = _columns(occupied)
     occluded = np.zeros(occupied.shape, np.bool_)
-    for x in range(occupied.shape[0]):
-        for y in range(occupied.shape[1]):
-            for z in range(occupied.shape[2]):
-                occluded[x, y, z] = _meets(occupied, sensor, x, y, z)
+    for lowest in range(0, spec.size[2], _BITS):
+        part = occluded[..., lowest : lowest + _BITS]
+        _occlude(columns, sensor, _heights(lowest, part.shape[2], spec.size[2], float(sensor[2])), part)
     return occluded
 
 
-@numba.njit(cache=True)
-def _meets(occupied: NDArray[np.bool_], sensor: NDArray[np.float64], x: int, y: int, z: int) -> bool:
-    """Return whether the line from a voxel to the sensor meets an occupied voxel. Coordinates are in voxels."""
-    cell = (x, y, z)
-    rx, ry, rz = sensor[0] - x - 0.5, sensor[1] - y - 0.5, sensor[2] - z - 0.5
-    sx, sy, sz = (1 if rx > 0 else -1), (1 if ry > 0 else -1), (1 if rz > 0 else -1)
-    # Per axis: the fraction of the line between two faces (d), and the fraction at which the next face comes (t).
-    # The first face is half a voxel away.
+def _columns(occupied: NDArray[np.bool_]) -> _Columns:
+    padded = np.pad(occupied, ((0, 0), (0, 0), (1, 1)))
+    ends = padded[..., 1:] != padded[..., :-1]
+    first = np.append(0, np.cumsum(np.count_nonzero(ends, axis=2)))
+    runs = np.flatnonzero(ends) % ends.shape[2]
+    return _Columns(runs.astype(np.int32), first.astype(np.int32))
+
+
+def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
+    """Return the heights of the lines of `count` voxels from the height `lowest` on, in a grid of `rows`; `sensor` is in voxels."""
+    start = np.arange(lowest, lowest + count)
+    bits = np.uint32(1) << np.arange(count, dtype=np.uint32)
+    way = sensor - start - 0.5
+    with np.errstate(divide="ignore"):
+        between = 1 / np.abs(way)  # infinite on the height of the sensor
+    times = np.repeat(between[:, None], rows, axis=1)
+    times[:, 0] /= 2  # the first face is half a voxel away
+    times = np.cumsum(times, axis=1)
+    up = way > 0
+    faces = start[:, None] + np.where(up[:, None], np.arange(1, rows + 1), -np.arange(rows))
+    voxel, step = np.nonzero((times < 1) & (faces >= 0) & (faces <= rows))
+    order = np.argsort(times[voxel, step])
+    voxel, step = voxel[order], step[order]
+    below = np.empty((len(order) + 1, rows + 1), np.uint32)
+    below[0] = np.bitwise_or.reduce(np.where(start[:, None] < np.arange(rows + 1), bits[:, None], 0), axis=0)
+    # Of all faces, a line that passes one changes from one side to the other of this one only.
+    below[1:] = 0
+    below[np.arange(1, len(below)), faces[voxel, step]] = bits[voxel]
+    np.bitwise_xor.accumulate(below, axis=0, out=below)
+    ends = np.append(times[voxel, step], np.inf)
+    stages = np.searchsorted(ends, np.arange(_PARTS) / _PARTS)
+    return _Heights(ends, stages.astype(np.int32), below, np.uint32(bits[up].sum()), np.uint32(bits[~up].sum()))
+
+
+@numba.njit(cache=True, nogil=True)
+def _occlude(columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, occluded: NDArray[np.bool_]) -> None:
+    """Walk from every column to the sensor.
+
+    Args:
+        columns: the occupied voxels.
+        sensor: (3,) its place in voxels.
+        heights: the heights of the lines of some voxels.
+        occluded: (X, Y, <= 32) bool output: these voxels of all columns.
+    """
+    for x in range(occluded.shape[0]):
+        for y in range(occluded.shape[1]):
+            met = _walk(columns, sensor, heights, x, y, occluded.shape[0], occluded.shape[1])
+            for i in range(occluded.shape[2]):
+                occluded[x, y, i] = (met >> i) & 1
+
+
+@numba.njit(nogil=True)
+def _walk(
+    columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, x: int, y: int, depth: int, width: int
+) -> np.uint32:
+    """Return the voxels of column (x, y) whose line to the sensor meets an occupied voxel, as bits."""
+    rx, ry = sensor[0] - x - 0.5, sensor[1] - y - 0.5
+    sx, sy = (1 if rx > 0 else -1), (1 if ry > 0 else -1)
+    # Per axis: the fraction of the way between two faces (d), and the fraction at which the next face comes (t).
     dx = 1 / abs(rx) if rx != 0 else np.inf
     dy = 1 / abs(ry) if ry != 0 else np.inf
-    dz = 1 / abs(rz) if rz != 0 else np.inf
-    tx, ty, tz = dx / 2, dy / 2, dz / 2
+    tx, ty = dx / 2, dy / 2
+    met, enter, stage = np.uint32(0), 0.0, 0  # stage: at `enter`, or -1
     while True:
-        if occupied[cell[0], cell[1], cell[2]]:
-            return True
-        if tx <= ty and tx <= tz:
-            if tx >= 1:
-                return False
+        leave = min(tx, ty)
+        first, last = columns.first[x * width + y], columns.first[x * width + y + 1]
+        if first < last:
+            before = stage if stage >= 0 else _stage(heights, enter)
+            stage = _stage(heights, leave)
+            for i in range(first, last, 2):
+                low, high = columns.runs[i], columns.runs[i + 1]
+                met |= heights.up & heights.below[before, high] & ~heights.below[stage, low]
+                met |= heights.down & ~heights.below[before, low] & heights.below[stage, high]
+            if met == heights.up | heights.down:
+                return met
+        else:
+            stage = -1
+        if leave >= 1:
+            return met
+        if tx <= ty:
             x += sx
             tx += dx
-        elif ty <= tz:
-            if ty >= 1:
-                return False
+        else:
             y += sy
             ty += dy
-        else:
-            if tz >= 1:
-                return False
-            z += sz
-            tz += dz
-        if x < 0 or y < 0 or z < 0 or x >= occupied.shape[0] or y >= occupied.shape[1] or z >= occupied.shape[2]:
-            return False
-        cell = (x, y, z)
+        if x < 0 or y < 0 or x >= depth or y >= width:
+            return met
+        enter = leave
+
+
+@numba.njit(nogil=True)
+def _stage(heights: _Heights, time: float) -> int:
+    """Return the number of faces that lines pass before a time."""
+    if time >= 1:
+        return len(heights.times) - 1
+    stage = heights.stages[int(time * _PARTS)]
+    while heights.times[stage] < time:
+        stage += 1
+    return stage
