@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from carlasc.cli.common import CommandGroup, echo
+from carlasc.cli.late_help import load_help
 
 _COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
     "demo",
@@ -49,7 +51,7 @@ class _Commands(MutableMapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         if self._loaded[name] is None:
             single = typer.Typer(add_completion=False, **_SETTINGS)
-            single.command(name)(getattr(importlib.import_module(f"carlasc.cli.{name}"), name))
+            single.command(name, cls=_Command)(_function(name))
             self._loaded[name] = _without_flag_types(typer.main.get_command(single))
         return self._loaded[name]
 
@@ -66,12 +68,24 @@ class _Commands(MutableMapping[str, Any]):
         return len(self._loaded)
 
 
+def _function(name: str) -> Callable[..., None]:
+    """Return the function of a command."""
+    function: Callable[..., None] = getattr(importlib.import_module(f"carlasc.cli.{name}"), name)
+    return function
+
+
 def _without_flag_types(command: Any) -> Any:
     """Remove the type from the help of flags: "--overwrite <bool>" would mean that a value follows."""
     for parameter in command.params:
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
     return command
+
+
+class _Command(TyperCommand):
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        load_help()
+        super().format_help(ctx, formatter)
 
 
 class _Group(CommandGroup):
@@ -82,6 +96,16 @@ class _Group(CommandGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help. It shows the first lines of commands alone, so their options are not made."""
+        load_help()
+        commands, self.commands = (
+            self.commands,
+            {name: _Command(name, help=_function(name).__doc__) for name in self.commands},
+        )
+        super().format_help(ctx, formatter)
+        self.commands = commands
 
 
 app = typer.Typer(

@@ -88,8 +88,6 @@ def validate(
     """
     from carlasc.core.grids import GridSpec
     from carlasc.groundtruth import FromScans
-    from carlasc.inspection.heldout import EVERY
-    from carlasc.inspection.heldout import holdout as hold_out
     from carlasc.inspection.validation import validate as examine
 
     if full and every is not None:
@@ -106,6 +104,9 @@ def validate(
                 source, every=1 if full else every, workers=workers or 1, executor=executor, progress=progress
             )
         if holdout:
+            from carlasc.inspection.heldout import EVERY
+            from carlasc.inspection.heldout import holdout as hold_out
+
             with progress_bar("Leaving scans out") as progress:
                 rays = hold_out(
                     source,

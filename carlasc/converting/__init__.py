@@ -1,31 +1,63 @@
 """Other data sets into the CarlaSC layout, and back."""
 
-from carlasc.converting.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
-from carlasc.converting.exporter import Exported, Exporter, Files, FrameExporter, SequenceExporter, SequenceFile
-from carlasc.converting.exporting import ExportResult, export
-from carlasc.converting.options import option_names
-from carlasc.converting.protocol import (
-    Cloud,
-    Converter,
-    FrameHandle,
-    Recording,
-    Sensor,
-    Split,
-    Trajectory,
-    VoxelContent,
-)
-from carlasc.converting.registry import (
-    converter_names,
-    exporter_names,
-    load_converter,
-    load_exporter,
-    remaps_to_carla,
-)
-from carlasc.converting.resampling import TargetFrame, is_same, resample_to, resampling_notes
-from carlasc.converting.results import ConvertResult, Failure
-from carlasc.converting.run import convert
-from carlasc.converting.scans import VOXEL_FILES
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from carlasc.loading import late_names
 from carlasc.storage.metadata import Axes
+
+if TYPE_CHECKING:
+    from carlasc.converting.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
+    from carlasc.converting.exporter import Exported, Exporter, Files, FrameExporter, SequenceExporter, SequenceFile
+    from carlasc.converting.exporting import ExportResult, export
+    from carlasc.converting.options import option_names
+    from carlasc.converting.protocol import (
+        Cloud,
+        Converter,
+        FrameHandle,
+        Recording,
+        Sensor,
+        Split,
+        Trajectory,
+        VoxelContent,
+    )
+    from carlasc.converting.registry import (
+        converter_names,
+        exporter_names,
+        load_converter,
+        load_exporter,
+        remaps_to_carla,
+    )
+    from carlasc.converting.resampling import TargetFrame, is_same, resample_to, resampling_notes
+    from carlasc.converting.results import ConvertResult, Failure
+    from carlasc.converting.run import convert
+    from carlasc.converting.scans import VOXEL_FILES
+else:
+    __getattr__, __dir__ = late_names(
+        __name__,
+        {
+            "axes": ("mirror_boxes", "mirror_grid", "mirror_points", "mirror_poses", "mirror_spec"),
+            "exporter": ("Exported", "Exporter", "Files", "FrameExporter", "SequenceExporter", "SequenceFile"),
+            "exporting": ("ExportResult", "export"),
+            "options": ("option_names",),
+            "protocol": (
+                "Cloud",
+                "Converter",
+                "FrameHandle",
+                "Recording",
+                "Sensor",
+                "Split",
+                "Trajectory",
+                "VoxelContent",
+            ),
+            "registry": ("converter_names", "exporter_names", "load_converter", "load_exporter", "remaps_to_carla"),
+            "resampling": ("TargetFrame", "is_same", "resample_to", "resampling_notes"),
+            "results": ("ConvertResult", "Failure"),
+            "run": ("convert",),
+            "scans": ("VOXEL_FILES",),
+        },
+    )
 
 __all__ = [
     "VOXEL_FILES",

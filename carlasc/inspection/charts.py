@@ -5,14 +5,16 @@ from __future__ import annotations
 import io
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.inspection.statistics import KINDS, Kind, Statistics
-from carlasc.metrics.results import Evaluation
 from carlasc.storage.files import write_output
+
+if TYPE_CHECKING:
+    from carlasc.metrics.results import Evaluation
 
 _SUFFIXES = (".png", ".svg", ".pdf")
 _OF: dict[Kind, str] = {"points": "points", "voxels": "known voxels"}

@@ -1,0 +1,84 @@
+"""What commands load before they start: a user waits for each of these modules."""
+
+import subprocess
+import sys
+
+import pytest
+from typer.main import get_command
+
+from carlasc.cli import app
+from carlasc.testing import write_dataset
+
+COMPILER = {"numba", "llvmlite", "scipy"}
+STORES = {"h5py", "pyarrow", "zarr", "fsspec", "numcodecs", "dask"}
+PICTURES = {"trimesh", "embreex", "PIL", "matplotlib", "open3d", "torch"}
+UNUSED_HELP = {"rich.markdown", "rich.traceback", "pygments", "markdown_it"}
+
+
+def loaded(*arguments):
+    """Return what a command printed, and the modules that it loaded."""
+    code = (
+        f"import sys; sys.argv = ['carlasc', *{list(map(str, arguments))!r}]\n"
+        "from carlasc.cli import main\n"
+        "try: main()\nfinally: print('loaded:', *sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    printed, _, modules = ran.stdout.partition("loaded:")
+    return printed, set(modules.split())
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data"))
+
+
+def test_help_loads_what_it_prints_with():
+    printed, modules = loaded("--help")
+    assert "Usage: carlasc" in printed
+    assert not modules & (COMPILER | STORES | PICTURES | UNUSED_HELP | {"numpy", "pydantic"})
+
+
+@pytest.mark.parametrize("command", ["regrid", "convert", "evaluate", "render"])
+def test_the_help_of_a_command_loads_no_numpy(command):
+    printed, modules = loaded(command, "--help")
+    assert f"Usage: carlasc {command}" in printed
+    assert not modules & (COMPILER | STORES | PICTURES | UNUSED_HELP | {"numpy"})
+
+
+@pytest.mark.parametrize("command", ["info", "stats"])
+def test_commands_that_compile_nothing_load_no_compiler(command, data):
+    _, modules = loaded(command, data)
+    assert not modules & (COMPILER | STORES | PICTURES | UNUSED_HELP)
+
+
+def test_the_list_of_commands_shows_their_first_lines():
+    printed, _ = loaded("--help")
+    text = " ".join(printed.replace("│", " ").split())
+    for name, command in get_command(app).commands.items():
+        first = " ".join(command.help.split("\n\n")[0].split())
+        assert f"{name} {first[:30]}" in text, name
+
+
+def in_a_new_process(code):
+    subprocess.run([sys.executable, "-c", f"import sys; from carlasc.cli import late_help\n{code}"], check=True)
+
+
+def test_markdown_is_there_for_whoever_asks_for_it():
+    in_a_new_process(
+        "late_help.load_help(); import typer.rich_utils as help\n"
+        "assert 'rich.markdown' not in sys.modules\n"
+        "text = help._make_rich_text(text='# Title', markup_mode='markdown')\n"
+        "from rich.markdown import Markdown\n"
+        "assert type(text) is Markdown\n"
+        "assert help.Traceback.from_exception(ValueError, ValueError('x'), None).trace.stacks"
+    )
+
+
+def test_a_version_of_typer_that_needs_more_gets_the_modules_themselves():
+    in_a_new_process(
+        "late_help._UNUSED = {'rich.panel': 'NoPanel'}\n"
+        "late_help.load_help()\n"
+        "assert 'typer.rich_utils' not in sys.modules\n"
+        "import typer.rich_utils, rich.panel\n"
+        "assert typer.rich_utils.Panel is rich.panel.Panel"
+    )
