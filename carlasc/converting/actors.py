@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, rotate_vectors, thin, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.running.engines import Engine
 from carlasc.running.processes import run_all
@@ -99,11 +99,8 @@ class _Estimate:
         positions, velocities = estimate_path(sightings, seconds, rigid=chain.label not in self.classes.deformable)
         if not self.classes.moving and is_standing(sightings, positions, headings_of(velocities), seconds):
             velocities = np.zeros_like(velocities)
-        sensor_T_world = invert(poses)
-        own = [
-            rotate_vectors(transform, velocity) for transform, velocity in zip(sensor_T_world, velocities, strict=True)
-        ]
-        return [(x, y, z) for x, y, z in np.stack(own).tolist()]
+        own = multiply(invert(poses)[:, :3, :3], velocities[:, :, None])[:, :, 0]
+        return [(x, y, z) for x, y, z in own.tolist()]
 
 
 class ActorMotion:

@@ -63,8 +63,9 @@ def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
 
 def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     """Rotate (..., 3) vectors, such as velocities and normals, from frame `src` to frame `dst`, without translation."""
-    x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
-    rotated = np.empty((*np.shape(vectors)[:-1], 3))
+    source = np.asarray(vectors, np.float64)
+    x, y, z = source[..., 0], source[..., 1], source[..., 2]
+    rotated = np.empty((*source.shape[:-1], 3))
     for row, (along_x, along_y, along_z) in enumerate(dst_T_src[:3, :3]):
         rotated[..., row] = x * along_x + y * along_y + z * along_z  # not `@`: see `multiply`
     return rotated

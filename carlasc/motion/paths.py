@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import rotation_z, thin
-from carlasc.motion.registration import best_sighting, follow, nearest_points
+from carlasc.motion.registration import best_sighting, follow, middles_of, nearest_points
 from carlasc.motion.smoothing import resample, smooth
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
@@ -47,11 +47,10 @@ def estimate_path(
     if len(enough) < 2:
         middle = np.mean(chosen[0], axis=0) if chosen else np.zeros(3)
         return np.tile(middle, (len(seconds), 1)), np.zeros((len(seconds), 3))
-    path = (
-        follow(chosen, at) if rigid else np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in chosen])
-    )
+    best = best_sighting(chosen)
+    path = follow(chosen, at, best) if rigid else middles_of(chosen)
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
-    velocities = _limit_acceleration(velocities, at, best_sighting(chosen))
+    velocities = _limit_acceleration(velocities, at, best)
     return resample(seconds, at, positions, velocities)
 
 

@@ -5,7 +5,7 @@ import pytest
 from helpers.actors import PERIOD_S, MovingBox, box_surface, scan_of
 
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.motion.registration import follow
+from carlasc.motion.registration import best_sighting, follow
 
 FRAMES = range(25)
 SECONDS = np.array(FRAMES) * PERIOD_S
@@ -105,5 +105,6 @@ class TestStanding:
 
 def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
     actor = MovingBox((10, 6, 0), speed=8.0)
-    path = follow(sightings_of(actor), SECONDS)
+    sightings = sightings_of(actor)
+    path = follow(sightings, SECONDS, best_sighting(sightings))
     assert np.abs(np.diff(path, axis=0) - (0.8, 0, 0)).max() < 0.1

@@ -1,0 +1,185 @@
+"""What was seen of a rigid actor so far: points with the planes around them, to which a sighting is registered.
+
+The model grows with each sighting, and only what is new is computed then. The sums that give a plane are kept for each point, and new
+points enter the sums of their neighbours in the order in which a sum over all points takes them. So the planes have the same bits as
+if they were computed anew.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import Transform, thin
+
+_CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most so many
+_PLANE_M = 0.5  # radius of the neighbourhood in which planes are estimated
+_LINE_M = 0.06  # points with a smaller standard deviation across form a line, which has no plane
+_SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
+_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])  # where the last six are in a (3, 3) matrix
+
+
+class Planes:
+    """The points of an actor that were seen so far, and the planes around them.
+
+    Attributes:
+        points: (M, 3) metres, actor frame.
+        normals: (M, 3) normals of the planes. Their length, at most 1, grows with the flatness of the points. The normal of a single
+            point or of a line has length 0.
+    """
+
+    def __init__(self, points: NDArray[np.float64]) -> None:
+        """Take the points of a sighting, (N, 3) metres, actor frame, N > 0."""
+        self.points, self.normals, self._sums = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, _SUMS))
+        self.add(points)
+
+    def add(self, points: NDArray[np.float64]) -> None:
+        """Add those of (N, 3) points, metres, actor frame, that are in cells without a point."""
+        joined, known = np.concatenate([self.points, points]), len(self.points)
+        joined = joined[first_of_cells(np.floor(joined / _CELL_M).astype(np.int64))]
+        if len(joined) > _POINTS:
+            joined, known = thin(joined, _POINTS), 0
+        elif len(joined) == known:
+            return
+        normals, sums = np.zeros((len(joined), 3)), np.zeros((len(joined), _SUMS))
+        normals[:known], sums[:known] = self.normals[:known], self._sums[:known]
+        changed = extend_sums(joined, known, _PLANE_M, sums)
+        normals[changed] = _normals(covariances(sums[changed]))
+        self.points, self.normals, self._sums = joined, normals, sums
+        self._widest = int(np.ptp(joined, axis=0).argmax())
+        self._order = np.argsort(joined[:, self._widest], kind="stable")
+        self._sorted = joined[self._order]
+
+    def near(
+        self, points: NDArray[np.float64], world_T_actor: Transform, squared_m: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pair the points of a sighting with the nearest points of the model.
+
+        Args:
+            points: (N, 3) metres, world.
+            world_T_actor: (4, 4) pose of the actor.
+            squared_m: the square of a distance: points that are not nearer than this to the model have no pair.
+
+        Returns:
+            (P,) indices of points that have a pair, increasing, and (P,) indices of the points of the model, the lowest of several.
+        """
+        return nearest_within(points, world_T_actor, self._sorted, self._order, self._widest, squared_m)
+
+
+def covariances(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (N, 3, 3) covariances of the points whose (N, 10) sums `extend_sums` made."""
+    counts, totals = sums[:, 0, None, None], sums[:, 1:4]
+    return sums[:, _SQUARES] / counts - totals[:, :, None] * totals[:, None, :] / (counts * counts)
+
+
+def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (N, 3) normals of planes through points with (N, 3, 3) covariances."""
+    values, vectors = np.linalg.eigh(covariances)
+    flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
+    flat[values[:, 1] < _LINE_M**2] = 0.0
+    return vectors[:, :, 0] * np.sqrt(flat)[:, None]
+
+
+@numba.njit(cache=True, nogil=True)
+def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (N,) which of (N, 3) cells are different from those before them."""
+    size = 2
+    while size < 2 * len(cells):
+        size *= 2
+    table = np.full(size, -1, np.int64)  # the index of the first row of each cell, at the hash of the cell or after it
+    first = np.zeros(len(cells), np.bool_)
+    for i in range(len(cells)):
+        x, y, z = cells[i]
+        slot = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
+        while table[slot] >= 0:
+            other = cells[table[slot]]
+            if other[0] == x and other[1] == y and other[2] == z:
+                break
+            slot = (slot + 1) & (size - 1)
+        else:
+            table[slot], first[i] = i, True
+    return first
+
+
+@numba.njit(cache=True, nogil=True)
+def extend_sums(model: NDArray[np.float64], known: int, radius: float, sums: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Add new points to the sums of the points within a radius of each point.
+
+    Args:
+        model: (M, 3) points.
+        known: number of the first of them that are already in the sums of each other.
+        radius: of the neighbourhood.
+        sums: (M, 10) over the neighbours of each point, of the offsets from it: 1, x, y, z, xx, xy, xz, yy, yz and zz. Is changed.
+
+    Returns:
+        (M,) whether the sums of a point changed.
+    """
+    changed = np.zeros(len(model), np.bool_)
+    for i in range(len(model)):
+        own = sums[i]
+        for j in range(known if i < known else 0, len(model)):
+            x, y, z = model[j, 0] - model[i, 0], model[j, 1] - model[i, 1], model[j, 2] - model[i, 2]
+            if x * x + y * y + z * z < radius * radius:
+                changed[i] = True
+                own[0] += 1
+                own[1] += x
+                own[2] += y
+                own[3] += z
+                own[4] += x * x
+                own[5] += x * y
+                own[6] += x * z
+                own[7] += y * y
+                own[8] += y * z
+                own[9] += z * z
+    return changed
+
+
+@numba.njit(cache=True, nogil=True)
+def nearest_within(
+    points: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    model: NDArray[np.float64],
+    order: NDArray[np.int64],
+    axis: int,
+    squared: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return what `Planes.near` returns, from points of the model that are sorted along an axis.
+
+    The search goes from the place of a point on the axis outwards, until all others are farther away along this axis alone.
+
+    Args:
+        points: (N, 3) points.
+        pose: (4, 4) from the frame of the model to that of the points, rigid.
+        model: (M, 3) points, sorted.
+        order: (M,) index of each of them before it was sorted.
+        axis: along which they are sorted.
+        squared: the square of the distance that pairs must be nearer than.
+    """
+    along, count, last = model[:, axis].copy(), 0, len(model) - 1
+    rows, nearest = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    place, moved = np.empty(3), np.empty(3)
+    for a in range(3):  # the operations of `invert` and `transform_points`, in their order
+        place[a] = -(pose[0, a] * pose[0, 3] + pose[1, a] * pose[1, 3] + pose[2, a] * pose[2, 3])
+    for i in range(len(points)):
+        for a in range(3):
+            moved[a] = (points[i, 0] * pose[0, a] + points[i, 1] * pose[1, a] + points[i, 2] * pose[2, a]) + place[a]
+        after = np.searchsorted(along, moved[axis])
+        before, best, found = after - 1, squared, -1
+        behind = moved[axis] - along[before] if before >= 0 else np.inf
+        ahead = along[after] - moved[axis] if after <= last else np.inf
+        while behind**2 <= best or ahead**2 <= best:
+            if behind < ahead:
+                k, before = before, before - 1
+                behind = moved[axis] - along[before] if before >= 0 else np.inf
+            else:
+                k, after = after, after + 1
+                ahead = along[after] - moved[axis] if after <= last else np.inf
+            x, y, z = moved[0] - model[k, 0], moved[1] - model[k, 1], moved[2] - model[k, 2]
+            distance = x * x + y * y + z * z
+            if distance < best or (distance == best and order[k] < found):
+                best, found = distance, order[k]
+        if found >= 0:
+            rows[count], nearest[count] = i, found
+            count += 1
+    return rows[:count], nearest[:count]

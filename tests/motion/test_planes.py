@@ -1,0 +1,126 @@
+"""The model of an actor grows point by point; it must be what one makes of all points at once."""
+
+import numpy as np
+import pytest
+
+from carlasc.core.geometry import invert, rotation_z, thin, transform_points, translation
+from carlasc.motion.planes import Planes, covariances, extend_sums, first_of_cells, nearest_within
+
+CELL_M, MOST, RADIUS_M = 0.15, 1200, 0.5
+
+
+def sighting(rng, count=300):
+    """Two sides of a car, some of whose points are in cells that another sighting had."""
+    points = rng.uniform(0, 1, (count, 3)) * (4.4, 1.8, 1.5)
+    points[: count // 2, 1] = 0
+    points[count // 2 :, 0] = 4.4
+    return points + rng.normal(0, 0.02, points.shape)
+
+
+def plain_sums(model):
+    """Return the sums of each point's neighbours, added one after the other."""
+    sums = np.zeros((len(model), 10))
+    for number, point in enumerate(model):
+        for x, y, z in (model - point)[np.sum((model - point) ** 2, axis=1) < RADIUS_M**2]:
+            sums[number] += (1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    return sums
+
+
+def plain_thin(points):
+    _, first = np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_index=True)
+    return thin(points[np.sort(first)], MOST)
+
+
+def test_covariances_are_those_of_the_points_within_the_radius():
+    model = np.random.default_rng(0).uniform(-1, 1, (60, 3)) * (1, 1, 0.1)
+    sums = np.zeros((60, 10))
+    assert extend_sums(model, 0, RADIUS_M, sums).all()
+    for point, covariance in zip(model, covariances(sums), strict=True):
+        near = model[np.square(model - point).sum(axis=1) < RADIUS_M**2]
+        assert np.allclose(covariance, np.cov(near, rowvar=False, bias=True) if len(near) > 1 else 0, atol=1e-12)
+
+
+def test_sums_that_grow_have_the_same_bits_as_sums_over_all_points():
+    model, sums, known = sighting(np.random.default_rng(1), 120), np.zeros((120, 10)), 0
+    for count in (50, 51, 90, 120):
+        before = sums[:count].copy()
+        changed = extend_sums(model[:count], known, RADIUS_M, sums[:count])
+        assert np.array_equal(sums[:count], plain_sums(model[:count]))
+        assert np.array_equal(changed, (sums[:count] != before).any(axis=1))
+        known = count
+    assert not changed[:90].all()  # few of the old points are near the last ones
+
+
+@pytest.mark.parametrize(
+    "size", [1.0, 4.0]
+)  # the larger actor has more points than a model may have, so that it is thinned
+def test_a_model_that_grows_is_the_model_of_all_points(size):
+    rng = np.random.default_rng(2)
+    model, plain, thinned = None, np.empty((0, 3)), False
+    for _ in range(8):
+        points = sighting(rng) * size
+        plain = plain_thin(np.concatenate([plain, points]))
+        if model is None:
+            model = Planes(points)
+        else:
+            thinned |= len(plain) < len(model.points)
+            model.add(points)
+        assert np.array_equal(model.points, plain)
+    assert thinned == (size > 1)
+    anew = Planes(model.points)
+    assert np.array_equal(model.points, anew.points)
+    assert np.array_equal(model.normals, anew.normals)
+
+
+def test_points_in_cells_that_are_known_change_nothing():
+    points = sighting(np.random.default_rng(3))
+    model = Planes(points)
+    before = model.points, model.normals
+    model.add(points[::-1])
+    assert (model.points, model.normals) == before
+
+
+def test_a_side_has_its_normal_and_a_line_or_a_point_none():
+    rng = np.random.default_rng(4)
+    side = Planes(rng.uniform(0, 1, (200, 3)) * (2, 0, 1.5))
+    assert np.allclose(np.abs(side.normals), (0, 1, 0), atol=1e-6)
+    assert not Planes(np.linspace((0, 0, 0), (3, 0, 0), 50)).normals.any()
+    assert not Planes(np.ones((1, 3))).normals.any()
+
+
+def test_first_rows_of_cells_are_those_that_numpy_finds():
+    cells = np.random.default_rng(5).integers(-3, 3, (400, 3)) * (1, 1 << 40, 1)
+    first = np.zeros(len(cells), np.bool_)
+    first[np.unique(cells, axis=0, return_index=True)[1]] = True
+    assert np.array_equal(first_of_cells(cells), first)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_pairs_are_those_of_all_distances(axis):
+    """Coordinates on a raster have many equal distances, of which the first point counts."""
+    rng = np.random.default_rng(axis)
+    model, points = rng.integers(0, 6, (200, 3)) / 4.0, rng.integers(-4, 12, (80, 3)) / 4.0
+    pose = translation((0.25, -0.5, 0))
+    order = np.argsort(model[:, axis], kind="stable")
+    squared = np.square(transform_points(invert(pose), points)[:, None] - model).sum(axis=2)
+    for most in (0.0, 0.0625, 0.5, 9.0):
+        rows, nearest = nearest_within(points, pose, model[order], order, axis, most)
+        assert np.array_equal(rows, np.flatnonzero(squared.min(axis=1) < most))
+        assert np.array_equal(nearest, squared.argmin(axis=1)[rows])
+
+
+def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
+    rng = np.random.default_rng(6)
+    model, points = Planes(sighting(rng)), sighting(rng) + (30, -20, 1)
+    pose = translation((30.2, -20.1, 1)) @ rotation_z(0.1)
+    squared = np.square(transform_points(invert(pose), points)[:, None] - model.points).sum(axis=2)
+    rows, nearest = model.near(points, pose, 0.04)
+    assert np.array_equal(rows, np.flatnonzero(squared.min(axis=1) < 0.04))
+    assert np.array_equal(nearest, squared.argmin(axis=1)[rows])
+    assert 50 < len(rows) < 300
+
+
+def test_a_pose_that_is_not_finite_pairs_nothing():
+    model = Planes(sighting(np.random.default_rng(7)))
+    rows, nearest = model.near(model.points, np.full((4, 4), np.nan), 1.0)
+    assert len(rows) == len(nearest) == 0
