@@ -9,6 +9,7 @@ straight road, for instance, a mirrored y axis makes none.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -16,14 +17,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.inspection.matching import match
 from carlasc.inspection.misfit import Misfit, explain_misfit
-from carlasc.inspection.structure import MAX_RANGE_M
+from carlasc.inspection.overlap import VOXEL_M, occupancy, overlap
 
 Poses: TypeAlias = NDArray[np.float64]
 
-_VOXEL_M = 0.4
 _LEVER_M = 15.0  # motions are compared by what they do to a point at this distance
 _DIFFERENT_M = 0.3
 _MIN_POINTS = 150
@@ -105,20 +105,24 @@ def diagnose_poses(
     corrections = known_corrections()
     corrected = [poses, *(correction.undo(poses) for correction in corrections)]
     pairs, scans, shares, judged = [], [], [], []
-    for earlier, later in choose_pairs(poses, max_pairs):
-        target, moved = structure(earlier), _thin(structure(later), _MAX_POINTS)
+    chosen = choose_pairs(poses, max_pairs)
+    structure = _Once(structure, Counter(itertools.chain.from_iterable(chosen)))
+    for earlier, later in chosen:
+        target, source = structure(earlier), structure(later)
+        moved = _thin(source, _MAX_POINTS)
         if min(len(target), len(moved)) < _MIN_POINTS:
             continue
-        occupied = _occupancy(target)
-        motions = [relative(candidate, earlier, later) for candidate in corrected]
-        distances = [_distance(motion, motions[0]) for motion in motions]
-        own = _share(occupied, transform_points(motions[0], moved))
+        occupied = occupancy(target)
+        ends = np.stack([candidate[[earlier, later]] for candidate in corrected])
+        motions = invert(ends[:, 0]) @ ends[:, 1]
+        distances = [_extent(between) for between in invert(motions) @ motions[0]]
+        own = overlap(occupied, motions[0], moved)
         pairs.append((earlier, later))
-        scans.append((target, moved))
+        scans.append((target, moved, _thin(source, _OFFSET_POINTS)))
         judged.append([distance > _JUDGED_M for distance in distances])
         shares.append(
             [
-                _share(occupied, transform_points(motion, moved)) if distance > _SAME_M else own
+                overlap(occupied, motion, moved) if distance > _SAME_M else own
                 for motion, distance in zip(motions, distances, strict=True)
             ]
         )
@@ -129,13 +133,12 @@ def diagnose_poses(
     if best is not None:
         index, share_there, corrected_share = best
         return PoseDiagnosis(own, len(pairs), corrections[index - 1], corrected_share, share_there)
-    motions = [relative(poses, earlier, later) for earlier, later in pairs]
-    matches = [match(target, moved, motion) for (target, moved), motion in zip(scans, motions, strict=True)]
+    ways = [relative(poses, earlier, later) for earlier, later in pairs]
+    matches = [match(target, moved, way) for (target, moved, _), way in zip(scans, ways, strict=True)]
     misfit = explain_misfit(poses, pairs, matches)
     search = misfit is None and own < _GOOD
-    return PoseDiagnosis(
-        own, len(pairs), misfit=misfit, offset_m=_common_offset(structure, poses, pairs) if search else None
-    )
+    overlaps = [(target, few, way) for (target, _, few), way in zip(scans, ways, strict=True)]
+    return PoseDiagnosis(own, len(pairs), misfit=misfit, offset_m=_common_offset(overlaps) if search else None)
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
@@ -210,28 +213,30 @@ def _best_correction(
 
 
 def _common_offset(
-    structure: Callable[[int], NDArray[np.float64]], poses: Poses, pairs: list[tuple[int, int]]
+    overlaps: list[tuple[NDArray[np.float64], NDArray[np.float64], Transform]],
 ) -> tuple[float, float, float] | None:
-    """Return the median of the offsets at which the later scans of pairs overlap best; None if few pairs have a clear one."""
-    steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * _VOXEL_M
-    offsets, chosen = [], pairs[:: max(1, len(pairs) // _OFFSET_PAIRS)]
-    for earlier, later in chosen:
-        occupied = _occupancy(structure(earlier))
-        motion = relative(poses, earlier, later)
-        moved = transform_points(motion, _thin(structure(later), _OFFSET_POINTS))
-        shares = np.array([_share(occupied, moved + step) for step in steps])
+    """Return the median of the offsets at which the later scans of pairs overlap best; None if few pairs have a clear one.
+
+    Args:
+        overlaps: (M, 3) structure of the earlier scan and (N, 3) some of the later one of each pair, and earlier_T_later.
+    """
+    steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * VOXEL_M
+    offsets, chosen = [], overlaps[:: max(1, len(overlaps) // _OFFSET_PAIRS)]
+    for target, later, motion in chosen:
+        occupied, moved = occupancy(target), transform_points(motion, later)
+        shares = np.array([overlap(occupied, translation(step), moved) for step in steps])
         if shares.max() > shares[len(steps) // 2] + _CLEAR_OFFSET:
             offsets.append((-steps[shares.argmax()], motion[:3, 3]))
     # where the scan fits as if it had not moved, it is vehicles that keep pace that fit
     offsets = [
         offset
         for offset, way in offsets
-        if np.abs(offset).max() > 1.5 * _VOXEL_M and np.abs(offset - way).max() > 1.5 * _VOXEL_M
+        if np.abs(offset).max() > 1.5 * VOXEL_M and np.abs(offset - way).max() > 1.5 * VOXEL_M
     ]
     if len(offsets) < max(1, _OFFSET_SHARE * len(chosen)):
         return None
     x, y, z = np.median(offsets, axis=0).tolist()
-    return (x, y, z) if max(abs(x), abs(y), abs(z)) > _VOXEL_M else None
+    return (x, y, z) if max(abs(x), abs(y), abs(z)) > VOXEL_M else None
 
 
 def _partner(poses: Poses, first: int) -> int:
@@ -247,24 +252,24 @@ def _partner(poses: Poses, first: int) -> int:
     return last
 
 
-def _occupancy(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a grid of cells of 0.4 m about the sensor: which of them hold points."""
-    cells = int(2 * MAX_RANGE_M / _VOXEL_M)
-    occupied = np.zeros((cells, cells, cells), np.bool_)
-    occupied[tuple(_cells(points)[0].T)] = True
-    return occupied
+class _Once:
+    """The structure of scans, each of which is read once and kept until its last use.
 
+    Args:
+        structure: returns the structure of the i-th scan.
+        uses: how often each scan will be asked for.
+    """
 
-def _cells(points: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    cells = np.floor((points + MAX_RANGE_M) / _VOXEL_M)
-    inside = np.all((cells >= 0) & (cells < int(2 * MAX_RANGE_M / _VOXEL_M)), axis=1)
-    return cells[inside].astype(np.int32), inside
+    def __init__(self, structure: Callable[[int], NDArray[np.float64]], uses: Counter[int]) -> None:
+        self._structure, self._uses = structure, uses
+        self._kept: dict[int, NDArray[np.float64]] = {}
 
-
-def _share(occupied: NDArray[np.bool_], points: NDArray[np.float64]) -> float:
-    """Return the share of the points that are in occupied cells."""
-    cells, _ = _cells(points)
-    return float(np.count_nonzero(occupied[tuple(cells.T)])) / len(points)
+    def __call__(self, index: int) -> NDArray[np.float64]:
+        """Return (M, 3) points."""
+        if index not in self._kept:
+            self._kept[index] = self._structure(index)
+        self._uses[index] -= 1
+        return self._kept[index] if self._uses[index] else self._kept.pop(index)
 
 
 def _thin(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
@@ -277,8 +282,12 @@ def _angle(motion: Transform) -> float:
 
 def _distance(a: Transform, b: Transform) -> float:
     """Return about how far apart, in metres, two motions put a point that is 15 m away."""
-    between = invert(a) @ b
-    return float(np.linalg.norm(between[:3, 3]) + _LEVER_M * _angle(between))
+    return _extent(invert(a) @ b)
+
+
+def _extent(motion: Transform) -> float:
+    """Return about how far, in metres, a motion moves a point that is 15 m away."""
+    return float(np.linalg.norm(motion[:3, 3]) + _LEVER_M * _angle(motion))
 
 
 def _transpose(poses: Poses) -> Poses:

@@ -75,7 +75,11 @@ class _Cells:
         self.lower = np.floor(points.min(axis=0) / cell_m) - 1
         self.size = (np.floor(points.max(axis=0) / cell_m) - self.lower + 2).astype(np.int64)
         flat = self._flat(points)
-        cells, row, counts = np.unique(flat, return_inverse=True, return_counts=True)
+        counts = np.bincount(flat, minlength=int(self.size.prod()))
+        cells, counts = np.flatnonzero(counts), counts[counts > 0]
+        self.row = np.full(int(self.size.prod()), -1)
+        self.row[cells] = np.arange(len(cells))
+        row = self.row[flat]
         means = np.stack([np.bincount(row, points[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
         off = points - means[row]
         spread = np.zeros((len(counts), 3, 3))
@@ -85,8 +89,7 @@ class _Cells:
         spread += _POINT_M**2 * np.eye(3)
         good = counts >= _CELL_POINTS
         self.means, self.inverse = means[good], np.linalg.inv(spread[good])
-        self.row = np.full(int(self.size.prod()), -1)
-        self.row[cells[good]] = np.arange(np.count_nonzero(good))
+        self.row[cells] = np.where(good, np.cumsum(good) - 1, -1)
 
     def pull(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (6, 6) the information, and (6,) the pull, of the motion of points (N, 3) towards the distributions of their cells."""

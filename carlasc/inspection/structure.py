@@ -6,6 +6,7 @@ the poses of a sensor that does not move. Points on moving objects, and points s
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,9 +35,7 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
         CarlascError: the points cannot be read.
     """
     points = np.asarray(sequence.read("points", frame))[:, :3]
-    keep = np.isfinite(points).all(axis=1)
-    distance = np.linalg.norm(np.where(keep[:, None], points, 0.0), axis=1)
-    keep &= (distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)
+    keep = within(points, points.dtype.type(MIN_RANGE_M), points.dtype.type(MAX_RANGE_M))
     labels = _per_point(sequence, "labels", frame, len(points))
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(sequence.metadata.classes)[
@@ -47,7 +46,17 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     flow = _per_point(sequence, "flow", frame, len(points))
     if flow is not None:
         keep &= np.abs(flow).max(axis=1, initial=0.0) < 0.1
-    return points[keep].astype(np.float64)
+    return points[np.flatnonzero(keep)].astype(np.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDArray[np.bool_]:
+    """Return (N,) which of (N, 3) points have a distance from the sensor between two others. Points that are not finite have none."""
+    found = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        found[i] = nearest < np.sqrt(x * x + y * y + z * z) < farthest
+    return found
 
 
 def upright(points: NDArray[np.floating]) -> NDArray[np.float64]:
