@@ -268,7 +268,8 @@ def choose_frames(frames: FrameRange, available: NDArray[np.int64], where: str) 
     chosen: list[int] = frames.select(available).tolist()
     if not chosen:
         found = f"only {available[0]} to {available[-1]}" if len(available) else "none"
-        raise MissingDataError(where, expected=f"frames in {frames}", found=found)
+        expected = "frames" if frames == FrameRange() else f"frames in {frames}"
+        raise MissingDataError(where, expected=expected, found=found)
     return chosen
 
 

@@ -9,10 +9,12 @@ from helpers.captures import make_recording, read_tree, write_capture
 
 from carlasc.captures.raw import Capture
 from carlasc.captures.writing import CaptureWriter
+from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.groundtruth import FromCapture, FromScans, Observation, Voting, count_votes, regrid
+from carlasc.groundtruth.inputs import choose_frames
 from carlasc.storage import FolderSource, Sink, layout
 from carlasc.storage.sinks import SequenceWriter
 
@@ -175,6 +177,11 @@ def test_a_range_without_frames_says_which_there_are(tmp_path, frames):
     with pytest.raises(MissingDataError, match="expected frames in .*, found only 100 to 102"):
         regrid(tmp_path, SMALL, frames=frames)
     assert not (tmp_path / "cartesian").exists()
+
+
+def test_a_sequence_without_any_frame_says_so():
+    with pytest.raises(MissingDataError, match="^a sequence: expected frames, found none$"):
+        choose_frames(FrameRange(), np.array([], np.int64), "a sequence")
 
 
 def test_several_sequences_keep_their_paths(tmp_path):
