@@ -8,7 +8,6 @@ with unknown voxels is not rated lower than a full one.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +40,7 @@ _STEPS = (-1, 0, 1)
 _SHIFTS = tuple(  # nearest first
     sorted(((x, y, z) for x in _STEPS for y in _STEPS for z in _STEPS if x or y or z), key=lambda s: sum(map(abs, s)))
 )
+_AS_IS_AND_SHIFTED = np.array([(0, 0, 0), *_SHIFTS], np.int64)
 
 
 @dataclass(frozen=True)
@@ -80,24 +80,23 @@ class GridEvidence:
             labels: (N,) class ids; points with id 0 are unlabelled and left out. None compares with any class but free.
             grid: the grid of this frame, with geometry `spec`.
         """
-        if labels is not None:
-            points, labels = points[labels != 0], labels[labels != 0]
-        step = max(1, len(points) // _MAX_POINTS)
-        points, labels = points[::step], None if labels is None else labels[::step]
-        as_is = _place(points, self.spec)
-        own = _look_up(as_is, labels, grid)
-        matches = [own, *(_look_up(_place(points @ matrix.T, self.spec), labels, grid) for _, matrix in _AXES)]
-        if max(match.known.sum() for match in matches) < _MIN_POINTS:
+        from carlasc.inspection.lookups import KNOWN, OCCUPIED, RIGHT, Voxels
+
+        if labels is None:  # a voxel of any class but free is right
+            labels, chosen, right = np.zeros(len(points), np.uint8), np.arange(len(points)), OCCUPIED
+        else:
+            chosen, right = np.flatnonzero(labels), RIGHT
+        chosen = chosen[:: max(1, len(chosen) // _MAX_POINTS)]
+        points, labels, voxels = points[chosen], labels[chosen], Voxels(grid)
+        as_is = voxels.count(points, labels, _AS_IS_AND_SHIFTED)
+        exact = points.astype(np.float64)
+        turned = [voxels.count(exact @ matrix.T, labels, _AS_IS_AND_SHIFTED[:1]) for _, matrix in _AXES]
+        counted = np.concatenate([as_is[:1], *turned, as_is[1:]])
+        if counted[: 1 + len(_AXES), KNOWN].max() < _MIN_POINTS:
             return
-        for shift in _SHIFTS:
-            shifted, within = as_is.shifted(shift, self.spec)
-            moved = _look_up(shifted, labels, grid)
-            # points whose voxel is outside the grid after the shift count as they did before
-            matches.append(_Match(*(np.append(new, old[~within]) for new, old in zip(moved, own, strict=True))))
-        self._right.append(np.array([np.count_nonzero(match.right) for match in matches]))
-        self._known.append(np.array([np.count_nonzero(match.known) for match in matches]))
-        occupied = _look_up(as_is, None, grid)
-        self._occupied.append(float(occupied.right.sum() / max(occupied.known.sum(), 1)))
+        self._right.append(counted[:, right])
+        self._known.append(counted[:, KNOWN])
+        self._occupied.append(float(as_is[0, OCCUPIED] / max(as_is[0, KNOWN], 1)))
 
     def diagnose(self) -> GridDiagnosis:
         """Return the share of right points over the frames added so far, and the mistake, if any, that explains it.
@@ -124,41 +123,6 @@ class GridEvidence:
         if best == 0:
             return GridDiagnosis(own, occupied, len(right))
         return GridDiagnosis(own, occupied, len(right), _mistake(best, self.spec), corrected)
-
-
-@dataclass(frozen=True)
-class _Placement:
-    """The points that are in a grid: their cells (M, 3), and their indices (M,) among all points."""
-
-    cells: NDArray[np.int32]
-    points: NDArray[np.int64]
-
-    def shifted(self, shift: tuple[int, int, int], spec: GridSpec) -> tuple[_Placement, NDArray[np.bool_]]:
-        """Return the placement in a grid whose labels are `shift` cells too far along its axes, and (M,) which cells are still inside."""
-        cells = self.cells + np.array(shift, np.int32)
-        if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
-            cells[:, 1] %= spec.size[1]  # the azimuth is periodic
-        within = np.all((cells >= 0) & (cells < np.array(spec.size)), axis=1)
-        return _Placement(cells[within], self.points[within]), within
-
-
-class _Match(NamedTuple):
-    """For each point in the grid, whether its voxel is known, and whether it is known and has the class of the point."""
-
-    known: NDArray[np.bool_]
-    right: NDArray[np.bool_]
-
-
-def _place(points: NDArray[np.floating], spec: GridSpec) -> _Placement:
-    cells, inside = spec.index(spec.to_axes(points))
-    return _Placement(cells[inside], np.flatnonzero(inside))
-
-
-def _look_up(placement: _Placement, labels: NDArray[np.integer] | None, grid: Grid) -> _Match:
-    index = np.ravel_multi_index(tuple(placement.cells.T), grid.spec.size)
-    voxels = grid.labels.reshape(-1)[index]
-    known = np.ones(len(voxels), np.bool_) if grid.counts is None else grid.counts.reshape(-1)[index] > 0
-    return _Match(known, known & (voxels != 0 if labels is None else voxels == labels[placement.points]))
 
 
 def _mistake(column: int, spec: GridSpec) -> str:

@@ -32,8 +32,9 @@ class GroundBelow:
 
     def add(self, ground: NDArray[np.float32]) -> None:
         """Add a frame's ground points (N, 3), metres, finite. Those outside of the grid's other bounds do not count."""
-        axes = self.spec.to_axes(ground)
-        inside = np.all((axes[:, :2] >= self.spec.lower[:2]) & (axes[:, :2] < self.spec.upper[:2]), axis=1)
+        axes, lower, upper = self.spec.to_axes(ground), np.array(self.spec.lower), np.array(self.spec.upper)
+        first, second = ((axes[:, a] >= lower[a]) & (axes[:, a] < upper[a]) for a in (0, 1))
+        inside = first & second
         self._heights.append(ground[inside, 2])
 
     @property

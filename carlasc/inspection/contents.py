@@ -153,11 +153,12 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
 
 
 def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
-    rows = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-    if not rows.all():
+    finite = np.isfinite(array)
+    if not finite.all():
+        rows = finite.all(axis=tuple(range(1, array.ndim)))
         found = f"NaN or infinity in {int((~rows).sum())} rows, first in row {int(np.argmin(rows))}"
         yield Finding("error", "not-finite", sequence.path, where, "finite numbers", found)
-    elif name == "flow" and len(rows) and float(np.abs(array).max()) > _FASTEST_M_S:
+    elif name == "flow" and len(array) and float(np.abs(array).max()) > _FASTEST_M_S:
         found = f"{float(np.abs(array).max()):.0f} m/s"
         yield Finding("warning", "flow", sequence.path, where, f"velocities below {_FASTEST_M_S:.0f} m/s", found)
 

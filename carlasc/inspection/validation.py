@@ -198,7 +198,8 @@ def _measure_grids(
 def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
     """Read the points that a grid is made from: finite, and within the ranges given in carlasc.json."""
     scan = sequence.scan(frame, ("labels",))
-    distance = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    x, y, z = scan.points.T.astype(np.float64)
+    distance = np.sqrt(x * x + y * y + z * z)
     keep = np.isfinite(distance) & (distance >= (sequence.metadata.min_range_m or 0.0))
     keep &= distance <= (sequence.metadata.max_range_m or np.inf)
     labels = None if scan.labels is None or not scan.labels.any() else scan.labels[keep]
