@@ -80,6 +80,10 @@ class _Chain:
     poses: list[Transform] = field(default_factory=list)
     points: list[NDArray[np.float32]] = field(default_factory=list)
 
+    def size(self) -> int:
+        """Return the number of points."""
+        return sum(map(len, self.points))
+
     @property
     def label(self) -> int:
         """The class of most sightings, the lowest of several."""
@@ -149,7 +153,8 @@ class ActorMotion:
             self._ended.append(chain)
 
     def _run(self) -> None:
-        chains, self._ended = self._ended, []
+        chains = sorted(self._ended, key=_Chain.size, reverse=True)  # so that no worker has a long one left at the end
+        self._ended = []
         with closing(run_all(self._estimate, chains, workers=self._workers, executor=self._executor)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):
                 for frame, velocity in zip(chain.frames, velocities, strict=True):

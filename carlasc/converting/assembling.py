@@ -86,7 +86,6 @@ def assemble(clouds: Sequence[Cloud], rig: Rig, motion: Motion | None, where: st
         _check(cloud, rig, where)
     placed = [_place(cloud, rig, motion) for cloud in clouds]
     points = np.concatenate([points for points, _ in placed]) if len(placed) > 1 else placed[0][0]
-    origins = np.concatenate([origins for _, origins in placed])
     fields: dict[str, NDArray[Any]] = {}
     if len(rig.sensors) > 1:
         fields["sensor"] = np.concatenate([np.full(len(cloud.points), cloud.sensor, np.uint8) for cloud in clouds])
@@ -94,8 +93,8 @@ def assemble(clouds: Sequence[Cloud], rig: Rig, motion: Motion | None, where: st
     if seconds is not None:
         fields["seconds"] = seconds
     # All frames of a recording have origins, or none has: also those in which the vehicle stands.
-    if origins.any() or any(_follows_motion(cloud, rig, motion) for cloud in clouds):
-        fields["origins"] = origins
+    if any(origins.any() for _, origins in placed) or any(_follows_motion(cloud, rig, motion) for cloud in clouds):
+        fields["origins"] = np.concatenate([origins for _, origins in placed])
     for name in clouds[0].others:
         fields[name] = np.concatenate([_other(cloud, name, rig, where) for cloud in clouds])
     labels = _joined([cloud.labels for cloud in clouds], clouds, np.uint32)
@@ -134,7 +133,7 @@ def _place(cloud: Cloud, rig: Rig, motion: Motion | None) -> tuple[NDArray[np.fl
         points = _moved(scan_T_points, cloud.points)
         if cloud.origins is not None:
             return points, transform_points(scan_T_points, cloud.origins).astype(np.float32)
-        return points, np.tile(_origin(sensor, scan_T_points), (len(points), 1))
+        return points, np.broadcast_to(_origin(sensor, scan_T_points), (len(points), 3))
     ticks, tick_of = np.unique(np.round(np.asarray(cloud.seconds, np.float64) / _TICK_S), return_inverse=True)
     now = motion.trajectory.at(np.array([motion.seconds]))[0]
     vehicle_T_then = invert(now) @ motion.trajectory.at(motion.seconds + ticks * _TICK_S)

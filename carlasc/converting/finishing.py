@@ -87,25 +87,25 @@ def fail_finish_block(block: FinishBlock, message: str) -> list[Outcome]:
 def _finish(job: FinishJob, block: FinishBlock) -> Outcome:
     outcome = Outcome(job.handle.number)
     add = _by_instances if job.tracks is None else _by_boxes
-    outcome.take(lambda: add(_read_back(job, block), job, block))
+    outcome.take(lambda: add(job, block))
     return outcome
 
 
-def _read_back(job: FinishJob, block: FinishBlock) -> Fields:
-    """Return points, instances, and labels of the data set, of a frame as they were written; only those that exist."""
+def _read_back(job: FinishJob, block: FinishBlock, *names: str) -> Fields:
+    """Return fields of a frame as they were written, only those that exist; labels only if they are of the data set."""
     number, writer = job.handle.number, block.writer
-    kept = ("points", "labels", "instances") if job.labelled else ("points", "instances")
-    fields = [name for name in kept if writer.has(name, number)]
-    written = {name: writer.read(name, number) for name in fields}
-    if "points" in written and all(array is not None for array in written.values()):
+    wanted = [name for name in names if job.labelled or name != "labels"]
+    written = {name: writer.read(name, number) for name in wanted if writer.has(name, number)}
+    if writer.has("points", number) and all(array is not None for array in written.values()):
         return {name: array for name, array in written.items() if array is not None}
     scan = assemble(job.handle.read(), block.rig, job.motion, job.handle.location)
     return make_fields(scan, block.target, job.handle.location)
 
 
-def _by_instances(written: Fields, job: FinishJob, block: FinishBlock) -> Fields:
+def _by_instances(job: FinishJob, block: FinishBlock) -> Fields:
     """Return the flow of a scan whose points have numbers: the velocity of each point's actor, zero for all other points."""
-    if "instances" not in written or not block.flow:
+    written = _read_back(job, block, "instances") if block.flow else {}
+    if "instances" not in written:
         return {}
     instances = written["instances"]
     flow = np.zeros((len(instances), 3), np.float32)
@@ -115,9 +115,10 @@ def _by_instances(written: Fields, job: FinishJob, block: FinishBlock) -> Fields
     return {"flow": mirror_points(flow) if block.target.mirrored else flow}
 
 
-def _by_boxes(written: Fields, job: FinishJob, block: FinishBlock) -> Fields:
+def _by_boxes(job: FinishJob, block: FinishBlock) -> Fields:
     """Return labels, instances, boxes and flow of a scan whose objects have boxes. Labels and instances of the data set are kept."""
     assert job.tracks is not None
+    written = _read_back(job, block, "points", "labels", "instances")
     classes, mirrored = block.target.classes, block.target.mirrored
     points = mirror_points(written["points"]) if mirrored else written["points"]
     labels = written.get("labels")
@@ -166,7 +167,7 @@ def _labelled_nearby(
     """Return points, in the frame of the scan of a job, and class ids of the labelled frames around it."""
     found = []
     for other in job.nearby:
-        written = _read_back(other, block)
+        written = _read_back(other, block, "points", "labels")
         if "labels" in written:
             points = mirror_points(written["points"]) if block.target.mirrored else written["points"]
             scan_T_other = invert(job.first_T_scan) @ other.first_T_scan

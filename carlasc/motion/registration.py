@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes
-from carlasc.motion.smoothing import smooth
+from carlasc.motion.smoothing import smooth_at
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _POINTS = 300  # number of points of a sighting that are registered to the model
@@ -51,8 +51,8 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
     middles = middles_of(sightings)
     states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
     states[best, :3] = middles[best]
-    initial = smooth(middles, seconds, np.minimum(counts, 200.0), _INITIAL_S)[1]
-    motion = np.append(initial[best], 0.0)  # of x, y, z and yaw per second
+    initial = smooth_at(best, middles, seconds, np.minimum(counts, 200.0), _INITIAL_S)[1]
+    motion = np.append(initial, 0.0)  # of x, y, z and yaw per second
     model = Planes(sightings[best] - middles[best])
     seen = 0
     for step, stop in ((1, len(counts)), (-1, -1)):
@@ -93,8 +93,8 @@ def _register(
     """
     state = predicted.copy()
     prior = expected = np.diag(1 / error**2)
-    for direction, _ in shifts:
-        row = np.append(direction, 0.0)
+    ways = [(np.append(direction, 0.0), direction, shift) for direction, shift in shifts]
+    for row, _, _ in ways:
         expected = expected + np.outer(row, row) / _ENDS_M**2
     first_reach = max(_FIRST_REACH_M, _DEVIATIONS * float(error[:2].max()))
     for iteration in range(_ITERATIONS):
@@ -102,8 +102,7 @@ def _register(
         pose = _pose(state)
         pairs, nearest = model.near(points, pose, reach**2)
         information, pull = expected, prior @ (predicted - state)
-        for direction, shift in shifts:
-            row = np.append(direction, 0.0)
+        for row, direction, shift in ways:
             pull = pull + row * (direction @ (previous - state[:3]) + shift) / _ENDS_M**2
         if len(pairs) >= 3:
             arm, normal = model.points[nearest] @ pose[:3, :3].T, model.normals[nearest] @ pose[:3, :3].T

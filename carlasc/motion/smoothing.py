@@ -21,22 +21,33 @@ def smooth(
         The (F, D) values of the fits, and their (F, D) derivatives per second.
     """
     smoothed, slopes = values.copy(), np.zeros_like(values)
-    for index, now in enumerate(seconds):
-        near = np.flatnonzero(np.abs(seconds - now) <= half_s + 1e-9)
-        if len(near) < 4:
-            near = np.sort(np.argsort(np.abs(seconds - now), kind="stable")[:4])
-        offsets = seconds[near] - now
-        degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
-        design = offsets[:, None] ** np.arange(degree + 1)
-        weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
-        for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
-            root = np.sqrt(weight)[:, None]
-            fit = np.linalg.lstsq(design * root, values[near] * root, rcond=None)[0]
-            error = np.linalg.norm(values[near] - design @ fit, axis=1)
-            weight = weight / (1 + (error / max(3 * _median(error), 0.02)) ** 2)
-        smoothed[index] = fit[0]
-        slopes[index] = fit[1] if degree else 0.0
+    for index in range(len(seconds)):
+        smoothed[index], slopes[index] = smooth_at(index, values, seconds, weights, half_s)
     return smoothed, slopes
+
+
+def smooth_at(
+    index: int,
+    values: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    half_s: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what `smooth` returns for the time of one index alone: (D,) and (D,)."""
+    distance = np.abs(seconds - seconds[index])
+    near = np.flatnonzero(distance <= half_s + 1e-9)
+    if len(near) < 4:
+        near = np.sort(np.argsort(distance, kind="stable")[:4])
+    offsets = seconds[near] - seconds[index]
+    degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
+    design, own = offsets[:, None] ** np.arange(degree + 1), values[near]
+    weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
+    for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
+        root = np.sqrt(weight)[:, None]
+        fit = np.linalg.lstsq(design * root, own * root, rcond=None)[0]
+        error = np.linalg.norm(own - design @ fit, axis=1)
+        weight = weight / (1 + (error / max(3 * _median(error), 0.02)) ** 2)
+    return fit[0], fit[1] if degree else np.zeros_like(fit[0])
 
 
 def _median(values: NDArray[np.float64]) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carlasc.motion.smoothing import resample, smooth
+from carlasc.motion.smoothing import _median, resample, smooth, smooth_at
 
 TIMES = np.arange(40) * 0.1
 
@@ -41,3 +41,17 @@ def test_a_path_goes_on_at_its_last_velocity():
     path, speed = resample(np.array([-1.0, 0.5, 3.0]), np.array([0.0, 1.0]), positions, velocities)
     assert path[:, 0].tolist() == [-1.0, 1.0, 8.0]
     assert speed[:, 0].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_one_time_alone_is_smoothed_as_among_all():
+    values = np.random.default_rng(1).normal(size=(40, 3))
+    weights = np.random.default_rng(2).uniform(1, 200, 40)
+    smoothed, slopes = smooth(values, TIMES, weights, 0.4)
+    for index in (0, 7, 39):
+        assert np.array_equal(smooth_at(index, values, TIMES, weights, 0.4), (smoothed[index], slopes[index]))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8])
+def test_the_weights_of_outliers_follow_the_median_of_numpy(count):
+    values = np.random.default_rng(count).exponential(size=count)
+    assert _median(values) == np.median(values)
