@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,20 +73,15 @@ class _Cells:
 
     def __init__(self, points: NDArray[np.float64], cell_m: float) -> None:
         self.cell_m = cell_m
-        self.lower = np.floor(points.min(axis=0) / cell_m) - 1
-        self.size = (np.floor(points.max(axis=0) / cell_m) - self.lower + 2).astype(np.int64)
+        lower, upper = bounds(points)
+        self.lower = np.floor(lower / cell_m) - 1
+        self.size = (np.floor(upper / cell_m) - self.lower + 2).astype(np.int64)
         flat = self._flat(points)
-        counts = np.bincount(flat, minlength=int(self.size.prod()))
-        cells, counts = np.flatnonzero(counts), counts[counts > 0]
         self.row = np.full(int(self.size.prod()), -1)
+        self.row[flat] = 0
+        cells = np.flatnonzero(self.row == 0)
         self.row[cells] = np.arange(len(cells))
-        row = self.row[flat]
-        means = np.stack([np.bincount(row, points[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
-        off = points - means[row]
-        spread = np.zeros((len(counts), 3, 3))
-        for i in range(3):
-            for j in range(i + 1):
-                spread[:, i, j] = spread[:, j, i] = np.bincount(row, off[:, i] * off[:, j]) / counts
+        counts, means, spread = distributions(points, self.row[flat], len(cells))
         spread += _POINT_M**2 * np.eye(3)
         good = counts >= _CELL_POINTS
         self.means, self.inverse = means[good], np.linalg.inv(spread[good])
@@ -113,8 +109,69 @@ class _Cells:
         return rows.T @ columns, rows.T @ (weight[:, None] * scaled).reshape(-1)
 
     def _flat(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
-        cells = (np.floor(points / self.cell_m) - self.lower).astype(np.int64)
-        return np.ravel_multi_index(tuple(cells.T), tuple(self.size))
+        return flat_cells(points, self.cell_m, self.lower, self.size)
+
+
+@numba.njit(cache=True, nogil=True)
+def bounds(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the least and the greatest coordinates of (N, 3) points, N > 0."""
+    lower, upper = points[0].copy(), points[0].copy()
+    for i in range(1, len(points)):
+        for a in range(3):
+            lower[a], upper[a] = min(lower[a], points[i, a]), max(upper[a], points[i, a])
+    return lower, upper
+
+
+@numba.njit(cache=True, nogil=True)
+def flat_cells(
+    points: NDArray[np.float64], cell_m: float, lower: NDArray[np.float64], size: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return (N,) the number of the cell of each of (N, 3) points that are inside of a grid.
+
+    Args:
+        points: metres.
+        cell_m: size of a cell.
+        lower: (3,) the first cell of the grid, counted from the origin.
+        size: (3,) number of cells.
+    """
+    flat = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        number = 0
+        for a in range(3):
+            number = number * size[a] + int(np.floor(points[i, a] / cell_m) - lower[a])
+        flat[i] = number
+    return flat
+
+
+@numba.njit(cache=True, nogil=True)
+def distributions(
+    points: NDArray[np.float64], row: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the number, (R,), the mean, (R, 3), and the covariance, (R, 3, 3), of the points of each cell.
+
+    Args:
+        points: (N, 3) metres.
+        row: (N,) the cell of each of them, of which each has a point.
+        count: R, the number of cells.
+    """
+    counts, means, spread = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for i in range(len(points)):
+        counts[row[i]] += 1
+        for a in range(3):
+            means[row[i], a] += points[i, a]
+    for r in range(count):
+        for a in range(3):
+            means[r, a] /= counts[r]
+    for i in range(len(points)):
+        r = row[i]
+        for a in range(3):
+            for b in range(3):
+                spread[r, a, b] += (points[i, a] - means[r, a]) * (points[i, b] - means[r, b])
+    for r in range(count):
+        for a in range(3):
+            for b in range(3):
+                spread[r, a, b] /= counts[r]
+    return counts, means, spread
 
 
 def _exp(step: NDArray[np.float64]) -> Transform:

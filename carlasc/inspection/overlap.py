@@ -18,9 +18,7 @@ _CELLS = int(2 * MAX_RANGE_M / VOXEL_M)
 def occupancy(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return the (C, C, C) cells about the sensor that hold points, (N, 3) metres, sensor frame."""
     occupied = np.zeros((_CELLS, _CELLS, _CELLS), np.bool_)
-    index = np.floor((points + MAX_RANGE_M) / VOXEL_M)
-    inside = np.all((index >= 0) & (index < _CELLS), axis=1)
-    occupied[tuple(index[inside].astype(np.int32).T)] = True
+    occupy(occupied, points, MAX_RANGE_M, VOXEL_M)
     return occupied
 
 
@@ -33,6 +31,17 @@ def overlap(occupied: NDArray[np.bool_], motion: Transform, points: NDArray[np.f
         points: (N, 3) metres, N > 0.
     """
     return count_occupied(occupied, motion, points, MAX_RANGE_M, VOXEL_M) / len(points)
+
+
+@numba.njit(cache=True, nogil=True)
+def occupy(occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: float, voxel_m: float) -> None:
+    """Mark the cells of a grid that hold points; the arguments are those of `count_occupied`."""
+    cells = len(occupied)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        a, b, c = (x + reach_m) / voxel_m, (y + reach_m) / voxel_m, (z + reach_m) / voxel_m
+        if 0 <= a < cells and 0 <= b < cells and 0 <= c < cells:
+            occupied[int(a), int(b), int(c)] = True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -57,7 +66,7 @@ def count_occupied(
         x, y, z = points[i]
         for a in range(3):  # the operations of `transform_points`, in their order
             moved = (x * motion[a, 0] + y * motion[a, 1] + z * motion[a, 2]) + motion[a, 3]
-            cell[a] = np.floor((moved + reach_m) / voxel_m)
+            cell[a] = (moved + reach_m) / voxel_m
         if 0 <= cell[0] < cells and 0 <= cell[1] < cells and 0 <= cell[2] < cells:
             count += occupied[int(cell[0]), int(cell[1]), int(cell[2])]
     return count
