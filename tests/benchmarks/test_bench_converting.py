@@ -7,8 +7,10 @@ import shutil
 
 import numpy as np
 import pytest
+from helpers.kitti import write_kitti
 from helpers.tiny_kitti import write_tiny_kitti
 
+from carlasc.captures import Drive, Lidar
 from carlasc.converting import convert
 from carlasc.motion.paths import estimate_path
 
@@ -39,6 +41,24 @@ def test_bench_convert(benchmark, source, tmp_path):
     def run():
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
         return convert("kitti", source, tmp_path / "out", grids="none", flow="none", force=True, workers=1)
+
+    assert benchmark(run).made == FRAMES
+
+
+@pytest.fixture(scope="module")
+def traffic(tmp_path_factory):
+    root = tmp_path_factory.mktemp("traffic")
+    write_kitti(root, Drive(4, "heavy", Lidar(channels=64, points=POINTS)), range(240, 240 + FRAMES), voxels_every=0)
+    return root
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_bench_convert_with_flow(benchmark, traffic, tmp_path, workers):
+    """The check of the poses, reading, the motion of actors and writing. Few scans: most is the check, and the start of the processes."""
+
+    def run():
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        return convert("kitti", traffic, tmp_path / "out", grids="none", workers=workers)
 
     assert benchmark(run).made == FRAMES
 
