@@ -41,3 +41,8 @@ def test_every_name_of_a_room_resolves_and_hides_no_module(room):
 def test_importing_a_room_loads_none_of_its_modules(room):
     code = f"import sys, carlasc.{room}; print([m for m in sys.modules if m.startswith('carlasc.{room}.')])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_a_module_of_a_room_is_an_attribute_of_it():
+    code = "import carlasc; print(carlasc.storage.layout.METADATA)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()

@@ -1,13 +1,16 @@
-"""Pictures of 1280 x 720 pixels: grids as full as those of the data set, and a full scan."""
+"""Pictures and films of 1280 x 720 pixels: grids as full as those of the data set, and a full scan."""
 
 from __future__ import annotations
+
+import json
 
 import numpy as np
 import pytest
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.viewing import render_grid, render_scan
+from carlasc.storage.folders.folder import FolderSink
+from carlasc.viewing import Scene, render, render_grid, render_scan
 
 pytestmark = pytest.mark.slow
 
@@ -34,3 +37,17 @@ def test_bench_full_grid(benchmark, name, view):
 def test_bench_scan(benchmark):
     points = np.random.default_rng(0).uniform((-25, -25, -2), (25, 25, 1), (130_000, 3)).astype(np.float32)
     benchmark.pedantic(render_scan, (Scan(points),), rounds=5, warmup_rounds=1)
+
+
+@pytest.mark.benchmark(group="films")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_bench_film(benchmark, tmp_path, workers):
+    spec = GridSpec.published()
+    sequence = FolderSink(tmp_path / "data").sequence("Train/Town01_Light/cartesian")
+    sequence.write_document("evaluation/params.json", json.dumps(spec.to_params()).encode())
+    for frame in range(20):
+        sequence.write("evaluation/labels", frame, np.roll(street(spec).labels, frame, axis=0))
+    scene = Scene(tmp_path / "data", frames=(0, 20))
+    benchmark.pedantic(
+        render, (scene, tmp_path / "film.mp4"), {"workers": workers, "overwrite": True}, rounds=2, warmup_rounds=1
+    )

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -125,15 +126,9 @@ class Camera:
 
         Directions have length 1 along the camera's forward axis, so that the distance along a ray is the depth.
         """
-        x = (np.arange(width) + 0.5 - width / 2) * (2 * self.half_height / height)
-        y = (height / 2 - np.arange(height)[rows] - 0.5) * (2 * self.half_height / height)
-        right, up, forward = self.axes
-        offsets = (x[None, :, None] * right + y[:, None, None] * up).reshape(-1, 3)
-        if self.orthographic:
-            origins, directions = self.position + offsets, np.broadcast_to(forward, offsets.shape)
-        else:
-            origins, directions = np.broadcast_to(self.position, offsets.shape), offsets + forward
-        return np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
+        return _rays(
+            self.position, self.axes, self.footprint(height), self.orthographic, width, height, rows.start, rows.stop
+        )
 
     def project(self, points: ArrayLike, width: int, height: int) -> tuple[Floats, Floats, Floats]:
         """Return pixel column, row and depth of (N, 3) points; a pinhole camera sees only points with a depth above 0."""
@@ -230,3 +225,19 @@ def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[floa
         distances.append((above + below) / (2 * tangent))
         shifts.append((above - below) / 2)
     return float(max(*distances, _NEAREST_M - z.min())), (float(shifts[0]), float(shifts[1]))
+
+
+@numba.njit(cache=True)
+def _rays(position, axes, step, flat, width, height, first, last):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    origins = np.empty(((last - first) * width, 3), np.float32)
+    directions = np.empty(((last - first) * width, 3), np.float32)
+    for row in range(first, last):
+        y = (height / 2 - row - 0.5) * step
+        for column in range(width):
+            x = (column + 0.5 - width / 2) * step
+            i = (row - first) * width + column
+            for a in range(3):
+                offset = x * axes[0, a] + y * axes[1, a]
+                origins[i, a] = position[a] + offset if flat else position[a]
+                directions[i, a] = axes[2, a] if flat else offset + axes[2, a]
+    return origins, directions

@@ -198,7 +198,7 @@ def _voxel_drawing(
     ego: bool,
 ) -> Drawing:
     floor = quads(footprint(spec, spec.lower[2] - 2e-3), _FLOOR, open_sky=True)
-    meshes = [grid_mesh(spec, voxel_colors, occupied), floor, *([ego_vehicle()] if ego else [])]
+    meshes = [grid_mesh(spec, voxel_colors, occupied, on_floor=True), floor, *([ego_vehicle()] if ego else [])]
     return Drawing(grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty)
 
 

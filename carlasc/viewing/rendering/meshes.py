@@ -70,13 +70,16 @@ def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky
     )
 
 
-def grid_mesh(spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bool_]) -> QuadMesh:
+def grid_mesh(
+    spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bool_], *, on_floor: bool = False
+) -> QuadMesh:
     """Return the exposed faces of a grid's occupied cells: boxes, or wedges in a cylindrical grid.
 
     Args:
         spec: geometry of the grid.
         colors: (X, Y, Z, 3) uint8 RGB of each cell.
         occupied: (X, Y, Z) bool.
+        on_floor: whether the grid stands on a floor, which hides the lowest faces of the lowest cells: they are left out.
     """
     pieces = 1
     if spec.coordinates == "cylindrical":
@@ -84,7 +87,8 @@ def grid_mesh(spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bo
         spec = spec.with_size((spec.size[0], spec.size[1] * pieces, spec.size[2]))
         occupied, colors = np.repeat(occupied, pieces, axis=1), np.repeat(colors, pieces, axis=1)
     solid = _surrounded(spec, occupied)
-    return join([_faces(spec, colors, solid, axis, side, pieces) for axis in range(3) for side in (0, 1)])
+    sides = [(axis, side) for axis in range(3) for side in (0, 1)]
+    return join([_faces(spec, colors, solid, axis, side, pieces, on_floor) for axis, side in sides])
 
 
 def _surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -96,7 +100,13 @@ def _surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_
 
 
 def _faces(
-    spec: GridSpec, colors: NDArray[np.uint8], solid: NDArray[np.bool_], axis: int, side: int, pieces: int
+    spec: GridSpec,
+    colors: NDArray[np.uint8],
+    solid: NDArray[np.bool_],
+    axis: int,
+    side: int,
+    pieces: int,
+    on_floor: bool,
 ) -> QuadMesh:
     """Return the exposed faces towards one side of one axis."""
     step = np.zeros(3, np.int64)
@@ -106,6 +116,8 @@ def _faces(
     exposed = solid[inner] & ~solid[outer]
     if spec.coordinates == "cylindrical" and axis == 0 and side == 0 and spec.lower[0] == 0:
         exposed[0] = False  # at radius 0 the wedge ends in a line
+    if on_floor and (axis, side) == (2, 0):
+        exposed[:, :, 0] = False
     cells = np.argwhere(exposed)
 
     across, along = (axis + 1) % 3, (axis + 2) % 3

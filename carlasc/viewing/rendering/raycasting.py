@@ -1,4 +1,4 @@
-"""Ray casting of meshes with Embree on the CPU: no screen and no GPU are needed.
+"""Pictures of meshes, with light from rays that Embree casts on the CPU: no screen and no GPU are needed.
 
 Light comes from a sun with soft shadows and from the sky: each face receives the share of the sky that a few rays from the face find
 free. Voxels have thin edges, which fade where a voxel is only a few pixels wide.
@@ -17,6 +17,7 @@ from carlasc.errors import import_extra
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
+from carlasc.viewing.rendering.rasterizing import hits, visible_triangles
 
 BACKGROUND = 255
 SAMPLES = 2  # per pixel and direction
@@ -76,17 +77,18 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, axes: Axes = "left") -
     suns = _suns(axes)
     extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
     height, width = frame.depth.shape
+    seen = visible_triangles(mesh, camera, width, height)
     band = max(1, _BAND // width)
     for top in range(0, height, band):
         rows = slice(top, min(top + band, height))
         origins, directions = camera.rays(width, height, rows)
-        hits = scene.run(origins, directions, output=True)
-        quad, depth = hits["primID"], hits["tfar"]
+        triangle = seen[rows].reshape(-1)
+        u, v, depth = hits(mesh.corners, triangle, origins, directions)
         # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows without further rays.
         columns = np.arange(width) % SAMPLES
         which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
-        starts, towards, facing = _shadow_rays(mesh.normals, quad, origins, directions, depth, suns, which)
-        shadowed = np.zeros(len(quad), np.bool_)
+        starts, towards, facing = _shadow_rays(mesh.normals, triangle, origins, directions, depth, suns, which)
+        shadowed = np.zeros(len(triangle), np.bool_)
         if len(facing):
             shadowed[facing] = scene.run(starts, towards, query="OCCLUDED") >= 0
         _shade(
@@ -98,9 +100,9 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, axes: Axes = "left") -
             sky,
             suns,
             which,
-            quad,
-            hits["u"],
-            hits["v"],
+            triangle,
+            u,
+            v,
             depth,
             shadowed,
             np.float32(camera.footprint(height // SAMPLES)),
@@ -145,13 +147,13 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True)
-def _shadow_rays(normals, quad, origins, directions, depth, suns, which):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _shadow_rays(normals, triangle, origins, directions, depth, suns, which):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return starts and directions of the rays towards the sun from the points that face it, and the samples that they belong to."""
     count = 0
-    facing = np.empty(len(quad), np.int64)
-    for i in range(len(quad)):
-        if quad[i] >= 0:
-            n, s = normals[quad[i] >> 1], suns[which[i]]
+    facing = np.empty(len(triangle), np.int64)
+    for i in range(len(triangle)):
+        if triangle[i] >= 0:
+            n, s = normals[triangle[i] >> 1], suns[which[i]]
             if n[0] * s[0] + n[1] * s[1] + n[2] * s[2] > 0:
                 facing[count] = i
                 count += 1
@@ -159,7 +161,7 @@ def _shadow_rays(normals, quad, origins, directions, depth, suns, which):  # typ
     towards = np.empty((count, 3), np.float32)
     for k in range(count):
         i = facing[k]
-        n = normals[quad[i] >> 1]
+        n = normals[triangle[i] >> 1]
         lift = np.float32(2e-3) + np.float32(2e-5) * depth[i]
         for a in range(3):
             starts[k, a] = origins[i, a] + depth[i] * directions[i, a] + lift * n[a]
@@ -177,7 +179,7 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     sky,
     suns,
     which,
-    quad,
+    triangle,
     u,
     v,
     depth,
@@ -188,12 +190,12 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     out_depth,
 ):
     """Compute the light of every sample that a ray hit, and write it where it is nearer than what the frame shows."""
-    for i in range(len(quad)):
-        if quad[i] < 0 or depth[i] >= out_depth[i]:
+    for i in range(len(triangle)):
+        if triangle[i] < 0 or depth[i] >= out_depth[i]:
             continue
-        q = quad[i] >> 1
+        q = triangle[i] >> 1
         # position on the face: s from corner 0 to 1, t from corner 0 to 3
-        if quad[i] & 1 == 0:
+        if triangle[i] & 1 == 0:
             s, t = u[i] + v[i], v[i]
         else:
             s, t = u[i], u[i] + v[i]

@@ -97,3 +97,15 @@ def test_quads_of_one_colour_have_unit_normals():
     mesh = quads([[(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)]], (9, 8, 7))
     np.testing.assert_allclose(mesh.normals, [[0, 0, 1]])
     assert mesh.colors.tolist() == [[9, 8, 7]]
+
+
+def test_a_floor_hides_the_lowest_faces_of_the_lowest_cells_alone():
+    spec = GridSpec("cartesian", (3, 3, 3), (0.0, 0.0, 0.0), (3.0, 3.0, 3.0))
+    occupied = np.zeros(spec.size, np.bool_)
+    occupied[1, 1, [0, 2]] = True
+    colors = np.zeros((*spec.size, 3), np.uint8)
+    bare, standing = (grid_mesh(spec, colors, occupied, on_floor=on_floor) for on_floor in (False, True))
+    lowest = (bare.corners[:, :, 2] == 0).all(1)
+    assert lowest.sum() == 1
+    for name in ("corners", "normals", "colors", "openness", "edges", "open_sky"):
+        np.testing.assert_array_equal(getattr(standing, name), getattr(bare, name)[~lowest])
