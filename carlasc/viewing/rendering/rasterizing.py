@@ -49,25 +49,27 @@ def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyp
     """Fill the triangles of quads. `nearness` is 1 / depth for a pinhole camera, -depth for an orthographic one: both are linear."""
     height, width = seen.shape
     middle_x, middle_y = width / 2 - 0.5, height / 2 - 0.5
-    points = np.empty((3, 3))
     for quad in range(len(corners)):
         for half in range(2):
-            for corner in range(3):
-                points[corner] = corners[quad, corner + half if corner else 0]
-            left, right, top, bottom = _bounds(points, flat)
+            first, second, third = (
+                _point(corners[quad, 0]),
+                _point(corners[quad, 1 + half]),
+                _point(corners[quad, 2 + half]),
+            )
+            left, right, top, bottom = _bounds((first, second, third), flat)
             first_x = max(0, int(np.floor(max(left / step + middle_x, -1.0))))
             last_x = min(width - 1, int(np.ceil(min(right / step + middle_x, width))))
             first_y = max(0, int(np.floor(max(middle_y - top / step, -1.0))))
             last_y = min(height - 1, int(np.ceil(min(middle_y - bottom / step, height))))
             if first_x > last_x or first_y > last_y:
                 continue
-            depths = points[:, 2].copy()
+            depths = first[2], second[2], third[2]
             if flat:
-                points[:, 2] = 1.0
-            ax, ay, az = _cross(points[1], points[2])
-            bx, by, bz = _cross(points[2], points[0])
-            cx, cy, cz = _cross(points[0], points[1])
-            volume = points[0, 0] * ax + points[0, 1] * ay + points[0, 2] * az
+                first, second, third = (first[0], first[1], 1.0), (second[0], second[1], 1.0), (third[0], third[1], 1.0)
+            ax, ay, az = _cross(second, third)
+            bx, by, bz = _cross(third, first)
+            cx, cy, cz = _cross(first, second)
+            volume = first[0] * ax + first[1] * ay + first[2] * az
             if volume == 0:  # seen from its edge
                 continue
             sign = 1.0 if volume > 0 else -1.0
@@ -87,6 +89,12 @@ def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyp
                     near = base + slope * x
                     if near >= nearness[row, column] and (not flat or near < 0):
                         nearness[row, column], seen[row, column] = near, 2 * quad + half
+
+
+@numba.njit(cache=True)
+def _point(corner):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """Return a corner as a tuple: assigning arrays to arrays would take seconds to compile."""
+    return corner[0], corner[1], corner[2]
 
 
 @numba.njit(cache=True)
@@ -126,10 +134,11 @@ def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def
         directions: (n, 3) float32.
     """
     u, v = np.zeros(len(triangle), np.float32), np.zeros(len(triangle), np.float32)
-    depth = np.full(len(triangle), np.inf, np.float32)
+    depth = np.empty(len(triangle), np.float32)
     one = np.float32(1)
     for i in range(len(triangle)):
         if triangle[i] < 0:
+            depth[i] = np.inf
             continue
         quad, half = triangle[i] >> 1, triangle[i] & 1
         origin, ray = origins[i], directions[i]
