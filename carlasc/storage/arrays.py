@@ -1,4 +1,4 @@
-"""Arrays in .npy and .npz files, which anybody may have made.
+"""Arrays in .npy and .npz files, which anybody may have made; and writing .npz files.
 
 Type, shape and size of an array are in its header. They are compared with what the file must hold before any value is read, and the header
 alone is unpacked for that: a small file that claims, or unpacks to, more than it may hold costs neither memory nor time. No pickle is read.
@@ -11,7 +11,7 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -208,6 +208,22 @@ class NpzFile:
                 where, expected=f"{header.size} bytes of values", found=str(place), advice="the file is damaged"
             )
         return view
+
+
+def npz_bytes(arrays: Mapping[str, tuple[NDArray[Any], int]]) -> bytes:
+    """Return a compressed .npz file, as `numpy.savez_compressed` writes it, but each array at a level of Deflate of its own.
+
+    Args:
+        arrays: name -> array, and level from 1 (fast) to 9 (small).
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, (array, level) in arrays.items():
+            values = io.BytesIO()
+            np.lib.format.write_array(values, array, allow_pickle=False)
+            member = zipfile.ZipInfo(f"{name}.npy")  # its time is 1980, so that the same arrays are the same bytes
+            archive.writestr(member, values.getbuffer(), zipfile.ZIP_DEFLATED, level)
+    return buffer.getvalue()
 
 
 @contextmanager

@@ -7,7 +7,6 @@ Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.storage.arrays import ArrayFormat, open_npz
+from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 
 SPLITS = ("Train", "Val", "Test")
 COORDINATES = ("cartesian", "cylindrical")
@@ -33,6 +32,8 @@ REPORT = "carlasc-report.json"
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
+# Level 6, zlib's own, takes 6 times as long, and saves 3 %: voxels are in order, so what repeats is always four bytes back.
+_VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
 CERTAIN = 65535  # the number in the column `votes` of `<grid>/classes` that means a probability of 1
 
@@ -382,6 +383,4 @@ def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
 
 
 def _encode_votes(votes: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, voxel=votes["voxel"], label=votes["label"], votes=votes["votes"])
-    return buffer.getvalue()
+    return npz_bytes({name: (votes[name], level) for name, level in _VOTES_LEVELS.items()})
