@@ -74,8 +74,9 @@ class MakeFrame(Task):
         """Make the frame. What it made is returned, and not written yet."""
         plan, number = self.plan, self.number
         try:
+            thinned = self.frame.thinned(plan) if self.sampled else None  # first, while there are no outputs to keep
             outputs, grid = _make(self.frame, plan)
-            changes = _changes(self.frame, plan, grid) if self.sampled else None
+            changes = None if thinned is None else Changes.between(grid, thinned)
             facts = FrameFacts.of(number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals())
         except MemoryError as error:
             raise CarlascError(
@@ -114,8 +115,8 @@ class MeasureFrame(Task):
             if not {f"{plan.grid}/labels", f"{plan.grid}/counts"} <= arrays.keys():
                 return Done(self)
             labels, counts = (arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size) for part in ("labels", "counts"))
-            again = self.frame if self.sampled else None
-            changes = None if again is None else _changes(again, plan, Grid(plan.spec, labels, counts))
+            thinned = self.frame.thinned(plan) if self.sampled and self.frame is not None else None
+            changes = None if thinned is None else Changes.between(Grid(plan.spec, labels, counts), thinned)
             residuals = None if self.frame is None else self.frame.residuals()
             facts = FrameFacts.of(self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals)
         except (CarlascError, OSError, ValueError):
@@ -205,8 +206,3 @@ def _make(frame: FrameInput, plan: Plan) -> tuple[Outputs, Grid]:
     if plan.voting.keep_evidence and evidence is not None:
         outputs |= {f"{plan.grid}/{part}": getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
     return outputs, Grid(plan.spec, labels, counts)
-
-
-def _changes(frame: FrameInput, plan: Plan, grid: Grid) -> Changes | None:
-    thinned = frame.thinned(plan)
-    return None if thinned is None else Changes.between(grid, thinned)

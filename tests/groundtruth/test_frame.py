@@ -1,5 +1,7 @@
 """The grid of one frame, step by step: scenes of a few points, with actors that are given."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -37,9 +39,9 @@ def feed_of(folder, scans, pose=lambda frame: np.eye(4), **options):
     return ScanFeed(sequence, FromScans(**{"motion": "none", "force": True, **options}))
 
 
-def merge(feed, actors, frame=NOW):
-    voting = Voting(keep_evidence=True) if feed.options.dynamic != "tube" else Voting()
-    plan = Plan(SPEC, "evaluation", feed.options, voting, FrameRange())
+def merge(feed, actors, frame=NOW, spec=SPEC, evidence=True):
+    voting = Voting(keep_evidence=evidence and feed.options.dynamic != "tube")
+    plan = Plan(spec, "evaluation", feed.options, voting, FrameRange())
     return merge_frame(plan, feed, actors, frame, feed.window_of(frame))
 
 
@@ -112,7 +114,7 @@ class TestBodies:
 
     HALF = np.array([2.0, 1.0, 0.8])
 
-    def make(self, folder, **options):
+    def make(self, folder, spec=SPEC, evidence=True, **options):
         side = [((x, 3.1, z), VEHICLE) for x in np.arange(-1.9, 2.0, 0.2) for z in (-0.5, -0.1, 0.3, 0.5)]
         ground = [((0.1, 4.1, -0.7), ROAD), ((0.1, 4.9, -0.7), ROAD)]  # seen under the car
         feed = feed_of(folder, dict.fromkeys(FRAMES, side + ground), own_path=False, **options)
@@ -121,7 +123,7 @@ class TestBodies:
         lower, upper = -self.HALF - 0.1, self.HALF + 0.1
         extent = Extent(-self.HALF, self.HALF, (False, False, True, False), 1000, (0.0, -4.0))
         track = Track(VEHICLE, 0, members, 0, poses, np.zeros((len(FRAMES), 3)), lower, upper, extent)
-        return merge(feed, Actors({3: track}))
+        return merge(feed, Actors({3: track}), spec=spec, evidence=evidence)
 
     def test_the_side_that_no_scan_saw_is_taken_from_the_other_one_and_marked(self, tmp_path):
         merged = self.make(tmp_path)
@@ -152,6 +154,24 @@ class TestBodies:
             label, count, flags = at(merged, (0.1, y, -0.7))
             assert (label, count > 0) == (ROAD, True)
             assert VoxelFlag.INFERRED not in flags
+
+    @pytest.mark.parametrize("complete", ["seen", "mirror", "body"])
+    def test_the_grid_is_the_same_without_what_says_how_certain_it_is(self, tmp_path, complete):
+        kept = self.make(tmp_path / "kept", complete=complete)
+        merged = self.make(tmp_path / "not kept", evidence=False, complete=complete)
+        assert merged.evidence is None
+        np.testing.assert_array_equal(merged.grid.labels, kept.grid.labels)
+        np.testing.assert_array_equal(merged.grid.counts, kept.grid.counts)
+        np.testing.assert_array_equal(merged.votes.to_sparse(), kept.votes.to_sparse())
+
+    def test_a_voxel_needs_no_more_memory_than_the_arrays_that_the_votes_fill(self, tmp_path):
+        spec = SPEC.with_size((200, 200, 50))
+        self.make(tmp_path / "compiled", evidence=False)
+        tracemalloc.start()
+        self.make(tmp_path / "fine", spec=spec, evidence=False)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak / spec.num_voxels < 32  # bytes: the ballot has 10, the grid 5, the votes for free space 4
 
 
 class TestOwnPath:

@@ -87,3 +87,14 @@ def test_what_a_class_is_depends_on_whether_it_is_in_a_body():
 def test_free_space_within_a_body_is_less_sure_than_outside():
     outside, inside = (posterior(0, 30.0, Matter.SOLID, in_body=body)[0] for body in (False, True))
     assert outside < inside < UNKNOWN
+
+
+def test_each_voxel_has_the_probability_that_it_has_alone_however_many_there_are():
+    rng = np.random.default_rng(1)
+    count = 40_000
+    hits, samples = rng.integers(0, 4, count) * rng.integers(0, 50, count), rng.integers(0, 200, count)
+    matter, body = rng.integers(0, len(EVERY), count).astype(np.int8), rng.random(count) < 0.1
+    whole = probability(hits, samples * 1.5, matter, body, FINE, 1.5)
+    for chosen in (slice(None, 3), slice(16_380, 16_390), slice(-1, None), slice(7, None, 1999)):
+        part = probability(hits[chosen], samples[chosen] * 1.5, matter[chosen], body[chosen], FINE, 1.5)
+        assert whole[chosen].tobytes() == part.tobytes()

@@ -43,7 +43,7 @@ def test_a_body_outside_the_grid_has_no_region():
 
 def test_nothing_is_hidden_of_a_body_that_was_seen_from_all_sides():
     regions = regions_of(np.eye(4), body())
-    assert not regions.hidden.any() and not regions.hidden_ends.any()
+    assert not len(regions.hidden) and not len(regions.hidden_ends)
 
 
 def test_voxels_that_touch_only_a_face_that_no_scan_saw_are_hidden():

@@ -7,6 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from helpers.lidar_frames import street_frame
+from helpers.plain_voting import plain_votes
+from hypothesis import given
+from hypothesis import strategies as st
 
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
@@ -65,7 +68,7 @@ def test_an_observation_without_points_is_a_voter_without_votes() -> None:
 
 def test_sparse_votes_are_sorted_and_those_that_do_not_fit_are_kept_as_the_most_that_does() -> None:
     spec = GridSpec("cartesian", (2, 1, 1), (0.0, 0.0, 0.0), (2.0, 1.0, 1.0))
-    occupied = np.array([(1, 9, 5), (0, 7, 70_000), (1, 3, 65_535)], OCCUPIED_DTYPE)
+    occupied = np.array([(0, 7, 70_000), (1, 3, 65_535), (1, 9, 5)], OCCUPIED_DTYPE)
     votes = Votes(spec, CARLA, np.array([0, 100_000], np.int64).reshape(spec.size), occupied)
     sparse = votes.to_sparse()
     assert sparse.dtype == VOTES_DTYPE
@@ -73,6 +76,35 @@ def test_sparse_votes_are_sorted_and_those_that_do_not_fit_are_kept_as_the_most_
     counts = votes.to_grid().counts
     assert counts is not None
     assert counts[:, 0, 0].tolist() == [70_000, 165_540]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rows_are_sorted_and_decide_what_a_table_of_all_classes_decides(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spec, channels = GridSpec("cartesian", (3, 2, 2), (0.0, 0.0, 0.0), (3.0, 2.0, 2.0)), CARLA.num_channels
+    ballot = Ballot(spec, rule="sample", free_step_m=0.4)
+    table = np.zeros((spec.num_voxels, channels), np.int64)
+    for _ in range(rng.integers(0, 4)):
+        points = rng.uniform(-0.5, 3.5, (rng.integers(0, 60), 3)).astype(np.float32)
+        labels = rng.integers(0, channels, len(points)).astype(np.uint16)
+        observation = Observation(points, labels, POSE)
+        ballot.add(observation)
+        table += plain_votes([observation], spec, channels, rule="sample", free_step_m=0.4)
+    votes = ballot.votes()
+    pairs = votes.occupied["voxel"].astype(np.int64) * channels + votes.occupied["label"]
+    assert (np.diff(pairs) > 0).all()
+    labels, counts = votes.elect_occupied()
+    np.testing.assert_array_equal(labels, np.where(table[:, 1:].any(axis=1), table[:, 1:].argmax(axis=1) + 1, 0))
+    np.testing.assert_array_equal(counts, table[:, 1:].sum(axis=1))
+    np.testing.assert_array_equal(ballot.hit, table[:, 1:].any(axis=1))
+    np.testing.assert_array_equal(ballot.seen, table.any(axis=1))
+    grid = votes.to_grid()
+    assert grid.counts is not None
+    np.testing.assert_array_equal(grid.labels.reshape(-1), table.argmax(axis=1))
+    np.testing.assert_array_equal(grid.counts.reshape(-1), table.sum(axis=1))
+    voxels, classes = np.nonzero(table)
+    expected = list(zip(voxels.tolist(), classes.tolist(), table[voxels, classes].tolist(), strict=True))
+    assert votes.to_sparse().tolist() == expected
 
 
 def test_ballots_of_several_threads_do_not_meet() -> None:

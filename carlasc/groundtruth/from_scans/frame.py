@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.evidence import VoxelFlag
-from carlasc.core.geometry import transform_points
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -30,11 +29,13 @@ from carlasc.groundtruth.voting.evidence import (
     matter_of,
     probability,
 )
+from carlasc.groundtruth.voting.marking import mark
 from carlasc.groundtruth.voting.observations import Observation
 
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
+_NO_VOXELS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -59,18 +60,55 @@ def merge_frame(plan: Plan, feed: ScanFeed, actors: Actors, frame: int, window: 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """The class with most hits of each voxel, its hits, its free samples, and what they are about, (V,) each; and the hits by class."""
+    """What votes say of N voxels.
 
+    Attributes:
+        voxels: (N,) flat indices, increasing.
+        labels: (N,) class with most hits, 0 without hits.
+        hits: (N,) points.
+        free: (N,) free samples.
+        matter: (N,) what the evidence is about.
+    """
+
+    voxels: NDArray[np.int64]
     labels: NDArray[np.unsignedinteger]
     hits: NDArray[np.integer]
     free: NDArray[np.integer]
     matter: NDArray[np.int8]
-    votes: NDArray[Any]
 
     @property
     def counts(self) -> NDArray[np.integer]:
-        """(V,) hits and free samples."""
+        """(N,) hits and free samples."""
         return self.hits + self.free
+
+    def at(self, chosen: NDArray[np.bool_]) -> _Evidence:
+        """Return the evidence of some of the voxels."""
+        return _Evidence(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+
+@dataclass
+class _Scene:
+    """The grid while it is made.
+
+    Attributes:
+        labels: (V,) classes.
+        counts: (V,) hits and free samples; 0 means unknown.
+        occupied: (V,) float32, probability that the voxel is occupied; None if it is not needed.
+    """
+
+    labels: NDArray[np.unsignedinteger]
+    counts: NDArray[np.unsignedinteger]
+    occupied: NDArray[np.float32] | None = None
+
+    def forget(self, voxels: NDArray[np.integer]) -> None:
+        """Make voxels unknown."""
+        self.labels[voxels] = self.counts[voxels] = 0
+        self.set_probability(voxels, UNKNOWN)
+
+    def set_probability(self, voxels: NDArray[np.integer], probability: NDArray[np.float32] | float) -> None:
+        """Set the probability that voxels are occupied, if it is needed."""
+        if self.occupied is not None:
+            self.occupied[voxels] = probability
 
 
 @dataclass(frozen=True)
@@ -86,48 +124,67 @@ class _Merging:
     def run(self) -> MergedFrame:
         """Make the grid."""
         ballot = self._vote(self.merger.observations(self.now, self.window, self.regions), self.plan.needs_evidence)
-        votes = ballot.votes()
+        votes, views = ballot.votes(copy=False), ballot.views if self.plan.needs_evidence else None
+        del ballot  # its memory is needed by the next ones
         if self.plan.rule != "ray":
             return MergedFrame(votes.to_grid(), votes)
-        seen = self._evidence(votes)
-        labels, counts, posterior = self._decide(seen), seen.counts.copy(), self._probability(seen)
+        scene = self._scene(votes)
 
         # What rays beside a body, or of other times, saw as free says nothing of these voxels.
         contested = self._contested()
-        unseen = contested & ~self._seen_now() if contested.any() else contested
-        forgotten = (labels == 0) & (self.regions.hidden | unseen)
-        counts[forgotten], posterior[forgotten] = 0, UNKNOWN
+        doubtful = np.concatenate([self.regions.hidden, self._unseen_now(contested)])
+        scene.forget(doubtful[scene.labels[doubtful] == 0])
 
-        inferred, hits = np.zeros(len(labels), np.bool_), [votes.occupied]
-        for completion in self._completions():
-            new = (counts == 0) & (completion.counts > 0) & ~(self.regions.hidden_ends & (completion.hits == 0))
-            labels[new] = self._decide(completion)[new]
-            counts[new], posterior[new] = completion.counts[new], self._probability(completion)[new]
-            hits.append(completion.votes[new[completion.votes["voxel"]]])
-            inferred |= new
-
+        completed = [(_NO_VOXELS, votes.occupied)]
+        completed += [self._complete(scene, completion) for completion in self._completions()]
         if self.options.own_path and self.options.dynamic != "tube":
-            driven = self._own_path() & (labels > 0) & (seen.matter != Matter.GROUND) & ~self._hit_now()
-            labels[driven], posterior[driven] = 0, _OWN_PROBABILITY
+            driven = self._driven(scene)
+            scene.labels[driven] = 0
+            scene.set_probability(driven, _OWN_PROBABILITY)
         if self.feed.finds_ground:
-            labels[np.isin(labels, sorted(self.classes.ground))] = self.classes.geometry_id
+            scene.labels[np.isin(scene.labels, sorted(self.classes.ground))] = self.classes.geometry_id
         size = self.spec.size
-        grid = Grid(self.spec, labels.reshape(size), counts.reshape(size))
-        if not self.plan.needs_evidence:
+        grid = Grid(self.spec, scene.labels.reshape(size), scene.counts.reshape(size))
+        if scene.occupied is None or views is None:
             return MergedFrame(grid, votes)
-        flags = self._flags(inferred, contested)
-        shares = class_shares(np.concatenate(hits), self.classes)
-        return MergedFrame(grid, votes, Evidence(posterior.reshape(size), shares, flags.reshape(size), ballot.views))
+        inferred, hits = (np.concatenate(parts) for parts in zip(*completed, strict=True))
+        flags, shares = self._flags(inferred, contested), class_shares(hits, self.classes)
+        return MergedFrame(grid, votes, Evidence(scene.occupied.reshape(size), shares, flags.reshape(size), views))
 
-    def _flags(self, inferred: NDArray[np.bool_], contested: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Return the flags of each voxel."""
+    def _scene(self, votes: Votes) -> _Scene:
+        """Return what the votes for the static scene and in the actors' bodies say."""
+        evidence = self.plan.needs_evidence
+        labels, hits = votes.elect_occupied()
+        free = votes.free.reshape(-1)
+        found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
+        labels[found.voxels] = self._decide(found)
+        counts = np.add(hits, free, out=hits)
+        scene = _Scene(labels, counts)
+        if evidence:
+            scene.occupied = np.full(len(labels), UNKNOWN, np.float32)
+            scene.occupied[found.voxels] = self._probability(found)
+        return scene
+
+    def _complete(self, scene: _Scene, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes."""
+        found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
+        found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
+        unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
+        found = found.at((scene.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
+        scene.labels[found.voxels] = self._decide(found)
+        scene.counts[found.voxels] = found.counts
+        scene.set_probability(found.voxels, self._probability(found))
+        return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
+
+    def _flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return (V,) the flags of each voxel."""
         own = [self.now.frame] if self.now.frame in self.window else []
-        now = self._count(self.merger.observations(self.now, own, replace(self.regions, actors={})))
-        flags = np.zeros(len(inferred), np.uint8)
+        now = self._vote(self.merger.observations(self.now, own, replace(self.regions, actors={})))
+        flags = np.zeros(self.spec.num_voxels, np.uint8)
         for where, flag in (
             (inferred, VoxelFlag.INFERRED),
             (contested, VoxelFlag.CONTESTED),
-            ((now.occupied_counts() + now.free).reshape(-1) > 0, VoxelFlag.SEEN_NOW),
+            (now.seen(), VoxelFlag.SEEN_NOW),
             (self.in_body, VoxelFlag.IN_ACTOR),
         ):
             flags[where] |= np.uint8(flag)
@@ -162,15 +219,11 @@ class _Merging:
             ballot.add(observation)
         return ballot
 
-    def _count(self, observations: Iterable[Observation]) -> Votes:
-        return self._vote(observations).votes()
-
-    def _evidence(self, votes: Votes, *, mirrored: bool = False) -> _Evidence:
-        labels, hits = votes.elect_occupied()
-        matter = matter_of(labels, self.in_body, self.classes)
-        if mirrored:
-            matter[matter == Matter.BODY] = Matter.MIRRORED
-        return _Evidence(labels, hits, votes.free.reshape(-1), matter, votes.occupied)
+    def _evidence(self, votes: Votes, labels: NDArray[Any], hits: NDArray[Any], voxels: NDArray[np.int64]) -> _Evidence:
+        """Return what votes say of some voxels; `labels` and `hits` are those of `Votes.elect_occupied`."""
+        labels = labels[voxels]
+        matter = matter_of(labels, self.in_body[voxels], self.classes)
+        return _Evidence(voxels, labels, hits[voxels], votes.free.reshape(-1)[voxels], matter)
 
     def _decide(self, evidence: _Evidence) -> NDArray[np.unsignedinteger]:
         if self.options.dynamic == "tube":
@@ -182,46 +235,46 @@ class _Merging:
 
     def _probability(self, evidence: _Evidence) -> NDArray[np.float32]:
         step = self.plan.voting.free_step_m
-        return probability(evidence.hits, evidence.free * step, evidence.matter, self.in_body, self.spec, step)
+        return probability(
+            evidence.hits, evidence.free * step, evidence.matter, self.in_body[evidence.voxels], self.spec, step
+        )
 
-    def _contested(self) -> NDArray[np.bool_]:
-        """Return where something that moves passes at other times."""
+    def _contested(self) -> NDArray[np.int64]:
+        """Return the voxels outside of bodies where something that moves passes at other times."""
         if self.options.dynamic != "align":
-            return np.zeros(self.spec.num_voxels, np.bool_)
-        passing = self._count(self.merger.passing(self.now, self.window))
-        return (passing.occupied_counts().reshape(-1) > 0) & ~self.in_body
+            return _NO_VOXELS
+        return np.flatnonzero(self._vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body)
 
-    def _seen_now(self) -> NDArray[np.bool_]:
-        """Return what the scans just before and after the frame saw."""
-        votes = self._count(self.merger.recent(self.now, self.window))
-        return (votes.occupied_counts() + votes.free).reshape(-1) > 0
+    def _unseen_now(self, voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return those of some voxels that the scans just before and after the frame did not see."""
+        if not len(voxels):
+            return voxels
+        return voxels[~self._vote(self.merger.recent(self.now, self.window)).seen(voxels)]
 
-    def _completions(self) -> Iterable[_Evidence]:
-        """Yield what completes actors: their mirror images, then their usual shapes."""
+    def _completions(self) -> Iterable[Votes]:
+        """Yield the votes of what completes actors: of their mirror images, then of their usual shapes."""
         if not self.regions.actors or self.options.complete == "seen":
             return
-        yield self._evidence(self._count(self.merger.mirrored(self.now, self.window, self.regions)), mirrored=True)
+        yield self._vote(self.merger.mirrored(self.now, self.window, self.regions)).votes(copy=False)
         if self.options.complete == "body":
-            yield self._evidence(self._count(self.merger.shells(self.now, self.regions)), mirrored=True)
+            yield self._vote(self.merger.shells(self.now, self.regions)).votes(copy=False)
 
-    def _own_path(self) -> NDArray[np.bool_]:
-        """Return the voxels that the recording vehicle itself drove through at other frames of the window."""
+    def _driven(self, scene: _Scene) -> NDArray[np.int64]:
+        """Return the occupied voxels that the recording vehicle drove through at other frames, without the ground and what is there now."""
         apart = float(self.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-        driven = np.zeros(self.spec.num_voxels + 1, np.bool_)
+        path = np.zeros(self.spec.num_voxels, np.bool_)
         for other in self.window:
             if other != self.now.frame:
-                driven[self.spec.flat_index(transform_points(self.now.grid_T_world @ self.feed.pose(other), body))] = (
-                    True
-                )
-        return driven[:-1]
+                mark(body, self.now.grid_T_world @ self.feed.pose(other), self.spec, path)
+        voxels = np.flatnonzero(path & (scene.labels > 0))
+        solid = ~np.isin(scene.labels[voxels], sorted(self.classes.ground))
+        return voxels[solid & ~self._hit_now()[voxels]]
 
     def _hit_now(self) -> NDArray[np.bool_]:
         """Return the voxels in which the frame's own scan has points, or that belong to an actor at the frame."""
         if self.now.frame not in self.window:
             return self.in_body
         scan = self.merger.scans[self.now.frame]
-        hit = np.zeros(self.spec.num_voxels + 1, np.bool_)
-        hit[self.spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, scan.points))] = True
-        return hit[:-1] | self.in_body
+        return self.in_body | mark(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.spec)

@@ -23,19 +23,19 @@ class Regions:
     Attributes:
         of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
         actors: number of the actor by region, for the regions that have voxels.
-        hidden: (V,) bool, voxels of a body's face that no scan saw. Rays beside the body go through these voxels: they say nothing of it.
-        hidden_ends: (V,) bool, those of a face that is hidden also if the body is completed by its mirror image.
+        hidden: (H,) flat indices of voxels of a body's face that no scan saw. Rays beside the body go through them: they say nothing of it.
+        hidden_ends: (E,) those of a face that is hidden also if the body is completed by its mirror image.
     """
 
     of_voxel: NDArray[np.uint16]
     actors: Mapping[int, int]
-    hidden: NDArray[np.bool_]
-    hidden_ends: NDArray[np.bool_]
+    hidden: NDArray[np.int64]
+    hidden_ends: NDArray[np.int64]
 
     @classmethod
     def empty(cls, spec: GridSpec) -> Self:
         """Return the regions of a grid without actors."""
-        nowhere = np.zeros(spec.num_voxels, np.bool_)
+        nowhere = np.empty(0, np.int64)
         return cls(np.zeros(spec.num_voxels, np.uint16), {}, nowhere, nowhere)
 
     def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> Regions:
@@ -59,8 +59,7 @@ class Regions:
         """
         of_voxel = np.zeros(spec.num_voxels, np.uint16)
         hidden, hidden_ends = np.zeros(spec.num_voxels, np.bool_), np.zeros(spec.num_voxels, np.bool_)
-        centers = spec.from_axes(spec.centers())
-        columns, heights = centers[:, :, 0, :2].reshape(-1, 2), centers[0, 0, :, 2]
+        columns, heights = _columns(spec)
         across, up = _half_cells(spec, columns)
         largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
         for region, (_, track, pose) in enumerate(largest_first, 1):
@@ -81,7 +80,7 @@ class Regions:
             hidden_ends[own] = _on_hidden_face(track, body[inside], slack[inside], mirrored)
         present = np.unique(of_voxel[of_voxel != STATIC]).tolist()
         actors = {region: largest_first[region - 1][0] for region in present}
-        return cls(of_voxel, actors, hidden, hidden_ends)
+        return cls(of_voxel, actors, np.flatnonzero(hidden), np.flatnonzero(hidden_ends))
 
 
 def _on_hidden_face(
@@ -100,6 +99,13 @@ def _on_hidden_face(
     touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
     seen = np.array(faces)[:, None]
     return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)
+
+
+def _columns(spec: GridSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return x and y of the centres of the columns of cells, (X * Y, 2), and the heights of the centres in each, (Z,), in metres."""
+    low = replace(spec, size=(*spec.size[:2], 1))
+    columns = spec.from_axes(low.centers())[:, :, 0, :2].reshape(-1, 2).astype(np.float64)
+    return columns, spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * spec.voxel_size[2]
 
 
 def _half_cells(spec: GridSpec, columns: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:

@@ -24,6 +24,7 @@ from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
 VoteRule = Literal["sensor", "sample", "ray"]
 
+_MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
 
 
@@ -52,7 +53,7 @@ def count_votes(
     ballot = Ballot(spec, classes, rule=rule, free_step_m=free_step_m)
     for observation in observations:
         ballot.add(observation)
-    return ballot.votes()
+    return ballot.votes(copy=False)
 
 
 def check_rule(rule: str, free_step_m: float) -> None:
@@ -159,13 +160,34 @@ class Ballot:
         """(X, Y, Z) uint16: number of observations that saw each voxel; a copy. Only with `count_views`."""
         return self._tally.views[:-1].reshape(self.spec.size).copy()
 
-    def votes(self) -> Votes:
-        """Return the votes so far, as a copy that later observations do not change."""
+    @property
+    def hit(self) -> NDArray[np.bool_]:
+        """(V,) bool: voxels with votes for a class other than free space."""
+        from carlasc.groundtruth.voting import kernel
+
+        return self._tally.heads != kernel.NONE
+
+    def seen(self, voxels: NDArray[np.integer] | slice = slice(None)) -> NDArray[np.bool_]:
+        """Return (N,) bool: which of some voxels, flat indices, have votes; of all voxels if none are given."""
+        from carlasc.groundtruth.voting import kernel
+
+        seen: NDArray[np.bool_] = self._tally.heads[voxels] != kernel.NONE
+        seen |= self._tally.free[:-1][voxels] > 0
+        return seen
+
+    def votes(self, *, copy: bool = True) -> Votes:
+        """Return the votes so far.
+
+        Args:
+            copy: whether later observations leave the result as it is; without a copy, the ballot must take no more of them.
+        """
+        from carlasc.groundtruth.voting import results
+
         candidates = self._tally.candidates[: self._tally.used[0]]
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
-        for name in OCCUPIED_DTYPE.names or ():
-            occupied[name] = candidates[name]
-        return Votes(self.spec, self.classes, self._tally.free[:-1].reshape(self.spec.size).copy(), occupied)
+        results.collect(self._tally.heads, candidates, occupied)
+        free = self._tally.free[:-1].reshape(self.spec.size)
+        return Votes(self.spec, self.classes, free.copy() if copy else free, occupied)
 
     def _make_room(self, points: int) -> None:
         """Make room for one more candidate per point, the most that an observation can add."""
@@ -185,7 +207,7 @@ class Votes:
         classes: class table of the labels.
         free: (X, Y, Z) unsigned integer, votes for free space.
         occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0); one row
-            per voxel and class, in no particular order.
+            per voxel and class, sorted by voxel, then by label.
     """
 
     spec: GridSpec
@@ -195,19 +217,19 @@ class Votes:
 
     def to_grid(self) -> Grid:
         """Return the grid: the class with most votes of each voxel, free space included, and the sum of its votes. Ties go to the lowest id."""
-        labels, counts = self._elect(self.free.reshape(-1))
+        labels, counts = self._elect(self.free.reshape(-1).copy())
         return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
 
     def elect_occupied(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return (V,) the class with most votes of each voxel, without free space, and (V,) the sum of these votes; 0 and 0 without any."""
         return self._elect(np.zeros(self.spec.num_voxels, self.free.dtype))
 
-    def _elect(self, free: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return (V,) the class with most votes, ties to the lowest id, and (V,) the sum of the votes; `free` are those of class 0."""
-        from carlasc.groundtruth.voting import kernel
+    def _elect(self, counts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return (V,) the class with most votes, ties to the lowest id, and (V,) the sum of the votes, in `counts`: those of class 0."""
+        from carlasc.groundtruth.voting import results
 
-        labels, best, counts = np.empty(len(free), self.classes.dtype), np.empty_like(free), np.empty_like(free)
-        kernel.elect(free, self.occupied, labels, best, counts)
+        labels = np.zeros(len(counts), self.classes.dtype)
+        results.elect(self.occupied, labels, counts)
         return labels, counts
 
     def occupied_counts(self) -> NDArray[np.int64]:
@@ -218,19 +240,16 @@ class Votes:
     def to_sparse(self) -> NDArray[Any]:
         """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by label; free space is label 0.
 
-        More than 65535 votes, the maximum of the layout, are stored as 65535.
+        More votes than the layout can hold are stored as the most that it can.
 
         Returns:
             (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
         """
-        free = np.flatnonzero(self.free)
-        columns = {
-            "voxel": np.concatenate([free, self.occupied["voxel"]]),
-            "label": np.concatenate([np.zeros(len(free), np.uint16), self.occupied["label"]]),
-            "votes": np.minimum(np.concatenate([self.free.reshape(-1)[free], self.occupied["votes"]]), 65535),
-        }
-        order = np.lexsort((columns["label"], columns["voxel"]))
-        votes = np.empty(len(order), VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE)
-        for name, column in columns.items():
-            votes[name] = column[order]
+        from carlasc.groundtruth.voting import results
+
+        votes = np.empty(
+            np.count_nonzero(self.free) + len(self.occupied),
+            VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE,
+        )
+        results.interleave(self.free.reshape(-1), self.occupied, votes, _MOST_VOTES)
         return votes

@@ -55,6 +55,7 @@ _FREE = np.array([-4.0, -0.7])  # of the logarithm of the number of free samples
 _FREE_IN_BODY = np.array([-1.7, -0.4])
 _SMALLEST_M, _LARGEST_M = 0.1, 0.8  # sizes beyond these count as these
 UNKNOWN = 0.5
+_BLOCK = 1 << 14  # voxels whose arrays fit into the L2 cache
 
 
 def matter_of(labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: ClassTable) -> NDArray[np.int8]:
@@ -102,14 +103,30 @@ def probability(
         spec: the grid.
         step_m: distance between two free samples of a ray, metres.
     """
+    posterior = np.empty(len(hits), np.float32)
+    for begin in range(0, len(hits), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        posterior[part] = _probability(hits[part], free_m[part], matter[part], in_body[part], spec, step_m)
+    return posterior
+
+
+def _probability(
+    hits: NDArray[np.integer],
+    free_m: NDArray[np.floating],
+    matter: NDArray[np.int8],
+    in_body: NDArray[np.bool_],
+    spec: GridSpec,
+    step_m: float,
+) -> NDArray[np.floating]:
     finer = math.log2(0.4 / min(max(float(np.cbrt(_volume(spec))), _SMALLEST_M), _LARGEST_M))
-    offset, slope = (_HIT[:, 0] + finer * (_HIT[:, 1] - _HIT[:, 0]))[matter].T
-    ratio = np.log((hits + 0.5) / (_PER_M[matter] * free_m + 0.5))
     samples = np.log(np.maximum(free_m / step_m, 1.0))
-    free = np.where(in_body, _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples, _FREE[0] + _FREE[1] * samples)
-    score = np.where(hits > 0, offset + np.maximum(slope, 0.2) * ratio, free)
+    score = np.where(in_body, _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples, _FREE[0] + _FREE[1] * samples)
+    hit = hits > 0
+    offset, slope = (_HIT[:, 0] + finer * (_HIT[:, 1] - _HIT[:, 0]))[matter[hit]].T
+    ratio = np.log((hits[hit] + 0.5) / (_PER_M[matter[hit]] * free_m[hit] + 0.5))
+    score[hit] = offset + np.maximum(slope, 0.2) * ratio
     posterior = 1 / (1 + np.exp(-score))
-    return np.where((hits > 0) | (free_m > 0), posterior, UNKNOWN).astype(np.float32)
+    return np.where(hit | (free_m > 0), posterior, UNKNOWN)
 
 
 def _volume(spec: GridSpec) -> float:

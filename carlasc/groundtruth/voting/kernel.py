@@ -1,4 +1,4 @@
-"""The compiled loops of the voting: they add the votes of one observation, and find the class that the votes of a voxel decide.
+"""The compiled loops of the voting: they add the votes of one observation.
 
 Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the voxels of their samples; where rounding
 could change the voxel, rule.py finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
@@ -218,31 +218,6 @@ def vote_free_by_rule(
         elif region == ANYWHERE or tally.regions[voxel] == region:
             tally.free[voxel] += 1
         step += 1.0
-
-
-@cached
-def elect(
-    free: NDArray[Any], candidates: NDArray[Any], labels: NDArray[Any], best: NDArray[Any], counts: NDArray[Any]
-) -> None:
-    """Find the class with most votes of each voxel, where ties go to the lowest id, and the sum of its votes.
-
-    Args:
-        free: (V,) votes of class 0.
-        candidates: (M,) `voxel`, `label`, `votes` of the other classes, in any order.
-        labels: (V,) output, the classes.
-        best: (V,) working memory.
-        counts: (V,) output, the sums.
-    """
-    for v in range(len(free)):
-        labels[v] = 0
-        best[v] = free[v]
-        counts[v] = free[v]
-    for entry in candidates:
-        v, votes = entry.voxel, entry.votes
-        counts[v] += votes
-        if votes > best[v] or (votes == best[v] and entry.label < labels[v]):
-            best[v] = votes
-            labels[v] = entry.label
 
 
 def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
