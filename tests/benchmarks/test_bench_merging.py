@@ -1,0 +1,61 @@
+"""How long a frame from merged scans takes, with its votes in a table, and how much memory. Small inputs where benchmarks are off."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from carlasc import FromScans, GridSpec, Voting
+from carlasc.core.frames import FrameRange
+from carlasc.core.tables import CARLA
+from carlasc.groundtruth.from_scans.actors import Actors
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
+from carlasc.groundtruth.inputs import Plan
+from carlasc.storage import FolderSink, FolderSource, layout
+from carlasc.testing.drives import KINDS, SimulatedDrive
+
+pytestmark = pytest.mark.slow
+
+IDS = {"road": "Road", "building": "Building", "vegetation": "Vegetation", "pole": "Pole", "pedestrian": "Pedestrian"}
+LABELS = np.array([0, *(CARLA.id_of(IDS.get(kind, "Vehicle")) for kind in KINDS[1:])], np.uint32)
+
+
+def feed_of(folder: Path, full: bool) -> ScanFeed:
+    """Write a drive of 31 scans of 57,600 rays, or of 3 small ones, and return what reads them."""
+    drive = SimulatedDrive(frames=31, channels=32, columns=1800) if full else SimulatedDrive(frames=3)
+    with FolderSink(folder) as sink, sink.sequence("cartesian") as writer:
+        for frame in range(drive.frames):
+            scan = drive.scan(frame)
+            writer.write("points", frame, np.hstack([scan.points[:, :3], np.zeros((len(scan.points), 1), np.float32)]))
+            writer.write("labels", frame, LABELS[scan.kinds])
+        mount = drive.sensors[0].vehicle_T_sensor
+        poses = drive.world_T_vehicle(drive.times) @ mount
+        writer.write_document(layout.POSES, layout.encode_poses(np.linalg.inv(poses[0]) @ poses))
+    (sequence,) = FolderSource(folder).sequences().values()
+    return ScanFeed(sequence, FromScans(motion="none"))
+
+
+@pytest.mark.parametrize("keep_evidence", [False, True], ids=["grid", "and evidence"])
+@pytest.mark.parametrize("res", [0.4, 0.2, 0.1])
+def test_a_frame_from_merged_scans(benchmark: Any, tmp_path: Path, res: float, keep_evidence: bool) -> None:
+    feed = feed_of(tmp_path, benchmark.enabled)
+    spec = GridSpec.published().with_resolution(res)
+    plan = Plan(spec, "evaluation", feed.options, Voting(keep=True, keep_evidence=keep_evidence), FrameRange())
+    frame = int(feed.frames[len(feed.frames) // 2])
+
+    def make() -> tuple[MergedFrame, Any]:
+        merged = merge_frame(plan, feed, Actors(), frame, feed.window_of(frame))
+        return merged, merged.votes.to_sparse()
+
+    make()  # compiled, and the scans are read
+    tracemalloc.start()
+    make()
+    benchmark.extra_info["peak_mb"] = round(tracemalloc.get_traced_memory()[1] / 1e6)
+    tracemalloc.stop()
+    merged, votes = benchmark.pedantic(make, rounds=3 if benchmark.enabled else 1)
+    assert merged.grid.known.any() and len(votes)
