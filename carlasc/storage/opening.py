@@ -13,7 +13,7 @@ from carlasc.storage.folders.folder import FolderSink, FolderSource
 from carlasc.storage.folders.published import PublishedSource
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, is_url
 from carlasc.storage.folders.zipped import ZipTree
-from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK
+from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK, unfinished, unfinished_error
 from carlasc.storage.packed.protocol import Options, PackedSink
 from carlasc.storage.protocol import Source
 from carlasc.storage.remote import target_of
@@ -55,20 +55,22 @@ def open(
     if is_url(text):
         return _open_remote(RemoteTree(text, storage_options), cache)
     local = Path(text.removeprefix("file://"))
+    if _is_unfinished(local):
+        raise unfinished_error(local)
     if local.is_dir():
         return _open_store(LocalTree(local)) or FolderSource(local)
     if local.is_file():
         return _open_file(LocalTree(local.parent), local.name)
-    if (unfinished := local.with_name(f"{local.name}.part")).exists():
-        raise MissingDataError(
-            local,
-            expected="a finished store",
-            found=f"{unfinished.name}",
-            advice="run the same command again to finish it",
-        )
     raise MissingDataError(
         local, expected="a folder, a zip or a packed store", found="nothing", advice="check the path"
     )
+
+
+def _is_unfinished(path: Path) -> bool:
+    """Whether a path is that of a store that gets its name when it is whole, or of what is written until then."""
+    if not path.exists():
+        return bool(path.name) and unfinished(path).exists()
+    return path.suffix == unfinished(Path("x")).suffix and path.with_suffix("").suffix in PACKED
 
 
 def as_source(source: str | os.PathLike[str] | Source) -> Source:
@@ -176,12 +178,7 @@ def _open_store(tree: Tree) -> Source | None:
 
         return ZarrSource(tree)
     if tree.is_file(UNFINISHED_MARK):
-        raise FormatError(
-            tree.location,
-            expected="a finished store",
-            found="one whose packing was cut off",
-            advice="run the same command again",
-        )
+        raise unfinished_error(tree.location)
     if tree.is_file(TABLES_MARK):
         from carlasc.storage.packed.tables.reading import ParquetSource
 

@@ -119,6 +119,35 @@ def test_what_a_run_left_that_was_killed_while_it_finished_a_store_of_tables_is_
     assert not list(tmp_path.rglob(".*.part"))
 
 
+@pytest.mark.parametrize(
+    ("name", "opened"),
+    [
+        ("x.zarr", "x.zarr"),
+        ("x.h5", "x.h5"),
+        ("x.h5", "x.h5.part"),
+        ("x.hdf5", "x.hdf5.part"),
+        ("x.parquet", "x.parquet"),
+        ("x.parquet", "x.parquet.part"),
+    ],
+)
+def test_an_unfinished_store_of_any_format_says_the_same(tmp_path: Path, name: str, opened: str) -> None:
+    pytest.importorskip("pyarrow")
+    sink = open_sink(tmp_path / name, Options(), False)
+    with sink.sequence(SCANS) as writer:
+        writer.write("points", 0, points_of(5))
+    with pytest.raises(FormatError) as error:
+        carlasc.open(tmp_path / opened)
+    assert str(error.value) == (
+        f"{tmp_path / opened}: expected a finished store, found one that is being written, or was interrupted: "
+        "run the same command again to finish it (`carlasc finish` for a .zarr store whose parts are all written)"
+    )
+
+
+def test_a_folder_with_the_ending_of_unfinished_stores_is_opened(tmp_path: Path) -> None:
+    (tmp_path / "drives.part" / "cartesian" / "velodyne").mkdir(parents=True)
+    assert carlasc.open(tmp_path / "drives.part").sequences()
+
+
 @pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])
 def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> None:
     pytest.importorskip(package)

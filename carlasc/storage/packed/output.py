@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import ArgumentError, ConflictError, StorageError
+from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
 from carlasc.storage.durability import rename
 from carlasc.storage.files import storage_error
 
@@ -52,6 +52,16 @@ def _is_store(path: Path) -> bool:
 def unfinished(path: Path) -> Path:
     """Return where a store or a folder is written until it is whole: `<name>.part` beside it."""
     return path.with_name(f"{path.name}.part")
+
+
+def unfinished_error(where: str | os.PathLike[str]) -> FormatError:
+    """Return the error of a store that is being written, or whose writing was interrupted: the same for every format."""
+    return FormatError(
+        where,
+        expected="a finished store",
+        found="one that is being written, or was interrupted",
+        advice="run the same command again to finish it (`carlasc finish` for a .zarr store whose parts are all written)",
+    )
 
 
 def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:

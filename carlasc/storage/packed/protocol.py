@@ -14,6 +14,7 @@ from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.folders.names import leads_outside
+from carlasc.storage.packed.output import unfinished_error
 from carlasc.storage.protocol import Sequence, Source, identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
 
@@ -96,12 +97,7 @@ def _check_root(root: Mapping[str, Any] | None, where: str, newest: int) -> Mapp
             advice="upgrade carlasc to read it",
         )
     if not root.get("complete"):
-        raise FormatError(
-            where,
-            expected="a finished store",
-            found="one that is being written, or was interrupted",
-            advice="run the same command again to finish it, or `carlasc finish`",
-        )
+        raise unfinished_error(where)
     sequences = root.get("sequences")
     if not isinstance(sequences, dict) or not all(isinstance(node, str) for node in sequences.values()):
         raise FormatError(where, expected="the groups of sequences", found="none", advice="the store is damaged")
