@@ -125,7 +125,8 @@ def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
 def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return where rays hit given triangles: the weights u and v of the second and third corner, and the depth; float32.
 
-    These are the steps that Embree takes in single precision: Pluecker coordinates with fused products.
+    These are the steps that Embree takes in single precision: Pluecker coordinates with fused products. What depends on the triangle
+    and the origin alone is kept for the next ray.
 
     Args:
         corners: (Q, 4, 3) float32, metres.
@@ -135,26 +136,32 @@ def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def
     """
     u, v = np.zeros(len(triangle), np.float32), np.zeros(len(triangle), np.float32)
     depth = np.empty(len(triangle), np.float32)
-    one = np.float32(1)
+    one, zero = np.float32(1), np.float32(0)
+    origin = edge_a = edge_b = edge_c = normal = (zero, zero, zero)
+    height, last = zero, -1
     for i in range(len(triangle)):
         if triangle[i] < 0:
             depth[i] = np.inf
             continue
-        quad, half = triangle[i] >> 1, triangle[i] & 1
-        origin, ray = origins[i], directions[i]
-        a, b, c = (
-            _minus(corners[quad, 0], origin),
-            _minus(corners[quad, 1 + half], origin),
-            _minus(corners[quad, 2 + half], origin),
-        )
-        from_c, from_a, from_b = _minus(c, a), _minus(a, b), _minus(b, c)
-        beside_b = _dot(_cross32(from_c, _plus(c, a)), ray)
-        beside_c = _dot(_cross32(from_a, _plus(a, b)), ray)
-        beside_a = _dot(_cross32(from_b, _plus(b, c)), ray)
-        normal = _cross32(from_c, from_a)
-        inverse = one / (beside_b + beside_c + beside_a)
+        start, ray = _point(origins[i]), _point(directions[i])
+        if triangle[i] != last or start != origin:
+            origin, last = start, triangle[i]
+            quad, half = last >> 1, last & 1
+            a = _minus(_point(corners[quad, 0]), origin)
+            b = _minus(_point(corners[quad, 1 + half]), origin)
+            c = _minus(_point(corners[quad, 2 + half]), origin)
+            from_c, from_a, from_b = _minus(c, a), _minus(a, b), _minus(b, c)
+            edge_b, edge_c, edge_a = (
+                _cross32(from_c, _plus(c, a)),
+                _cross32(from_a, _plus(a, b)),
+                _cross32(from_b, _plus(b, c)),
+            )
+            normal = _cross32(from_c, from_a)
+            height = _dot(a, normal)
+        beside_b, beside_c = _dot(edge_b, ray), _dot(edge_c, ray)
+        inverse = one / (beside_b + beside_c + _dot(edge_a, ray))
         u[i], v[i] = min(beside_b * inverse, one), min(beside_c * inverse, one)
-        depth[i] = _dot(a, normal) * (one / _dot(normal, ray))
+        depth[i] = height * (one / _dot(normal, ray))
     return u, v, depth
 
 
