@@ -97,7 +97,7 @@ def test_rows_are_sorted_and_decide_what_a_table_of_all_classes_decides(seed: in
     np.testing.assert_array_equal(labels, np.where(table[:, 1:].any(axis=1), table[:, 1:].argmax(axis=1) + 1, 0))
     np.testing.assert_array_equal(counts, table[:, 1:].sum(axis=1))
     np.testing.assert_array_equal(ballot.hit, table[:, 1:].any(axis=1))
-    np.testing.assert_array_equal(ballot.seen, table.any(axis=1))
+    np.testing.assert_array_equal(ballot.seen(), table.any(axis=1))
     grid = votes.to_grid()
     assert grid.counts is not None
     np.testing.assert_array_equal(grid.labels.reshape(-1), table.argmax(axis=1))
