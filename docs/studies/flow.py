@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from clock import Clock
 from numpy.typing import NDArray
 
 import carlasc
@@ -51,8 +52,12 @@ def compare(seed: int) -> NDArray[np.float64]:
 
 
 def main(seeds: list[int]) -> None:
-    """Print the table."""
-    label, speed, points, error = np.concatenate([compare(seed) for seed in seeds]).T
+    """Compare the drives one after the other, and print the table."""
+    clock, drives = Clock(), []
+    for seed in seeds:
+        drives.append(compare(seed))
+        clock(f"drive {seed}")
+    label, speed, points, error = np.concatenate(drives).T
     print("| | median | 3 of 4 below | sightings |", "|---|---:|---:|---:|", sep="\n")
     for name, (wanted, (slowest, fastest), (fewest, most)) in ROWS.items():
         own = error[(label == wanted) & (speed >= slowest) & (speed < fastest) & (points >= fewest) & (points <= most)]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 import numpy as np
+from clock import Clock
 from numpy.typing import NDArray
 
 from carlasc.captures import Drive, Lidar
@@ -134,13 +135,15 @@ def main(seeds: tuple[int, ...]) -> None:
     """Print the table."""
     methods = {"ours": ours} | ({"Patchwork++": patchwork} if find_spec("pypatchworkpp") else {})
     columns = " | ".join(f"{name}: precision | recall | height | time" for name in methods)
-    print(f"| scans | {columns} |\n|---|{'---:|' * 4 * len(methods)}")
+    print(f"| scans | {columns} |\n|---|{'---:|' * 4 * len(methods)}", flush=True)
+    clock = Clock()
     ours(np.zeros((1, 3), np.float32), 0.0)  # compile
     for case in CASES:
         taken = [scan for seed in seeds for scan in scans(case, seed)]
         height = case.mounts[0][2]
         rows = (rate([m(p, height) for p, _ in taken], [truth for _, truth in taken], height) for m in methods.values())
         print(f"| {case.name} | {' | '.join(rows)} |", flush=True)
+        clock(case.name)
 
 
 def _mount(x: float, y: float, height: float, roll_deg: float, pitch_deg: float) -> Transform:

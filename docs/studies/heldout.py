@@ -10,6 +10,8 @@ from __future__ import annotations
 import argparse
 from functools import reduce
 
+from clock import Clock
+
 from carlasc import FromScans, GridSpec
 from carlasc.groundtruth import Dynamic
 from carlasc.inspection import HeldOutScores, RayShares, holdout
@@ -25,13 +27,15 @@ def main() -> None:
     parser.add_argument("--res", type=float, help="size of a voxel, metres; default: the published grid")
     arguments = parser.parse_args()
     spec = GridSpec.published() if arguments.res is None else GridSpec.published().with_resolution(arguments.res)
+    clock = Clock()
     for rule in RULES:
         results = [holdout(drive, spec, observe=FromScans(dynamic=rule)).total for drive in arguments.drives]
         scores = reduce(HeldOutScores.merge, [total for total in results if total is not None])
         by_class = scores.by_class()
         print(f"{rule}: {scores.frames} scans left out, swept volume {show(scores.swept_share)}")
         for name, shares in {"all": scores.all, **{name: by_class[name] for name in SHOWN if name in by_class}}.items():
-            print(f"  {name:12s} {describe(shares)}")
+            print(f"  {name:12s} {describe(shares)}", flush=True)
+        clock(rule)
 
 
 def describe(shares: RayShares) -> str:

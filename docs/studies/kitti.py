@@ -13,6 +13,7 @@ from functools import reduce
 from operator import add
 from pathlib import Path
 
+from clock import Clock
 from PIL import Image
 
 import carlasc
@@ -78,19 +79,24 @@ def row(name: str, run: str, total: TruthScore) -> str:
 
 def main(out: Path) -> None:
     """Convert, make grids by each rule, score them, draw one scene."""
-    drive = Drive(SEED, "heavy")
+    drive, clock = Drive(SEED, "heavy"), Clock()
     lines = [f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle |", "|---|---|" + "---:|" * 7]
     with tempfile.TemporaryDirectory() as place:
         write_kitti(Path(place) / "in", drive, FRAMES, voxels_every=0)
         for flow in ("none", "instances"):
             convert("kitti", Path(place) / "in", Path(place) / flow, grids="none", flow=flow, workers=2)  # type: ignore[arg-type]
+        clock("conversion")
         truths = {frame: reference(drive, frame) for frame in JUDGED}
+        clock("reference")
+        print("\n".join(lines), flush=True)
         for name in GRIDS:
-            made = {run: make(Path(place) / flow, rule, name) for run, (rule, flow) in RUNS.items()}
-            for run, grids in made.items():
-                scores = (score_truth(grids[frame], truths[frame][name], CARLA.num_channels) for frame in JUDGED)
+            made = {}
+            for run, (rule, flow) in RUNS.items():
+                made[run] = make(Path(place) / flow, rule, name)
+                scores = (score_truth(made[run][frame], truths[frame][name], CARLA.num_channels) for frame in JUDGED)
                 lines.append(row(name, run, reduce(add, scores)))
                 print(lines[-1], flush=True)
+                clock(f"{run}, {name}")
         out.mkdir(parents=True, exist_ok=True)
         draw(made, {frame: truth["0.2 m"] for frame, truth in truths.items()}, out / "kitti.png")
     (out / "kitti.md").write_text("\n".join(lines) + "\n")

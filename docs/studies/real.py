@@ -14,6 +14,7 @@ from functools import reduce
 from operator import add
 from pathlib import Path
 
+from clock import Clock
 from real_drive import find_poses, read_scans, write_drive
 from real_measures import Judge, Measures
 
@@ -42,7 +43,7 @@ def main(archive: Path, every: int) -> None:
         for labelled, folder in drives.items():
             write_drive(archive, folder, labelled=labelled, poses=poses)
         (drive,) = carlasc.open(drives[True]).sequences().values()
-        judge = Judge.of(drive, WINDOW)
+        judge, clock = Judge.of(drive, WINDOW), Clock()
         print(
             f"frames {frames[0]} to {frames[-1]}, {len(frames)} of them; {len(judge.movers)} labelled movers; in percent"
         )
@@ -54,6 +55,7 @@ def main(archive: Path, every: int) -> None:
             cells = [f"{share.percent:.2f}" for share in vars(measures).values()]
             elapsed_s = (time.perf_counter() - began) / len(frames)
             print(f"| {name} | {' | '.join(cells)} | {elapsed_s:.1f} |", flush=True)
+            clock(name)
 
 
 def measure_rule(judge: Judge, folder: Path, name: str, frames: list[int], every: int, observe: FromScans) -> Measures:

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from clock import Clock
 from matplotlib.figure import Figure
 
 from carlasc import Grid, GridSpec
@@ -52,7 +53,10 @@ def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
 
 def main(folder: Path) -> None:
     """Score all scenes, and print and plot the means."""
-    scenes = [score_scene(seed, frame) for seed, frame in SCENES]
+    clock, scenes = Clock(), []
+    for seed, frame in SCENES:
+        scenes.append(score_scene(seed, frame))
+        clock(f"scene {seed}")
     lines = ["| voxels | sensors | accuracy | coverage |", "|---|---:|---:|---:|"]
     curves: dict[str, list[tuple[float, float]]] = {}
     for name in SPECS:
