@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from carlasc.groundtruth.inputs import Plan
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.testing.drives import KINDS, SimulatedDrive
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.benchmark(timer=time.process_time)]  # of one thread, whatever else runs
 
 IDS = {"road": "Road", "building": "Building", "vegetation": "Vegetation", "pole": "Pole", "pedestrian": "Pedestrian"}
 LABELS = np.array([0, *(CARLA.id_of(IDS.get(kind, "Vehicle")) for kind in KINDS[1:])], np.uint32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import cache
 from typing import Any
 
@@ -14,7 +15,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.voting.ballot import count_votes
 from carlasc.groundtruth.voting.observations import Observation
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.benchmark(timer=time.process_time)]  # of one thread, whatever else runs
 
 FINEST = GridSpec.published().with_resolution(0.1)
 CASES = {
