@@ -93,3 +93,9 @@ def test_a_face_seen_from_its_edge_shows_nothing():
     face = quads([[(1, 0, 2), (2, 0, 4), (3, 0, 6), (4, 0, 8)]], (1, 2, 3))
     camera = Camera(np.zeros(3), np.eye(3), 1.0)
     assert (visible_triangles(face, camera, WIDTH, HEIGHT) == -1).all()
+
+
+def test_a_ray_along_a_face_raises_nothing():
+    face = quads([[(1, 0, 2), (2, 0, 4), (3, 0, 6), (4, 0, 8)]], (1, 2, 3))
+    origins, directions = np.zeros((1, 3), np.float32), np.array([[0.5, 0, 1]], np.float32)
+    assert not np.isfinite(hits(face.corners, np.zeros(1, np.int32), origins, directions)[2]).any()
