@@ -32,17 +32,19 @@ def cast_rays(mesh, camera):
     return found
 
 
-def check(mesh, camera, share=2e-4, precision=1e-5):
+def check(mesh, camera, share=2e-4):
     """Compare with rays; only samples on an edge, at most a share of all, may show another face, which is equally near."""
+    origins, directions = camera.rays(WIDTH, HEIGHT, slice(0, HEIGHT))
     triangle = visible_triangles(mesh, camera, WIDTH, HEIGHT).reshape(-1)
     expected = cast_rays(mesh, camera)
-    u, v, depth = hits(mesh.corners, triangle, *camera.rays(WIDTH, HEIGHT, slice(0, HEIGHT)))
+    u, v, depth = hits(mesh.corners, triangle, origins, directions)
     same = triangle == expected["primID"]
     assert (~same).mean() <= share
-    hit = same & (triangle >= 0)
-    np.testing.assert_allclose(u[hit], expected["u"][hit], atol=precision)
-    np.testing.assert_allclose(v[hit], expected["v"][hit], atol=precision)
-    np.testing.assert_allclose(depth[hit], expected["tfar"][hit], rtol=1e-5, atol=precision)
+    cosine = (mesh.normals[triangle >> 1] * directions).sum(1) / np.linalg.norm(directions, axis=1)
+    hit = same & (triangle >= 0) & (abs(cosine) > 0.05)  # along a face, single precision is only as exact as that
+    np.testing.assert_allclose(u[hit], expected["u"][hit], atol=1e-4)
+    np.testing.assert_allclose(v[hit], expected["v"][hit], atol=1e-4)
+    np.testing.assert_allclose(depth[hit], expected["tfar"][hit], rtol=1e-5, atol=1e-4)
     assert np.isinf(depth[triangle < 0]).all()
     return hit.mean()
 
@@ -77,9 +79,7 @@ def test_triangles_anywhere_also_around_and_behind_the_camera(seed, orthographic
     middle, one, two = rng.normal(scale=(4, 4, 4), size=(3, 12, 1, 3))
     corners = (middle + np.concatenate([-one - two, one - two, one + two, two - one], axis=1)).astype(np.float32)
     camera = Camera(rng.normal(size=3), np.linalg.qr(rng.normal(size=(3, 3)))[0], 0.7, orthographic=orthographic)
-    check(
-        quads(corners, (1, 2, 3)), camera, share=2e-3, precision=1e-3
-    )  # faces seen from their edges: single precision
+    check(quads(corners, (1, 2, 3)), camera, share=2e-3)
 
 
 def test_faces_with_a_common_edge_leave_no_gap():
