@@ -73,16 +73,19 @@ class _Cells:
 
     def __init__(self, points: NDArray[np.float64], cell_m: float) -> None:
         self.cell_m = cell_m
-        lower, upper = bounds(points)
-        self.lower = np.floor(lower / cell_m) - 1
-        self.size = (np.floor(upper / cell_m) - self.lower + 2).astype(np.int64)
+        columns = points.T.copy()  # the bounds of rows take NumPy a tenth of the time of those of columns
+        self.lower = np.floor(columns.min(axis=1) / cell_m) - 1
+        self.size = (np.floor(columns.max(axis=1) / cell_m) - self.lower + 2).astype(np.int64)
         flat = self._flat(points)
-        self.row = np.full(int(self.size.prod()), -1)
-        self.row[flat] = 0
-        cells = np.flatnonzero(self.row == 0)
+        counts = np.bincount(flat, minlength=int(self.size.prod()))
+        cells = np.flatnonzero(counts)
+        counts, self.row = counts[cells], np.full(len(counts), -1)
         self.row[cells] = np.arange(len(cells))
-        counts, means, spread = distributions(points, self.row[flat], len(cells))
-        spread += _POINT_M**2 * np.eye(3)
+        row, spread = self.row[flat], np.zeros((len(cells), 3, 3))
+        means = np.stack([np.bincount(row, column) for column in columns], axis=1) / counts[:, None]
+        add_squares(points, row, means, spread)
+        spread[:, [1, 2, 2], [0, 0, 1]] = spread[:, [0, 0, 1], [1, 2, 2]]
+        spread = spread / counts[:, None, None] + _POINT_M**2 * np.eye(3)
         good = counts >= _CELL_POINTS
         self.means, self.inverse = means[good], np.linalg.inv(spread[good])
         self.row[cells] = np.where(good, np.cumsum(good) - 1, -1)
@@ -113,16 +116,6 @@ class _Cells:
 
 
 @numba.njit(cache=True, nogil=True)
-def bounds(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the least and the greatest coordinates of (N, 3) points, N > 0."""
-    lower, upper = points[0].copy(), points[0].copy()
-    for i in range(1, len(points)):
-        for a in range(3):
-            lower[a], upper[a] = min(lower[a], points[i, a]), max(upper[a], points[i, a])
-    return lower, upper
-
-
-@numba.njit(cache=True, nogil=True)
 def flat_cells(
     points: NDArray[np.float64], cell_m: float, lower: NDArray[np.float64], size: NDArray[np.int64]
 ) -> NDArray[np.int64]:
@@ -144,34 +137,22 @@ def flat_cells(
 
 
 @numba.njit(cache=True, nogil=True)
-def distributions(
-    points: NDArray[np.float64], row: NDArray[np.int64], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the number, (R,), the mean, (R, 3), and the covariance, (R, 3, 3), of the points of each cell.
+def add_squares(
+    points: NDArray[np.float64], row: NDArray[np.int64], means: NDArray[np.float64], squares: NDArray[np.float64]
+) -> None:
+    """Add the products of the offsets of points from the mean of their cell.
 
     Args:
         points: (N, 3) metres.
-        row: (N,) the cell of each of them, of which each has a point.
-        count: R, the number of cells.
+        row: (N,) the cell of each of them.
+        means: (R, 3) of the points of each cell.
+        squares: (R, 3, 3) the sums. Is changed.
     """
-    counts, means, spread = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
-    for i in range(len(points)):
-        counts[row[i]] += 1
-        for a in range(3):
-            means[row[i], a] += points[i, a]
-    for r in range(count):
-        for a in range(3):
-            means[r, a] /= counts[r]
     for i in range(len(points)):
         r = row[i]
-        for a in range(3):
-            for b in range(3):
-                spread[r, a, b] += (points[i, a] - means[r, a]) * (points[i, b] - means[r, b])
-    for r in range(count):
-        for a in range(3):
-            for b in range(3):
-                spread[r, a, b] /= counts[r]
-    return counts, means, spread
+        x, y, z = points[i, 0] - means[r, 0], points[i, 1] - means[r, 1], points[i, 2] - means[r, 2]
+        for a, b, product in ((0, 0, x * x), (0, 1, x * y), (0, 2, x * z), (1, 1, y * y), (1, 2, y * z), (2, 2, z * z)):
+            squares[r, a, b] += product
 
 
 def _exp(step: NDArray[np.float64]) -> Transform:

@@ -38,7 +38,7 @@ def occupy(occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: fl
     """Mark the cells of a grid that hold points; the arguments are those of `count_occupied`."""
     cells = len(occupied)
     for i in range(len(points)):
-        x, y, z = points[i]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         a, b, c = (x + reach_m) / voxel_m, (y + reach_m) / voxel_m, (z + reach_m) / voxel_m
         if 0 <= a < cells and 0 <= b < cells and 0 <= c < cells:
             occupied[int(a), int(b), int(c)] = True
@@ -63,7 +63,7 @@ def count_occupied(
     """
     count, cells, cell = 0, len(occupied), np.empty(3)
     for i in range(len(points)):
-        x, y, z = points[i]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for a in range(3):  # the operations of `transform_points`, in their order
             moved = (x * motion[a, 0] + y * motion[a, 1] + z * motion[a, 2]) + motion[a, 3]
             cell[a] = (moved + reach_m) / voxel_m

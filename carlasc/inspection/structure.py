@@ -54,7 +54,7 @@ def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDA
     """Return (N,) which of (N, 3) points have a distance from the sensor between two others. Points that are not finite have none."""
     found = np.empty(len(points), np.bool_)
     for i in range(len(points)):
-        x, y, z = points[i]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         found[i] = nearest < np.sqrt(x * x + y * y + z * z) < farthest
     return found
 

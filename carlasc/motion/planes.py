@@ -87,18 +87,19 @@ def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     size = 2
     while size < 2 * len(cells):
         size *= 2
-    table = np.full(size, -1, np.int64)  # the index of the first row of each cell, at the hash of the cell or after it
+    table = np.zeros(size, np.int64)  # 1 + the index of the first row of each cell, at the hash of the cell or after it
     first = np.zeros(len(cells), np.bool_)
     for i in range(len(cells)):
-        x, y, z = cells[i]
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         slot = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
-        while table[slot] >= 0:
-            other = cells[table[slot]]
-            if other[0] == x and other[1] == y and other[2] == z:
+        while True:
+            k = table[slot] - 1
+            if k < 0:
+                table[slot], first[i] = i + 1, True
+                break
+            if cells[k, 0] == x and cells[k, 1] == y and cells[k, 2] == z:
                 break
             slot = (slot + 1) & (size - 1)
-        else:
-            table[slot], first[i] = i, True
     return first
 
 
@@ -156,25 +157,30 @@ def nearest_within(
         axis: along which they are sorted.
         squared: the square of the distance that pairs must be nearer than.
     """
-    along, count, last = model[:, axis].copy(), 0, len(model) - 1
-    rows, nearest = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
-    place, moved = np.empty(3), np.empty(3)
+    rows, nearest, moved = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(3)
+    place, count, last = np.empty(3), 0, len(model) - 1
     for a in range(3):  # the operations of `invert` and `transform_points`, in their order
         place[a] = -(pose[0, a] * pose[0, 3] + pose[1, a] * pose[1, 3] + pose[2, a] * pose[2, 3])
     for i in range(len(points)):
         for a in range(3):
             moved[a] = (points[i, 0] * pose[0, a] + points[i, 1] * pose[1, a] + points[i, 2] * pose[2, a]) + place[a]
-        after = np.searchsorted(along, moved[axis])
-        before, best, found = after - 1, squared, -1
-        behind = moved[axis] - along[before] if before >= 0 else np.inf
-        ahead = along[after] - moved[axis] if after <= last else np.inf
-        while behind**2 <= best or ahead**2 <= best:
+        before, after = -1, last + 1
+        while after - before > 1:
+            middle = (before + after) // 2
+            if model[middle, axis] < moved[axis]:
+                before = middle
+            else:
+                after = middle
+        best, found = squared, -1
+        behind = moved[axis] - model[before, axis] if before >= 0 else np.inf
+        ahead = model[after, axis] - moved[axis] if after <= last else np.inf
+        while behind * behind <= best or ahead * ahead <= best:
             if behind < ahead:
                 k, before = before, before - 1
-                behind = moved[axis] - along[before] if before >= 0 else np.inf
+                behind = moved[axis] - model[before, axis] if before >= 0 else np.inf
             else:
                 k, after = after, after + 1
-                ahead = along[after] - moved[axis] if after <= last else np.inf
+                ahead = model[after, axis] - moved[axis] if after <= last else np.inf
             x, y, z = moved[0] - model[k, 0], moved[1] - model[k, 1], moved[2] - model[k, 2]
             distance = x * x + y * y + z * z
             if distance < best or (distance == best and order[k] < found):

@@ -139,8 +139,7 @@ def lay(
     count = len(points)
     slope, weighted, off = np.empty((count, 4)), np.empty((count, 4)), np.empty(count)
     for i in range(count):
-        for a in range(3):
-            slope[i, a] = normal[i, a]
+        slope[i, 0], slope[i, 1], slope[i, 2] = normal[i, 0], normal[i, 1], normal[i, 2]
         slope[i, 3] = arm[i, 0] * normal[i, 1] - arm[i, 1] * normal[i, 0]
         x = (points[i, 0] - place[0] - arm[i, 0]) * normal[i, 0]
         y = (points[i, 1] - place[1] - arm[i, 1]) * normal[i, 1]
