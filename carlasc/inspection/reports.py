@@ -245,7 +245,7 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
         plan = Plan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
         inputs = ScanSequence(sequence, plan, options)
         return inputs if len(inputs.feed.frames) else None
-    except (CarlascError, ValueError, TypeError):  # the record of another version, or no valid poses
+    except (CarlascError, ValueError, TypeError, OverflowError):  # the record of another version, or no valid poses
         return None
 
 

@@ -199,14 +199,20 @@ def parse_json_value(data: bytes | str, where: str) -> Any:
     """Read any JSON value.
 
     Raises:
-        FormatError: `where` (the file) holds something else, or is nested too deeply.
+        FormatError: `where` (the file) holds something else, is nested too deeply, or has text that no file can hold.
     """
     try:
-        return json.loads(data)
+        value = json.loads(data)
+        if _HALF.search(data if isinstance(data, bytes) else data.encode()):
+            json.dumps(
+                value, ensure_ascii=False
+            ).encode()  # ValueError: half of a character, which could not be written again
+        return value
     except (ValueError, RecursionError, TypeError) as error:  # ValueError: also a number of more than 4,300 digits
         raise FormatError(where, expected="JSON", found="something else", advice=describe(error)) from error
 
 
+_HALF = re.compile(rb"\\u[dD][89a-fA-F]")
 _PART = ".part"
 _FREE_SPACE = "free some space and run again"
 _HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())

@@ -21,7 +21,7 @@ from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, remap_named
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.storage.arrays import NUMBERS, ArrayFormat
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size
 from carlasc_converters.files import opening, read_text
 from carlasc_converters.npz import read_arrays
 from carlasc_converters.ply import PlyVertices
@@ -255,6 +255,7 @@ def _read_geometry(path: str | Path) -> GridSpec:
         lower = np.asarray(origin, np.float64).reshape(3)
         cells = np.asarray(size, np.int64).reshape(3)
         x, y, z = cells.tolist()
+        check_size((x, y, z), np.dtype(np.uint8), str(path))
         # Decimals first, because the origin is float32 and the size of a voxel is not: the bounds are then those of the documentation,
         # in float32, as `--bounds` gives them.
         low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()

@@ -216,6 +216,10 @@ def move_rows(folder: Path) -> None:
             "0002.npz: expected an array voxel_size, found occupancy, voxel_origin, volume_size",
         ),
         (lambda folder: change_grid(folder, voxel_size=0.2), "0002.npz: expected the geometry of"),
+        (
+            lambda folder: change_grid(folder, volume_size=np.array([65408, 128, 255])),
+            "0002.npz: expected at most 268435456 bytes, found uint8 of shape",
+        ),
         (lambda folder: change_grid(folder, volume_size=np.array([1, 2])), "0002.npz: expected voxel_size, and 3"),
         (
             lambda folder: change_grid(folder, occupancy=np.zeros((4, 3), np.uint16)),

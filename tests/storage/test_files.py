@@ -61,10 +61,14 @@ def test_json_is_written_as_the_published_files_are(tmp_path):
     assert (tmp_path / "params.json").read_text() == '{"grid_size": [128.0], "max_bound": [25.600000381469727]}'
 
 
-@pytest.mark.parametrize("data", [b"{", b"\xff", b"[1]"])
+@pytest.mark.parametrize("data", [b"{", b"\xff", b"[1]", b'{"a": "\\ud800"}'])
 def test_what_is_no_json_object_is_refused_by_name(data):
     with pytest.raises(FormatError, match="here.json: expected"):
         parse_json(data, "here.json")
+
+
+def test_escaped_pairs_are_one_character():
+    assert parse_json(b'{"a": "\\ud83d\\ude97"}', "here.json") == {"a": "\U0001f697"}
 
 
 def test_what_killed_writers_left_is_removed_and_what_others_write_now_is_not(tmp_path):
