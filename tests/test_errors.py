@@ -1,4 +1,5 @@
 import pickle
+import signal
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -125,8 +126,14 @@ def test_ctrl_c_is_not_lost_in_a_module_that_catches_everything(tmp_path, monkey
     lines = ("import os, signal", "try:", "    os.kill(os.getpid(), signal.SIGINT)", "    sum(range(1000))")
     (tmp_path / "catches_all.py").write_text("\n".join([*lines, "except BaseException:", "    pass", ""]))
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        import_extra("catches_all", "view")
+    usual = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a program that a shell starts with "&" ignores Ctrl-C
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            import_extra("catches_all", "view")
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 def test_importing_carlasc_loads_numpy_and_nothing_heavier():

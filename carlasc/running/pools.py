@@ -204,17 +204,25 @@ def _end_with_parent() -> None:
 
 
 def _exit_worker(*_: object) -> None:
+    if not _Cleanly.is_working:
+        # At once: an exception in the middle of reading a task would leave its rest to the next worker, who takes it for a task.
+        os._exit(_TERMINATED)
     raise SystemExit(_TERMINATED)
 
 
 class _Cleanly:
     """A function whose process ends on SIGTERM once the function has cleaned up, instead of taking the next task."""
 
+    is_working = False
+
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         try:
+            _Cleanly.is_working = True
             return self.function(*args, **kwargs)
         except SystemExit:
             os._exit(_TERMINATED)
+        finally:
+            _Cleanly.is_working = False

@@ -145,6 +145,18 @@ def is_alive(process: int) -> bool:
     return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
+def test_a_worker_that_is_told_to_end_between_tasks_leaves_the_next_one_whole():
+    code = (
+        "import os, signal, threading; from multiprocessing import Pipe; from carlasc.running import pools\n"
+        "pools._prepare_worker(); tasks, _writer = Pipe(duplex=False)\n"
+        "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()\n"
+        "try: tasks.recv()\n"
+        "except BaseException: print('the rest of the task is in the pipe', flush=True)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (143, "", "")
+
+
 def test_a_number_of_workers_below_one_makes_no_sense():
     with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
         list(run_all(jobs.square, range(3), workers=0))
