@@ -20,7 +20,7 @@ def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
         name: what it is called in errors.
 
     Raises:
-        ValueError: it has another type, lacks a key, or is a number that is not finite.
+        ValueError: it has another type, lacks a key, or is a number that is not finite, or that has more than 64 bits.
     """
     origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
     if kind is Any:
@@ -36,6 +36,8 @@ def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
         return tuple(from_plain(each, part, name) for each, part in zip(value, kinds, strict=True))
     if origin in (Mapping, dict) and isinstance(value, dict):
         return {key: from_plain(each, parts[1], f"{name}.{key}") for key, each in value.items()}
+    if type(value) is int and abs(value) >= 1 << 63:
+        raise ValueError(f"a number of more than 64 bits in {name}")
     if kind is float and type(value) in (int, float) and math.isfinite(value):
         return float(value)
     if value is None and kind in (None, types.NoneType):

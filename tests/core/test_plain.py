@@ -35,6 +35,8 @@ def test_objects_become_dataclasses_and_lists_tuples():
     [
         ({"count": True}, "bool in the value.count"),
         ({"count": 1.5}, "float in the value.count"),
+        ({"count": 10**30}, "a number of more than 64 bits in the value.count"),
+        ({"share": -(10**400)}, "a number of more than 64 bits in the value.share"),
         ({"share": "1"}, "str in the value.share"),
         ({"share": float("nan")}, "float in the value.share"),
         ({"sizes": [1]}, "1 values in the value.sizes, not 2"),
