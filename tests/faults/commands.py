@@ -18,6 +18,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import zipfile
@@ -221,6 +222,7 @@ def start(argv: list[str], case: Path, before: Callable[[], None] | None = None)
     finally:
         if code == 70:
             traceback.print_exc()
+        threading._shutdown()  # type: ignore[attr-defined]  # as the interpreter does at its end: it waits for threads, also after Ctrl-C
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

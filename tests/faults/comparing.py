@@ -11,7 +11,7 @@ import numpy as np
 
 import carlasc
 from carlasc.errors import CarlascError
-from faults.commands import MESSAGES
+from faults.commands import MESSAGES, TEMPORARY
 
 STORES = (".zarr", ".h5", ".parquet")
 Content = dict[str, bytes | None]
@@ -19,15 +19,20 @@ Content = dict[str, bytes | None]
 
 
 def content_of(folder: Path) -> Content:
-    """Return what is in a folder, without the messages of commands."""
+    """Return what is in a folder, without the messages of commands, and without the file by which Python tries the folder for temporary files."""
     found: Content = {}
     for path in sorted(folder.rglob("*")):
-        if path.name != MESSAGES:
+        if path.name != MESSAGES and not _is_trial(path):
             is_file = path.is_file() and not path.is_symlink()
             found[path.relative_to(folder).as_posix()] = (
                 _without_times(path.name, path.read_bytes()) if is_file else None
             )
     return found
+
+
+def _is_trial(path: Path) -> bool:
+    """Whether `tempfile` made a file to see whether it can; a process that is killed at that moment leaves these four bytes."""
+    return path.parent.name == TEMPORARY and path.is_file() and b"blat".startswith(path.read_bytes())
 
 
 def _without_times(name: str, data: bytes) -> bytes:
