@@ -30,6 +30,7 @@ _Number = TypeVar("_Number", int, float)
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
+_INTERRUPTED = "interrupted: files written so far are complete; run the same command again to continue"
 _ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also one that lost a slash; a drive has one letter
@@ -131,7 +132,11 @@ class CommandGroup(TyperGroup):
                 echo(f"carlasc: {_replace_arguments(message, self._options(ctx))}", err=True)
             fail(str(error))
         except KeyboardInterrupt:
-            fail("interrupted: files written so far are complete; run the same command again to continue", INTERRUPTED)
+            fail(_INTERRUPTED, INTERRUPTED)
+        except SystemError as error:
+            if not isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while compiled code returned its result
+                raise
+            fail(_INTERRUPTED, INTERRUPTED)
         except BrokenPipeError:  # `carlasc info | head`
             sys.stderr.close()
             raise typer.Exit(FAILED) from None

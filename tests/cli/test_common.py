@@ -40,6 +40,15 @@ def test_an_error_is_one_line_and_an_honest_exit_code(error, code):
     assert "Traceback" not in result.output
 
 
+def test_ctrl_c_in_compiled_code_is_ctrl_c():
+    def action():
+        raise SystemError("dispatcher returned a result with an exception set") from KeyboardInterrupt()
+
+    result = run(action)
+    assert result.exit_code == 130
+    assert result.stderr.startswith("carlasc: interrupted")
+
+
 def run_with_options(error):
     """Run a command that has some of the library's arguments as options, and fails with an error; return its message."""
 
