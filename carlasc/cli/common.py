@@ -133,8 +133,9 @@ class CommandGroup(TyperGroup):
             fail(str(error))
         except KeyboardInterrupt:
             fail(_INTERRUPTED, INTERRUPTED)
-        except SystemError as error:
-            if not isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while compiled code returned its result
+        except (SystemError, ValueError) as error:
+            # Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
+            if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
                 raise
             fail(_INTERRUPTED, INTERRUPTED)
         except BrokenPipeError:  # `carlasc info | head`

@@ -40,9 +40,12 @@ def test_an_error_is_one_line_and_an_honest_exit_code(error, code):
     assert "Traceback" not in result.output
 
 
-def test_ctrl_c_in_compiled_code_is_ctrl_c():
+@pytest.mark.parametrize(
+    "error", [SystemError("a result with an exception set"), ValueError("Can't close the ZIP file")]
+)
+def test_ctrl_c_that_another_error_hides_is_ctrl_c(error):
     def action():
-        raise SystemError("dispatcher returned a result with an exception set") from KeyboardInterrupt()
+        raise error from KeyboardInterrupt()
 
     result = run(action)
     assert result.exit_code == 130
