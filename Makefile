@@ -2,7 +2,7 @@
 PYTHON ?= python3
 DEMO_VENV := .venv-demo
 VENV := .venv
-SYSTEM_LIBRARIES := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1 xvfb chromium chromium-driver
+SYSTEM_LIBRARIES := libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1 xvfb chromium chromium-driver firefox-esr
 RUN := $(VENV)/bin
 SIDE_BY_SIDE := -q -n auto --dist worksteal
 COVERAGE := 90 # percent; below it, `make coverage` fails
@@ -97,7 +97,7 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@touch $@
 
 # Without torch, which on Linux is gigabytes: its tests skip. `EXTRAS=all,dev` has it too.
-EXTRAS ?= zarr,hdf5,parquet,remote,kitti,render,simulate,view,plots,dev
+EXTRAS ?= zarr,hdf5,parquet,remote,kitti,render,simulate,view,plots,rerun,foxglove,hub,dev
 .venv-newest/ready: pyproject.toml
 	$(call virtual_environment,.venv-newest)
 	.venv-newest/bin/pip install --quiet --no-compile --editable '.[$(EXTRAS)]'
