@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.compiling import cached
+from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 
@@ -209,7 +209,7 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
                 voxel += step
 
 
-@cached
+@jit
 def _entry(start, step, size):  # type: ignore[no-untyped-def]
     """Return the distance at which a ray from outside enters the grid, -1 if it does not enter the grid."""
     near, far = 0.0, np.inf
