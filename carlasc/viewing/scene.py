@@ -1,6 +1,6 @@
-"""What to look at: frames of a sequence with a grid, its ground truth and its points, all in one class table.
+"""What to look at: frames of a sequence with a grid, its ground truth, points, boxes and pose, all in one class table.
 
-Pictures, pages and windows, and whatever else shows data, take a `Scene` and read it through a `SceneReader`.
+Pictures, pages, recordings and windows, and whatever else shows data, take a `Scene` and read it through a `SceneReader`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.converting.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
+from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES, remaps_between
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.comparison import check_same_geometry, compare_grids
 from carlasc.storage import Sequence, layout
+from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
 from carlasc.viewing.finding import FoundSequence, SceneSource, find_sequence, find_truth
 from carlasc.viewing.remapping import RemappedSequence
@@ -148,11 +152,13 @@ class GridPanel:
         title: "prediction", "truth", "errors"; or the size of the grid if there is only one.
         spec: geometry.
         colors: colours of its labels.
+        name: "prediction", "truth", "errors"; or "grid" if there is only one.
     """
 
     title: str
     spec: GridSpec
     colors: ClassColors
+    name: str = "grid"
 
 
 @dataclass(frozen=True)
@@ -163,11 +169,15 @@ class FrameContent:
         grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.Outcome`).
         scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
         time_s: seconds since the first frame, or None if the sequence has no times.
+        boxes: tracked boxes, sensor frame; None where the frame was not annotated.
+        pose: (4, 4) first_T_sensor, or None if the sequence has no poses.
     """
 
     grids: tuple[Grid, ...]
     scan: Scan | None
     time_s: float | None
+    boxes: Boxes | None = None
+    pose: Transform | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +191,7 @@ class SceneReader:
         frames: the frame numbers.
         palette: "class", "colorblind" or "height".
         notes: what was chosen where the scene left a choice, one sentence each.
+        mirrored: whether y is mirrored: what `right_handed` returns for left-handed data.
     """
 
     data: RemappedSequence
@@ -189,6 +200,7 @@ class SceneReader:
     frames: tuple[int, ...]
     palette: PaletteName = "class"
     notes: tuple[str, ...] = ()
+    mirrored: bool = False
 
     @property
     def name(self) -> str:
@@ -203,9 +215,22 @@ class SceneReader:
         return self.data.sequence.path or self.data.sequence.location
 
     @property
+    def axes(self) -> Axes:
+        """The handedness of everything that is read: "left" where y points to the right of the vehicle."""
+        return "right" if self.mirrored else self.data.sequence.metadata.axes
+
+    @property
     def left_handed(self) -> bool:
         """Whether y points to the right of the vehicle."""
-        return self.data.sequence.metadata.axes == "left"
+        return self.axes == "left"
+
+    def right_handed(self) -> SceneReader:
+        """Return a reader of the same frames in right-handed axes, for programs that know no others: y points to the left."""
+        return replace(self, mirrored=True) if self.left_handed else self
+
+    def has(self, field: str) -> bool:
+        """Whether some frame of the sequence has a field, such as "points" or "flow" (see `carlasc.storage.layout`)."""
+        return field in self.data.sequence.fields()
 
     @property
     def table(self) -> ClassTable:
@@ -222,13 +247,13 @@ class SceneReader:
         """The grids that are shown side by side; empty if only points are shown."""
         if not self.data.grid:
             return ()
-        spec = self.data.spec
+        spec = mirror_spec(self.data.spec) if self.mirrored else self.data.spec
         if self.truth is None:
             return (GridPanel(str(spec), spec, self.colors),)
         return (
-            GridPanel("prediction", spec, self.colors),
-            GridPanel("truth", spec, self.colors),
-            GridPanel("errors", spec, ClassColors(ERRORS)),
+            GridPanel("prediction", spec, self.colors, "prediction"),
+            GridPanel("truth", spec, self.colors, "truth"),
+            GridPanel("errors", spec, ClassColors(ERRORS), "errors"),
         )
 
     def read(self, frame: int) -> FrameContent:
@@ -237,8 +262,20 @@ class SceneReader:
         Raises:
             FormatError: the data do not have the format.
         """
-        scan = self.data.read_scan(frame) if frame in self.data.sequence.frames("points") else None
-        return FrameContent(self._read_grids(frame), scan, self.read_time(frame))
+        scan = self.read_scan(frame)
+        boxes = self._read_boxes(frame) if scan is None else scan.boxes
+        return FrameContent(self._read_grids(frame), scan, self.read_time(frame), boxes, self.read_pose(frame))
+
+    def read_scan(self, frame: int) -> Scan | None:
+        """Read the points of a frame with all of their fields, without those that are not finite; None if it has no points.
+
+        Raises:
+            FormatError: the data do not have the format.
+        """
+        if frame not in self.data.sequence.frames("points"):
+            return None
+        scan = self.data.read_scan(frame)
+        return mirror_scan(scan) if self.mirrored else scan
 
     def read_time(self, frame: int) -> float | None:
         """Return the seconds since the first frame, or None if the sequence has no times."""
@@ -247,14 +284,47 @@ class SceneReader:
         except MissingDataError:
             return None
 
+    def read_pose(self, frame: int) -> Transform | None:
+        """Return (4, 4) first_T_sensor of a frame, or None if the sequence has no poses.
+
+        Raises:
+            FormatError: the frame has no line in the file of poses, or its line is no rigid transform.
+        """
+        sequence = self.data.sequence
+        try:
+            pose = check_rigid(sequence.read_pose(frame), f"{sequence.location}/{layout.POSES}: frame {frame}")
+        except MissingDataError:
+            return None
+        return mirror_poses(pose) if self.mirrored else pose
+
+    def path_of_ego(self) -> NDArray[np.float64]:
+        """Return the (F, 3) positions of the sensor in all frames, metres in the frame of the first scan; none without poses."""
+        poses = [pose for pose in map(self.read_pose, self.frames) if pose is not None]
+        return np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
+
+    def read_picture(self, frame: int) -> bytes | None:
+        """Return the bird's-eye camera picture of a frame as its JPEG bytes, or None if it has none.
+
+        Raises:
+            FormatError: the data do not have the format.
+        """
+        if frame not in self.data.sequence.frames("bev"):
+            return None
+        return self.data.sequence.read("bev", frame).tobytes()
+
+    def _read_boxes(self, frame: int) -> Boxes | None:
+        boxes = self.data.read_boxes(frame)
+        return mirror_boxes(boxes) if self.mirrored and boxes is not None else boxes
+
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:
         if not self.data.grid:
             return ()
         grid = self.data.read_grid(frame)
-        if self.truth is None:
-            return (grid,)
-        truth = self.truth.read_grid(frame)
-        return grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
+        grids: tuple[Grid, ...] = (grid,)
+        if self.truth is not None:
+            truth = self.truth.read_grid(frame)
+            grids = grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
+        return tuple(map(mirror_voxels, grids)) if self.mirrored else grids
 
 
 def _table_of(classes: ClassTable | str | None) -> ClassTable | None:
