@@ -19,11 +19,12 @@ from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.core.tables import TABLES, remaps_between
+from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.comparison import check_same_geometry, compare_grids
-from carlasc.storage import Sequence, layout
+from carlasc.storage import layout
 from carlasc.storage.metadata import Axes
+from carlasc.viewing.choosing import choose_grid, common_table, describe_frames, frames_with, list_fields, table_of
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
 from carlasc.viewing.finding import FoundSequence, SceneSource, find_sequence, find_truth
 from carlasc.viewing.remapping import RemappedSequence
@@ -90,17 +91,17 @@ class Scene:
         found = find_sequence(self.source, self.sequence)
         truth = None if self.truth is None else find_truth(self.truth, found.sequence)
         contents = self._default_contents(found) if what is None else self._check_contents(what)
-        grid = _choose_grid(found, self.grid) if {"grid", "errors"} & set(contents) else ""
-        data = RemappedSequence(found.sequence, grid, stored=_table_of(self.source_classes))
+        grid = choose_grid(found, self.grid) if {"grid", "errors"} & set(contents) else ""
+        data = RemappedSequence(found.sequence, grid, stored=table_of(self.source_classes))
         reference = None
         if truth is not None:
-            reference = RemappedSequence(truth.sequence, _choose_grid(truth, self.truth_grid))
+            reference = RemappedSequence(truth.sequence, choose_grid(truth, self.truth_grid))
             if "errors" in contents:
                 check_same_geometry(data.spec, reference.spec)
-        table = _common_table(data, reference, _table_of(self.classes))
+        table = common_table(data, reference, table_of(self.classes))
         data = replace(data, shown=table)
         reference = None if reference is None else replace(reference, shown=table)
-        frames = self._choose_frames(found, _frames_with(data, reference, contents))
+        frames = self._choose_frames(found, frames_with(data, reference, contents))
         notes = () if found.note is None else (found.note,)
         return SceneReader(data, reference, contents, frames, self.palette, notes)
 
@@ -111,7 +112,7 @@ class Scene:
             return ("grid",) if self.truth is None else ("grid", "truth", "errors")
         if "points" in found.sequence.fields():
             return ("scan",)
-        raise MissingDataError(found.sequence.location, expected="a grid or points", found=_list_fields(found.sequence))
+        raise MissingDataError(found.sequence.location, expected="a grid or points", found=list_fields(found.sequence))
 
     def _check_contents(self, what: str | Iterable[str]) -> tuple[str, ...]:
         contents = tuple(what.split(",") if isinstance(what, str) else what)
@@ -133,7 +134,7 @@ class Scene:
             raise MissingDataError(
                 found.sequence.location,
                 expected=f"frames {frames}",
-                found=_describe_frames(available),
+                found=describe_frames(available),
                 advice="choose others with `frames`",
             )
         return tuple(int(frame) for frame in chosen)
@@ -325,72 +326,3 @@ class SceneReader:
             truth = self.truth.read_grid(frame)
             grids = grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
         return tuple(map(mirror_voxels, grids)) if self.mirrored else grids
-
-
-def _table_of(classes: ClassTable | str | None) -> ClassTable | None:
-    return TABLES[classes] if isinstance(classes, str) else classes
-
-
-def _choose_grid(found: FoundSequence, name: str | None) -> str:
-    """Return the grid that is asked for, the one that the path names, `evaluation`, or the first."""
-    names = list(found.sequence.grids)
-    wanted = name or found.grid
-    if wanted is None:
-        wanted = layout.EVALUATION if layout.EVALUATION in names else next(iter(names), layout.EVALUATION)
-    if wanted not in names:
-        raise MissingDataError(
-            found.sequence.location, expected=f"the grid {wanted}", found=", ".join(names) or "no grid"
-        )
-    return wanted
-
-
-def _common_table(data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None) -> ClassTable:
-    """Return the class table that all labels are shown in: the wanted one, the data's, or the truth's."""
-    stored = [data.stored_table] + ([] if truth is None else [truth.stored_table])
-    candidates = stored if wanted is None else [wanted]
-    for table in candidates[:-1]:
-        try:
-            _check_remaps(stored, table)
-        except ArgumentError:
-            continue
-        return table
-    _check_remaps(stored, candidates[-1])
-    return candidates[-1]
-
-
-def _check_remaps(stored: Iterable[ClassTable], target: ClassTable) -> None:
-    """Raise ArgumentError if labels of one of the tables cannot be shown in the target."""
-    for table in stored:
-        remaps_between(table, target)
-
-
-def _frames_with(
-    data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]
-) -> NDArray[np.int64]:
-    """Return the frames that have everything that is shown."""
-    own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
-    needed = [(data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))]
-    if truth is not None and {"truth", "errors"} & set(contents):
-        needed.append((truth.sequence, f"{truth.grid}/labels"))
-    frames: NDArray[np.int64] | None = None
-    for sequence, name in needed:
-        available = sequence.frames(name)
-        if not len(available):
-            raise MissingDataError(sequence.location, expected=f"the field {name}", found=_list_fields(sequence))
-        common = available if frames is None else np.intersect1d(frames, available)
-        if frames is not None and not len(common):
-            raise MissingDataError(
-                sequence.location,
-                expected=f"{name} of frames {_describe_frames(frames)}",
-                found=f"frames {_describe_frames(available)}",
-            )
-        frames = common
-    return np.empty(0, np.int64) if frames is None else frames
-
-
-def _list_fields(sequence: Sequence) -> str:
-    return ", ".join(sorted(sequence.fields())) or "nothing"
-
-
-def _describe_frames(frames: NDArray[np.int64]) -> str:
-    return f"{frames[0]} to {frames[-1]} ({len(frames)} frames)"

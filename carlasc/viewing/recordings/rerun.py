@@ -18,10 +18,12 @@ import errno
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import quaternions_of
 from carlasc.core.grids import Grid
 from carlasc.errors import import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
@@ -53,7 +55,7 @@ class RerunWriter:
         self._drawn: dict[str, set[int]] = {panel.name: set() for panel in reader.panels}
         batches = self._rr.ChunkBatcherConfig(flush_tick=timedelta(days=1))  # frames, not seconds, say when
         self._waiting = 0
-        self._recording = self._rr.RecordingStream("carlasc", recording_id=reader.name, batcher_config=batches)
+        self._recording = self._rr.RecordingStream("carlasc", recording_id=uuid4(), batcher_config=batches)
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
         self._recording.save(path, default_blueprint=self._blueprint())
@@ -75,7 +77,8 @@ class RerunWriter:
         if self._reader.has("boxes"):
             self._write_boxes(frame.boxes)
         if frame.pose is not None:
-            log("world/ego", rr.Transform3D(translation=frame.pose[:3, 3], mat3x3=frame.pose[:3, :3]))
+            rotation = np.roll(quaternions_of(frame.pose[None, :3, :3])[0], -1)  # x, y, z, w
+            log("world/ego", rr.Transform3D(translation=frame.pose[:3, 3], quaternion=rotation))
             ways, classes = [trail.points for trail in frame.trails], [trail.label for trail in frame.trails]
             log("world/tracks", rr.LineStrips3D(ways, class_ids=classes, radii=[_TRAIL_RADIUS_M]))
         if frame.picture is not None:
