@@ -13,9 +13,10 @@ Topics, all in right-handed axes with z up; times are seconds since the first fr
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -241,28 +242,28 @@ class FoxgloveWriter:
 
 
 class _Output:
-    """The file, for the SDK, which reports no error of a file that it writes to: the first one is kept here."""
+    """The file, for the SDK, which does not say when one cannot be written: the first error is kept, and what follows is dropped."""
 
     def __init__(self, path: Path) -> None:
-        self._file, self._error = path.open("wb"), cast("OSError | None", None)
+        self._file = path.open("wb", buffering=0)
+        self._error: OSError | None = None
+        self._position = self._end = 0
 
     def write(self, data: bytes | bytearray) -> int:
         if self._error is None:
-            try:
-                return self._file.write(data)
-            except OSError as error:
-                self._error = error
+            self._try(lambda: self._write_all(memoryview(data)))
+        self._position += len(data)
+        self._end = max(self._end, self._position)
         return len(data)
 
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(offset, whence)
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._end}[whence]
+        if self._error is None:
+            self._try(lambda: self._file.seek(self._position))
+        return self._position
 
     def flush(self) -> None:
-        if self._error is None:
-            try:
-                self._file.flush()
-            except OSError as error:
-                self._error = error
+        """Do nothing: every write goes to the operating system at once."""
 
     def check(self) -> None:
         """Raise the error that was kept."""
@@ -270,8 +271,15 @@ class _Output:
             raise self._error
 
     def close(self) -> None:
+        self._try(self._file.close)
+        self.check()
+
+    def _write_all(self, data: memoryview) -> None:
+        while data:
+            data = data[self._file.write(data) :]
+
+    def _try(self, action: Callable[[], object]) -> None:
         try:
-            self._file.close()
+            action()
         except OSError as error:
             self._error = self._error or error
-        self.check()
