@@ -80,7 +80,7 @@ class RerunWriter:
             rotation = np.roll(quaternions_of(frame.pose[None, :3, :3])[0], -1)  # x, y, z, w
             log("world/ego", rr.Transform3D(translation=frame.pose[:3, 3], quaternion=rotation))
             ways, classes = [trail.points for trail in frame.trails], [trail.label for trail in frame.trails]
-            log("world/tracks", rr.LineStrips3D(ways, class_ids=classes, radii=[_TRAIL_RADIUS_M]))
+            log("world/tracks", rr.LineStrips3D(ways, class_ids=classes, radii=[_TRAIL_RADIUS_M], show_labels=False))
         if frame.picture is not None:
             log("picture", rr.EncodedImage(contents=frame.picture, media_type="image/jpeg"))
         self._waiting += 1
