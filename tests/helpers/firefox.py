@@ -5,11 +5,11 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import shutil
 import socket
 import subprocess
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +32,13 @@ _PREFERENCES = {
 class Firefox:
     """A browser with a fresh profile in a folder."""
 
-    def __init__(self, binary: str, folder: Path) -> None:
+    def __init__(self, binary: str, folder: Path, environment: Mapping[str, str]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         lines = (f"user_pref({json.dumps(name)}, {json.dumps(value)});" for name, value in _PREFERENCES.items())
         (folder / "user.js").write_text("\n".join(lines))
         command = [binary, "--headless", "--marionette", "--no-remote", "--profile", str(folder)]
         quiet = subprocess.DEVNULL
-        self.process = subprocess.Popen(command, env={**os.environ, "HOME": str(folder)}, stdout=quiet, stderr=quiet)
+        self.process = subprocess.Popen(command, env={**environment, "HOME": str(folder)}, stdout=quiet, stderr=quiet)
         self.socket = socket.create_connection(("127.0.0.1", self._port(folder)), timeout=60)
         self.number = 0
         self._receive()  # it introduces itself
@@ -112,9 +112,14 @@ class Firefox:
             self.process.wait()
 
 
-def start_firefox(profile: Path) -> Firefox:
-    """Start a browser with a fresh profile, or skip the test saying what is missing."""
+def start_firefox(profile: Path, environment: Mapping[str, str]) -> Firefox:
+    """Start a browser with a fresh profile, or skip the test saying what is missing.
+
+    Args:
+        profile: an empty folder.
+        environment: names a screen, without which Firefox has no WebGL, not even headless (see `helpers.screens`).
+    """
     binary = shutil.which("firefox-esr") or shutil.which("firefox")
     if binary is None:
         pytest.skip("Firefox is not installed: apt-get install firefox-esr")
-    return Firefox(binary, profile)
+    return Firefox(binary, profile, environment)

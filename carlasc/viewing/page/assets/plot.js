@@ -85,6 +85,6 @@ class ScorePlot {
   /** Returns a text for each run, with its number. */
   describe() {
     const names = this.scene.runs.length > 1 ? this.scene.runs : [METRICS[this.metric]];
-    return names.map((name, run) => [`${name} ${percent(this.scene.scores[this.metric][run][this.position])}`, run]);
+    return names.map((name, run) => [`${percent(this.scene.scores[this.metric][run][this.position])} ${name}`, run]);
   }
 }
