@@ -89,7 +89,7 @@ class Firefox:
     def run(self, script: str) -> Any:
         """Run the body of an async function in the page, and return its result."""
         body = f"const done = arguments[0]; (async () => {{ {script} }})().then(done, (error) => done(`failed: ${{error.stack}}`));"
-        parameters = {"script": body, "args": [], "sandbox": None}  # in the page's own world
+        parameters: dict[str, Any] = {"script": body, "args": [], "sandbox": None}  # in the page's own world
         return self.call("WebDriver:ExecuteAsyncScript", parameters)["value"]
 
     def picture(self, name: str) -> NDArray[np.uint8]:

@@ -152,6 +152,14 @@ def test_a_folder_is_replaced_only_if_it_is_a_page_and_with_overwrite(blocks, tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine", "page"]
 
 
+def test_a_page_is_written_into_the_working_folder(blocks, tmp_path, monkeypatch):
+    (tmp_path / "site").mkdir()
+    monkeypatch.chdir(tmp_path / "site")
+    write_page(blocks, ".", frames=(0, 1))
+    assert sorted(path.name for path in (tmp_path / "site").iterdir()) == ["frames", "index.html"]
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
 @pytest.mark.parametrize("name", ["page", "page.html"])
 def test_a_run_that_fails_leaves_nothing_and_keeps_the_old_page(tmp_path, name):
     folder = write_blocks(tmp_path / "a" / "cartesian", frames=3, points=False)

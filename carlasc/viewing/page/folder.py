@@ -68,6 +68,7 @@ def writing_folder(out: Path) -> Iterator[NewFolder]:
     Raises:
         StorageError: it cannot be written; nothing is left behind.
     """
+    out = out.resolve()  # "." has no name
     part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
     try:
         with writing(out):
@@ -76,15 +77,16 @@ def writing_folder(out: Path) -> Iterator[NewFolder]:
             folder = NewFolder(part)
             yield folder
             folder.sync()
-            remove(old)
             if out.exists():
+                remove(old)
                 out.rename(old)
             part.rename(out)
             sync_all([out.parent])
             remove(old)
     finally:
-        if part.exists():
-            remove(part)
+        remove(part)
+        if old.exists() and not out.exists():
+            old.rename(out)
 
 
 def _is_page(path: Path) -> bool:

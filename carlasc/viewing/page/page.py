@@ -44,11 +44,6 @@ class PageResult:
     notes: tuple[str, ...]
 
 
-def is_page(out: Path) -> bool:
-    """Return whether a name is that of a page: it ends in .html, or has no ending and is that of a folder."""
-    return out.suffix.lower() in (".html", ".htm", "")
-
-
 def write_page(
     scene: Scene,
     out: Path,

@@ -50,8 +50,8 @@ class ScorePlot {
   build() {
     const runs = this.scene.scores[this.metric];
     const found = runs.flat().filter((value) => value !== null);
-    const low = Math.floor(10 * Math.min(1, ...found)) / 10;
-    const high = Math.max(Math.ceil(10 * Math.max(0, ...found)) / 10, low + 0.1);
+    const high = Math.max(Math.ceil(10 * Math.max(0, ...found)) / 10, 0.1);
+    const low = Math.min(Math.floor(10 * Math.min(1, ...found)) / 10, high - 0.1);
     const last = Math.max(this.scene.frames.length - 1, 1);
     const lines = runs.map((values, run) => {
       const pieces = [];
