@@ -90,7 +90,9 @@ def view(
     if out is None:
         if as_json:
             raise ArgumentError("--json", problem="a window has no figures to print", advice="write a page with `out`")
-        viewing.view(scene, beside=beside, beside_grid=beside_grid, report=echo)
+        if beside is not None or beside_grid is not None:
+            raise ArgumentError("--beside", problem="a window shows one run", advice="write a page with `out`")
+        viewing.view(scene, report=echo)
         return
     with progress_bar("Writing the file") as progress:
         result = viewing.view(
@@ -110,6 +112,10 @@ def view(
     for note in result.notes:
         echo(note)
     size = f"{result.size_bytes / 1e6:.1f} MB"
-    opened = {".rrd": "open it with `rerun`", ".mcap": "open it in Foxglove", "": "serve it with `python -m http.server`"}
+    opened = {
+        ".rrd": "open it with `rerun`",
+        ".mcap": "open it in Foxglove",
+        "": "serve it with `python -m http.server`",
+    }
     advice = opened.get(out.suffix.lower(), "open it in a browser")
     echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: {advice}")

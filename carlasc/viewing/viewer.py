@@ -35,8 +35,6 @@ def view(
     source: Scene | SceneSource,
     out: None = ...,
     *,
-    beside: SceneSource | None = ...,
-    beside_grid: str | None = ...,
     report: Callable[[str], None] | None = ...,
 ) -> None: ...
 

@@ -28,8 +28,8 @@ class PagePanel:
     """A grid of the page.
 
     Attributes:
-        name: "prediction", "truth", "errors", or the size of the grid if there is only one.
-        title: what is written above it: the name, or that of the run if two are compared.
+        name: "prediction", "truth", "errors", or "grid" if there is only one.
+        title: what is written above it: the name, the size of the grid if there is only one, or that of the run if two are compared.
         spec: geometry.
         colors: colours of its labels.
         run: number of the run that it belongs to: 0, or 1 for the run beside it.
@@ -103,7 +103,6 @@ class PageContent:
         """Return what the scripts of the page need to know besides the frames and their scores."""
         reader = self.reader
         tables = {colors.table.name: colors for colors in (reader.colors, *(panel.colors for panel in self.panels))}
-        fields = reader.data.sequence.fields()
         return {
             "name": reader.name,
             "leftHanded": reader.left_handed,
@@ -114,8 +113,8 @@ class PageContent:
             "frames": list(self.frames),
             "times": [reader.read_time(frame) for frame in self.frames],
             "poses": self._read_poses(),
-            "hasPoints": "points" in fields,
-            "hasFlow": "flow" in fields,
+            "hasPoints": reader.has("points"),
+            "hasFlow": reader.has("flow"),
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
         }
@@ -123,7 +122,7 @@ class PageContent:
     def _make_panels(self) -> list[PagePanel]:
         own = self._fields_of(self.reader)
         panels = [
-            PagePanel(p.title, p.title, p.spec, p.colors, evidence=() if p.title in ("truth", "errors") else own)
+            PagePanel(p.name, p.title, p.spec, p.colors, evidence=() if p.name in ("truth", "errors") else own)
             for p in self.reader.panels
         ]
         if self.beside is None:
@@ -138,8 +137,7 @@ class PageContent:
         return panels
 
     def _fields_of(self, reader: SceneReader) -> tuple[str, ...]:
-        fields = reader.data.sequence.fields()
-        return tuple(name for name in EVIDENCE if f"{reader.data.grid}/{name}" in fields)
+        return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
 
     def _name_runs(self) -> tuple[str, ...]:
         """Return what tells the two runs apart: their grids, or the last folders in which their paths differ."""
