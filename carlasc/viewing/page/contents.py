@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import PurePath
 from typing import Any
 
@@ -68,20 +69,46 @@ class PageContent:
         beside: the run that it is compared with, or None.
         frames: the frame numbers.
         thin_m: side length of the cells to which points are thinned, metres.
-        panels: the grids of the page: those of the first run, then those of the run beside it.
-        runs: names of the runs.
     """
 
     reader: SceneReader
     beside: SceneReader | None
     frames: tuple[int, ...]
     thin_m: float
-    panels: tuple[PagePanel, ...] = field(init=False)
-    runs: tuple[str, ...] = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "runs", self._name_runs())
-        object.__setattr__(self, "panels", tuple(self._make_panels()))
+    @cached_property
+    def panels(self) -> tuple[PagePanel, ...]:
+        """The grids of the page: those of the first run, then those of the run beside it."""
+        own = self._fields_of(self.reader)
+        panels = [
+            PagePanel(p.name, p.title, p.spec, p.colors, evidence=() if p.name in ("truth", "errors") else own)
+            for p in self.reader.panels
+        ]
+        if self.beside is None:
+            return tuple(panels)
+        others = [panel for panel in panels if panel.name != "truth"]
+        for number, panel in enumerate(others, len(panels)):
+            prefix = "errors of " if panel.name == "errors" else ""
+            first = panels.index(panel)
+            panels[first] = replace(panel, title=prefix + self.runs[0], beside=number)
+            spec, evidence = (panel.spec, ()) if prefix else (self.beside.data.spec, self._fields_of(self.beside))
+            panels.append(replace(panel, title=prefix + self.runs[1], spec=spec, run=1, evidence=evidence))
+        return tuple(panels)
+
+    @cached_property
+    def runs(self) -> tuple[str, ...]:
+        """The names of the runs: what tells two runs apart, their grids, or the last folders in which their paths differ."""
+        parts = [
+            (*PurePath(reader.data.sequence.location).parts, reader.data.grid)
+            for reader in (self.reader, self.beside)
+            if reader is not None
+        ]
+        if len(parts) < 2:
+            return ("",)
+        for first, second in zip(reversed(parts[0]), reversed(parts[1]), strict=False):
+            if first != second:
+                return first, second
+        return "left", "right"
 
     def read(self, frame: int) -> tuple[Arrays, FrameScores | None]:
         """Return the arrays of a frame, named `panel0/index`, ... and `scan/index`, ..., and its scores if there is a truth.
@@ -119,39 +146,8 @@ class PageContent:
             "offsetSteps": OFFSET_STEPS,
         }
 
-    def _make_panels(self) -> list[PagePanel]:
-        own = self._fields_of(self.reader)
-        panels = [
-            PagePanel(p.name, p.title, p.spec, p.colors, evidence=() if p.name in ("truth", "errors") else own)
-            for p in self.reader.panels
-        ]
-        if self.beside is None:
-            return panels
-        others = [panel for panel in panels if panel.name != "truth"]
-        for number, panel in enumerate(others, len(panels)):
-            prefix = "errors of " if panel.name == "errors" else ""
-            first = panels.index(panel)
-            panels[first] = replace(panel, title=prefix + self.runs[0], beside=number)
-            spec, evidence = (panel.spec, ()) if prefix else (self.beside.data.spec, self._fields_of(self.beside))
-            panels.append(replace(panel, title=prefix + self.runs[1], spec=spec, run=1, evidence=evidence))
-        return panels
-
     def _fields_of(self, reader: SceneReader) -> tuple[str, ...]:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
-
-    def _name_runs(self) -> tuple[str, ...]:
-        """Return what tells the two runs apart: their grids, or the last folders in which their paths differ."""
-        parts = [
-            (*PurePath(reader.data.sequence.location).parts, reader.data.grid)
-            for reader in (self.reader, self.beside)
-            if reader is not None
-        ]
-        if len(parts) < 2:
-            return ("",)
-        for first, second in zip(reversed(parts[0]), reversed(parts[1]), strict=False):
-            if first != second:
-                return first, second
-        return "left", "right"
 
     def _read_beside(self, frame: int, grids: tuple[Grid, ...]) -> list[Grid]:
         if self.beside is None:
