@@ -301,7 +301,7 @@ class Viewer {
 
 (async () => {
   try {
-    if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old: Chrome 80, Firefox 113, Safari 16.4 or later is needed');
+    if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old: Chrome 87, Firefox 113, Safari 16.4 or later is needed');
     window.carlasc = new Viewer(JSON.parse(byId('scene').textContent));
     await window.carlasc.start();
     if (window.carlasc.contents) document.documentElement.dataset.ready = 'true';
