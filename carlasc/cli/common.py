@@ -80,7 +80,7 @@ def place_argument(text: str, name: str = "SOURCE", default: str | None = None) 
     return typer.Argument(metavar=name, help=text, callback=_read_place, show_default=default or True)
 
 
-def places_argument(text: str, name: str = "SOURCE...") -> Any:
+def places_argument(text: str, name: str = "SOURCES") -> Any:
     """Return an argument for one or more paths or URLs. `text` is its help, `name` what it is called there."""
     return typer.Argument(metavar=name, help=text, callback=_read_places)
 

@@ -23,6 +23,7 @@ _BAR_M = 0.08  # width of the edges of a box
 _MIN_SPEED_M_S = 0.5  # slower actors may move by the noise of their points alone
 _LEAST_SIZE_M = 0.1
 _FEWEST_POINTS = 5
+_CLOSE_M = 0.05  # nearer points count as being on the side
 _ANGLES = np.deg2rad(np.arange(0, 90, 2.0))
 
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -64,8 +65,8 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
 def tight_boxes(scan: Scan) -> Boxes:
     """Return the tightest upright box around the points of each numbered actor that has at least five.
 
-    A box points to where its actor moves. One that does not move points along the longer side of the smallest rectangle around its
-    points, to either of its two ends.
+    A box points to where its actor moves. One that does not move points along the longer side of the rectangle to whose sides its
+    points are closest, to either of its two ends.
 
     Args:
         scan: with instances; with flow, boxes of moving actors have the right direction.
@@ -132,13 +133,23 @@ def box_edges(boxes: Boxes) -> QuadMesh:
 
 
 def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
-    """Return the yaw of an actor, in radians."""
+    """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle to whose sides its points are closest.
+
+    A LiDAR sees one or two sides of a vehicle. The smallest rectangle around them is often tilted; the closest one is not (Zhang, Xu, Dong
+    and Dolan, "Efficient L-shape fitting for vehicle detection using laser scanners", 2017).
+    """
     if np.linalg.norm(velocity[:2]) > _MIN_SPEED_M_S:
         return float(np.arctan2(velocity[1], velocity[0]))
-    turned = [points @ np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in _ANGLES]
-    sizes = np.array([np.ptp(rectangle, axis=0) for rectangle in turned])
-    best = int(np.argmin(sizes.prod(axis=1) + 1e-3 * sizes.sum(axis=1)))
-    return float(_ANGLES[best] + (0 if sizes[best, 0] >= sizes[best, 1] else np.pi / 2))
+    best, longest, most = 0.0, True, -1.0
+    for angle in _ANGLES:
+        cos, sin = np.cos(angle), np.sin(angle)
+        rectangle = points @ np.array([[cos, -sin], [sin, cos]])
+        lower, upper = rectangle.min(axis=0), rectangle.max(axis=0)
+        to_side = np.minimum(rectangle - lower, upper - rectangle).min(axis=1)
+        closeness = float((1 / np.maximum(to_side, _CLOSE_M)).sum())
+        if closeness > most:
+            best, longest, most = float(angle), bool(upper[0] - lower[0] >= upper[1] - lower[1]), closeness
+    return best if longest else best + float(np.pi / 2)
 
 
 def _turned(points: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:

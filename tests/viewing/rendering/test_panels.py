@@ -4,8 +4,9 @@ from helpers.blocks import write_blocks
 from helpers.films import Image, read_mp4
 from helpers.pixels import blue_pixels, middle_of, red_pixels
 
+from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.viewing import Scene, render
+from carlasc.viewing import ClassColors, Scene, render
 from carlasc.viewing.rendering import pictures
 from carlasc.viewing.rendering.pages import plan_page
 
@@ -120,14 +121,17 @@ def test_impossible_panels_are_refused(blocks, moved, tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
-def test_panels_with_captions_have_one_size_and_do_not_overlap(count):
+@pytest.mark.parametrize("entries", [0, 4, 22])
+def test_panels_with_captions_have_one_size_and_nothing_overlaps(count, entries):
     captions = [f"({number}) what is shown in this panel, in some words" for number in range(count)]
-    page = plan_page((1001, 701), count, titled=False, legend=[], captions=captions)
+    legend = ClassColors(CARLA).entries(range(1, entries + 1))
+    page = plan_page((1001, 701), count, titled=False, legend=legend, captions=captions)
     assert len({(box.width, box.height) for box in page.panels}) == 1
     for panel, caption in zip(page.panels, page.titles, strict=True):
         assert panel.y + panel.height <= caption.y and caption.y + caption.height <= 701
         assert panel.x == caption.x and panel.x + panel.width <= 1001
-    for i, one in enumerate(page.panels):
-        for two in page.panels[i + 1 :]:
+    boxes = page.panels + page.titles + page.entry_boxes
+    for i, one in enumerate(boxes):
+        for two in boxes[i + 1 :]:
             apart = one.x + one.width <= two.x or two.x + two.width <= one.x
             assert apart or one.y + one.height <= two.y or two.y + two.height <= one.y
