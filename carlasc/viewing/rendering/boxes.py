@@ -50,10 +50,10 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
     """Return the boxes of a frame: those of the field `boxes`, or else the tightest ones around the points of each actor.
 
     Raises:
-        FormatError: the boxes or the scan are damaged.
+        FormatError: the boxes or the scan do not have the format.
     """
     sequence = data.sequence
-    annotated = sequence.boxes(frame)
+    annotated = data.read_boxes(frame)
     if annotated is not None:
         return annotated
     numbered = "boxes" not in sequence.fields() and all(

@@ -63,7 +63,7 @@ class PictureRenderer:
             viewpoint=viewpoint,
             size=self.style.size,
             legend=self.legend,
-            axes=cells[0].renderer.reader.data.sequence.metadata.axes,
+            axes=cells[0].renderer.reader.axes,
             captioned=bool(self.captions),
             columns=self.columns,
             font_size=self.style.font_size,
@@ -77,7 +77,7 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
         ArgumentError: sources of different handedness, or more panels than a picture can have.
         MissingDataError: the sources of a film have no frame in common.
     """
-    axes = {renderer.reader.data.sequence.metadata.axes for renderer in renderers}
+    axes = {renderer.reader.axes for renderer in renderers}
     if len(axes) > 1:
         raise ArgumentError("source", expected="sources with the same axes", found="left-handed and right-handed ones")
     if film:
