@@ -1,7 +1,8 @@
 """Makes the pictures of the gallery by running the commands of its page: `python docs/gallery.py [SECTION ...]` writes docs/images/gallery.
 
-Everything is simulated, so nothing has to be downloaded. All pictures need about seven minutes of processor time, which is four minutes on
-two idle cores, and three gigabytes of disk while the script runs. With names of sections, only these are made, with the data that they need.
+Everything is simulated, so nothing has to be downloaded. The script prints how long each command takes: twelve minutes in all on two
+cores that other programs used at the same time. It needs three gigabytes of disk while it runs. With names of sections, only these are
+made, with the data that they need.
 """
 
 from __future__ import annotations
