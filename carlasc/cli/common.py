@@ -54,6 +54,11 @@ def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None
     return str(Path(place).expanduser()) if place.startswith("~") else place
 
 
+def _read_places(parameter: typer.CallbackParam, places: list[str]) -> list[str | None]:
+    """Return several paths or URLs, each as `_read_place` does."""
+    return [_read_place(parameter, place) for place in places]
+
+
 def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
     """Return the path of a file on this machine.
 
@@ -73,6 +78,11 @@ def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None
 def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
     """Return an argument for a path or a URL. `text` is its help, `name` what it is called there."""
     return typer.Argument(metavar=name, help=text, callback=_read_place, show_default=default or True)
+
+
+def places_argument(text: str, name: str = "SOURCES") -> Any:
+    """Return an argument for one or more paths or URLs. `text` is its help, `name` what it is called there."""
+    return typer.Argument(metavar=name, help=text, callback=_read_places)
 
 
 def place_option(*flags: str, text: str) -> Any:

@@ -14,6 +14,7 @@ from carlasc.cli.common import (
     echo,
     engine,
     file_option,
+    places_argument,
     print_json,
     progress_bar,
 )
@@ -23,7 +24,6 @@ from carlasc.cli.scene_options import (
     GridOption,
     OverwriteOption,
     SequenceOption,
-    SourceArgument,
     SourceClassesOption,
     TruthGridOption,
     TruthOption,
@@ -33,9 +33,15 @@ from carlasc.errors import ArgumentError
 
 
 def render(
-    source: SourceArgument,
+    sources: Annotated[
+        list[str],
+        places_argument(
+            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame;"
+            " several with --grid-of.",
+        ),
+    ],
     out: Annotated[
-        Path | None, file_option("-o", "--out", text="A .png, .gif or .mp4. Default: named after the sequence.")
+        Path | None, file_option("-o", "--out", text="A .png, .gif, .mp4 or .webp. Default: named after the sequence.")
     ] = None,
     frames: FramesOption = None,
     every: EveryOption = 1,
@@ -53,11 +59,41 @@ def render(
     sequence: SequenceOption = None,
     classes: ClassesOption = None,
     source_classes: SourceClassesOption = None,
+    grid_of: Annotated[
+        bool,
+        typer.Option("--grid-of", help="Draw panels of several SOURCES, or of the frames of one, with captions."),
+    ] = False,
+    captions: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--caption",
+            help="With --grid-of: text of a panel, once for each. Default: what differs between the panels.",
+        ),
+    ] = None,
+    columns: Annotated[int | None, typer.Option(help="With --grid-of: number of panels in a row.", min=1)] = None,
+    color: Annotated[
+        Literal["class", "confidence", "views", "votes", "inferred"],
+        typer.Option(help="What the colours of the grid mean: classes, or one of the kinds of evidence."),
+    ] = "class",
+    boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes around actors.")] = False,
     palette: Annotated[
         Literal["class", "colorblind", "height"],
         typer.Option(help="Colours of the class table, colours for colour-blind readers, or colours by height."),
     ] = "class",
-    size: Annotated[str, typer.Option(help="Size of the picture in pixels, WIDTHxHEIGHT.")] = "1280x720",
+    style: Annotated[
+        Literal["screen", "paper"],
+        typer.Option(help="paper: 300 dpi, type of 8 points, and the legend in a file of its own (NAME.legend.png)."),
+    ] = "screen",
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="WIDTHxHEIGHT in pixels, or with a unit, such as 8.8cmx5cm or 3.5inx2in. Default: 1280x720, or 8.8cmx5cm on paper."
+        ),
+    ] = None,
+    dpi: Annotated[
+        float | None,
+        typer.Option(help="Pixels per inch, written into a PNG. Default: 300 on paper and for a size with a unit."),
+    ] = None,
     viewpoint: Annotated[
         str | None,
         typer.Option(
@@ -80,32 +116,43 @@ def render(
     overwrite: OverwriteOption = False,
     as_json: Json = False,
 ) -> None:
-    """Draw a frame (PNG) or several frames (GIF, MP4): grids, scans, scene flow, predictions with ground truth and errors.
+    """Draw a frame (PNG) or several frames (GIF, MP4, WebP): grids, scans, scene flow, predictions with ground truth and errors.
 
     No screen and no GPU are needed. The camera is behind and above the ego vehicle and follows it.
     Without --frames, a picture shows the first frame and a film shows all frames.
     """
     from carlasc import viewing
 
-    scene = viewing.Scene(
-        source,
-        sequence=sequence,
-        frames=frames,
-        every=every,
-        grid=grid,
-        truth=truth,
-        truth_grid=truth_grid,
-        classes=classes,
-        source_classes=source_classes,
-        palette=palette,
-    )
+    scenes = [
+        viewing.Scene(
+            source,
+            sequence=sequence,
+            frames=frames,
+            every=every,
+            grid=grid,
+            truth=truth,
+            truth_grid=truth_grid,
+            classes=classes,
+            source_classes=source_classes,
+            palette=palette,
+        )
+        for source in sources
+    ]
+    if len(scenes) > 1 and not grid_of:
+        raise ArgumentError("SOURCE", expected="one", found=str(len(scenes)), advice="draw several with --grid-of")
     with progress_bar("Rendering", "pictures") as progress, engine(cluster, workers) as executor:
         result = viewing.render(
-            scene,
+            scenes if grid_of else scenes[0],
             out,
             what=what,
             view=view,
-            size=_parse_size(size),
+            color=color,
+            boxes=boxes,
+            style=style,
+            size=size,
+            dpi=dpi,
+            captions=captions or (),
+            columns=columns,
             legend=legend,
             ego=ego,
             viewpoint=None if viewpoint is None else viewing.Viewpoint.parse(viewpoint),
@@ -122,13 +169,7 @@ def render(
         return
     for note in result.notes:
         echo(note)
+    if result.legend is not None:
+        echo(f"{result.legend}: the legend")
     shown = f"{', '.join(result.what)} of {result.sequence}, {describe_frames(result.frames)}"
     echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(part) for part in text.lower().split("x"))
-    except ValueError:
-        raise ArgumentError("size", expected="WIDTHxHEIGHT, such as 1280x720", found=repr(text)) from None
-    return width, height

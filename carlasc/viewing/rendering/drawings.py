@@ -91,7 +91,7 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
         voxel_colors, legend = np.broadcast_to(layers, (*grid.spec.size, 3)), palette.height_entries(low, high)
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
-    return _voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
+    return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
 
 
 def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
@@ -104,7 +104,7 @@ def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing
     colors = ClassColors(ERRORS)
     legend = [entry._replace(order=AFTER_CLASSES + entry.order) for entry in colors.entries(ERRORS.names)]
     empty = "no known voxel is occupied in either"
-    return _voxel_drawing(truth.spec, colors.by_id[outcomes], outcomes != Outcome.NOT_COMPARED, legend, empty, ego)
+    return voxel_drawing(truth.spec, colors.by_id[outcomes], outcomes != Outcome.NOT_COMPARED, legend, empty, ego)
 
 
 def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
@@ -189,7 +189,7 @@ def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64
     return middle[real], vectors[real]
 
 
-def _voxel_drawing(
+def voxel_drawing(
     spec: GridSpec,
     voxel_colors: NDArray[np.uint8],
     occupied: NDArray[np.bool_],
@@ -197,6 +197,16 @@ def _voxel_drawing(
     empty: str,
     ego: bool,
 ) -> Drawing:
+    """Return voxels on the floor of their grid.
+
+    Args:
+        spec: geometry of the grid.
+        voxel_colors: (*spec.size, 3) uint8 RGB.
+        occupied: (*spec.size) bool, the voxels that are drawn.
+        legend: the meaning of the colours.
+        empty: note for a grid without any such voxel.
+        ego: whether the ego vehicle is drawn.
+    """
     floor = quads(footprint(spec, spec.lower[2] - 2e-3), _FLOOR, open_sky=True)
     meshes = [grid_mesh(spec, voxel_colors, occupied, on_floor=True), floor, *([ego_vehicle()] if ego else [])]
     return Drawing(grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty)

@@ -1,4 +1,4 @@
-"""Writing pictures as PNG, GIF and MP4 (with the encoder that imageio-ffmpeg includes). A file is written whole or not at all."""
+"""Writing pictures as PNG, GIF, MP4 and WebP (the last two with the encoder that imageio-ffmpeg includes). A file is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from carlasc.errors import ArgumentError, CarlascError, import_extra
 from carlasc.storage.files import write_output
 
 STILLS = (".png",)
-FILMS = (".gif", ".mp4")
+FILMS = (".gif", ".mp4", ".webp")
 
 
 def is_film(path: Path) -> bool:
@@ -29,13 +29,14 @@ def encodable_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     return (width + width % 2, height + height % 2) if path.suffix.lower() == ".mp4" else size
 
 
-def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> None:
-    """Write pictures one after the other: the first one into a PNG, all of them into a GIF or MP4.
+def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, dpi: float | None = None) -> None:
+    """Write pictures one after the other: the first one into a PNG, all of them into a film.
 
     Args:
-        path: a file name that ends in .png, .gif or .mp4.
+        path: a file name that ends in .png, or in one of `FILMS`.
         pictures: (H, W, 3) uint8, all of one size (see `encodable_size`); at least one.
         fps: pictures per second, above 0.
+        dpi: pixels per inch that a PNG says it has; None says nothing. Films say nothing.
 
     Raises:
         ArgumentError: an impossible `fps`.
@@ -44,13 +45,17 @@ def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float
     """
     if not 0 < fps <= 240:
         raise ArgumentError("fps", expected="above 0 and at most 240 pictures per second", found=f"{fps:g}")
-    writers = {".png": _write_png, ".gif": _write_gif, ".mp4": _write_mp4}
-    write = writers[path.suffix.lower()]
+    suffix = path.suffix.lower()
+    if suffix in STILLS:
+        write_output(path, lambda file: _write_png(file, next(iter(pictures)), dpi))
+        return
+    write = {".gif": _write_gif, ".mp4": _write_mp4, ".webp": _write_webp}[suffix]
     write_output(path, lambda file: write(file, iter(pictures), fps))
 
 
-def _write_png(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    import_extra("PIL.Image", "render").fromarray(next(pictures)).save(file, format="PNG", compress_level=4)
+def _write_png(file: BinaryIO, picture: NDArray[np.uint8], dpi: float | None) -> None:
+    settings = {} if dpi is None else {"dpi": (dpi, dpi)}
+    import_extra("PIL.Image", "render").fromarray(picture).save(file, format="PNG", compress_level=4, **settings)
 
 
 def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
@@ -71,6 +76,15 @@ def _to_palette(picture: NDArray[np.uint8]) -> Any:
 
 
 def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    h264 = ("-c:v", "libx264", "-crf", "18", "-preset", "medium", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
+    _encode(file, pictures, fps, (*h264, "-f", "mp4"))
+
+
+def _write_webp(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    _encode(file, pictures, fps, ("-c:v", "libwebp_anim", "-quality", "72", "-loop", "0", "-f", "webp"))
+
+
+def _encode(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: tuple[str, ...]) -> None:
     """Encode a film into the file itself, by its name: a killed run leaves no other file, and the encoder can seek in it."""
     encoder = import_extra("imageio_ffmpeg", "render").get_ffmpeg_exe()
     with tempfile.TemporaryFile() as messages:
@@ -79,8 +93,7 @@ def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
         process = subprocess.Popen(
             [
                 *(encoder, "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
-                *("-r", f"{fps:g}", "-i", "-", "-c:v", "libx264", "-crf", "18", "-preset", "medium"),
-                *("-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", f"file:{file.name}"),
+                *("-r", f"{fps:g}", "-i", "-", *settings, f"file:{file.name}"),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,

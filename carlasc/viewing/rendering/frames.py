@@ -1,18 +1,17 @@
-"""One frame of a scene as a picture: which drawings are side by side, and from where each is seen."""
+"""One frame of a scene as panels: which drawings are side by side, and from where each is seen."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
 from carlasc.viewing.remapping import RemappedSequence
-from carlasc.viewing.rendering.cameras import Viewpoint
+from carlasc.viewing.rendering.boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.drawings import (
     Drawing,
     Extent,
@@ -23,7 +22,8 @@ from carlasc.viewing.rendering.drawings import (
     scan_drawing,
     scan_extent,
 )
-from carlasc.viewing.rendering.pictures import DEFAULT_SIZE, VIEWS, Panel, View, draw_panels
+from carlasc.viewing.rendering.evidence import GridColor, evidence_drawing, evidence_legend
+from carlasc.viewing.rendering.pictures import VIEWS, Panel, View
 from carlasc.viewing.scene import SceneReader
 
 
@@ -35,9 +35,9 @@ class FrameRenderer:
         reader: reads the scene; its `contents` are drawn side by side.
         views: from where each of the contents is seen.
         extent: what pictures of scans show, the same in all frames.
-        size: (width, height) of a picture, pixels.
         ego: whether the ego vehicle is drawn.
-        legend: entries of the legend, the same in all frames; empty for no legend.
+        color: what the colours of the grid mean.
+        boxes: whether boxes around actors are drawn.
         fixed_view: for a camera that does not follow the vehicle: extent of what it shows, and `world_T_view`, the frame of that
             extent; or None.
         orbit: whether the camera circles the scene, at one distance that shows it from every side.
@@ -46,29 +46,32 @@ class FrameRenderer:
     reader: SceneReader
     views: tuple[View, ...]
     extent: Extent
-    size: tuple[int, int] = DEFAULT_SIZE
     ego: bool = True
-    legend: list[Entry] = field(default_factory=list)
+    color: GridColor = "class"
+    boxes: bool = False
     fixed_view: tuple[Extent, Transform] | None = None
     orbit: bool = False
 
-    def render(self, frame: int, viewpoint: Viewpoint) -> NDArray[np.uint8]:
-        """Return the picture of a frame, (H, W, 3) uint8."""
+    def panels(self, frame: int) -> list[Panel]:
+        """Return the panels of a frame: each of the scene's contents from each of the views."""
         contents, panels = self.reader.contents, []
         for content in contents:
             drawing = self.draw(content, frame)
-            title = self._title(content) if len(contents) > 1 else ""
+            title = self.title(content) if len(contents) > 1 else ""
             panels += [Panel(drawing, view, title, self._view_of(drawing, view, frame)) for view in self.views]
-        return draw_panels(
-            panels,
-            viewpoint=viewpoint,
-            size=self.size,
-            legend=self.legend,
-            axes=self.reader.axes,
-        )
+        return panels
 
     def draw(self, content: str, frame: int) -> Drawing:
         """Return the drawing of one of the scene's contents in a frame."""
+        drawing = self._draw(content, frame)
+        if not self.boxes:
+            return drawing
+        boxes = boxes_in(self.reader.data, frame)
+        lower, upper = drawing.extent.min(axis=0), drawing.extent.max(axis=0)
+        shown = ((boxes.centers >= lower) & (boxes.centers <= upper))[:, :2].all(axis=1)
+        return with_boxes(drawing, boxes.select(shown))
+
+    def _draw(self, content: str, frame: int) -> Drawing:
         reader, colors = self.reader, self.reader.colors
         if content == "scan":
             return scan_drawing(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
@@ -76,17 +79,23 @@ class FrameRenderer:
             return flow_drawing(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
         if content == "errors":
             return error_drawing(reader.data.read_grid(frame), self._grid_of("truth").read_grid(frame), ego=self.ego)
+        if content == "grid" and self.color != "class":
+            return evidence_drawing(reader.data, frame, self.color, ego=self.ego)
         return grid_drawing(self._grid_of(content).read_grid(frame), colors, ego=self.ego)
 
     def legend_of(self, frame: int) -> list[Entry]:
         """Return the entries that the legend of a frame needs."""
         colors, legends = self.reader.colors, []
         for content in self.reader.contents:
-            if content in ("grid", "truth") and colors.palette != "height":  # without building the mesh
+            if content == "grid" and self.color != "class":
+                legends.append(evidence_legend(self.color))
+            elif content in ("grid", "truth") and colors.palette != "height":  # without building the mesh
                 labels = self._grid_of(content).read_grid(frame).labels
                 legends.append(colors.entries(np.flatnonzero(np.bincount(labels.reshape(-1))).tolist()))
             else:
-                legends.append(self.draw(content, frame).legend)
+                legends.append(self._draw(content, frame).legend)
+        if self.boxes:
+            legends.append([BOX])
         return merge_legends(legends)
 
     def _grid_of(self, content: str) -> RemappedSequence:
@@ -102,7 +111,8 @@ class FrameRenderer:
         drawing_T_view = np.linalg.inv(_pose_of(self.reader, frame)) @ world_T_view
         return (_swept_extent(extent) if orbits else extent), drawing_T_view
 
-    def _title(self, content: str) -> str:
+    def title(self, content: str) -> str:
+        """Return the title of one of the scene's contents."""
         titles = {"scan": "scan", "flow": "scene flow", "truth": "truth", "errors": "errors"}
         data, truth = self.reader.data, self.reader.truth
         return titles.get(content) or (str(data.spec) if truth is None else "prediction")

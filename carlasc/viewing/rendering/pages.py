@@ -1,24 +1,34 @@
 """The layout of a picture: panels, their titles and the legend, without overlaps and without clipping.
 
 The layout is computed first, so that every panel is rendered at its final size. Titles are above the panels; the legend is in a column
-to the right of square panels, and in rows below wide ones. The font is the one that Pillow includes.
+to the right of square panels, and in rows below wide ones. Captions, where there are some instead of titles, are below the panels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.viewing.colors import Entry
+from carlasc.viewing.rendering.texts import (
+    FAINT,
+    INK,
+    NO_SWATCH,
+    draw_entry,
+    entry_width,
+    font_of,
+    line_height,
+    shorten,
+    wrap_entries,
+    wrap_text,
+)
 
 SMALLEST = (64, 64)
 LARGEST = 16384
-_INK, _FAINT = (40, 42, 48), (110, 114, 122)
 
 
 @dataclass(frozen=True)
@@ -39,7 +49,7 @@ class Page:
         size: (width, height) of the whole picture.
         font_size: pixels.
         panels: rectangle of each panel.
-        titles: rectangle of each panel's title; empty if there are no titles.
+        titles: rectangle of each panel's title or caption; empty if there are none.
         entry_boxes: rectangle of each entry of the legend: a swatch and a name.
         entries: the legend. Entries for which there is no space are left out; the last entry then says how many.
     """
@@ -53,7 +63,15 @@ class Page:
 
 
 def plan_page(
-    size: tuple[int, int], panels: int, *, titled: bool, legend: Sequence[Entry], aspect: float = 16 / 9
+    size: tuple[int, int],
+    panels: int,
+    *,
+    titled: bool,
+    legend: Sequence[Entry],
+    aspect: float = 16 / 9,
+    captions: Sequence[str] = (),
+    columns: int | None = None,
+    font_size: int | None = None,
 ) -> Page:
     """Compute the layout of a picture.
 
@@ -63,33 +81,44 @@ def plan_page(
         titled: whether they have titles.
         legend: entries of the legend; empty for no legend.
         aspect: preferred width over height of a panel.
+        captions: a text for each panel, below it and in as many lines as needed; instead of titles. Empty for none.
+        columns: number of panels in a row; None takes the number with which panels are largest.
+        font_size: pixels; None takes one by the size of the picture.
 
     Raises:
         ArgumentError: a size that is too small or too large.
     """
     check_size(size)
     width, height = size
-    font_size = int(np.clip(round(min(width / 72, height / 40)), 9, 40))
-    entries, positions, area = _place_legend(size, font_size, list(legend), panels, aspect)
-    columns, rows = _tiling(area.width, area.height, panels, aspect)
-    title_height = round(font_size * 1.9) if titled else 0
+    if font_size is None:
+        font_size = int(np.clip(round(min(width / 72, height / 40)), 9, 40))
+    entries, positions, area = _place_legend(size, font_size, list(legend), panels, aspect, columns)
+    columns, rows = _tiling(area.width, area.height, panels, aspect, columns)
     gap = max(2, font_size // 2) if panels > 1 else 0
+    title_height = round(font_size * 1.9) if titled else 0
+    if captions:
+        lines = max(_count_lines(text, font_size, area.width / columns - 2 * gap) for text in captions)
+        title_height = round(font_size * 0.4) + lines * line_height(font_size)
     boxes, titles = [], []
     for number in range(panels):
         column, row = number % columns, number // columns
         left, right = (round(area.width * c / columns) for c in (column, column + 1))
         top, bottom = (round(area.height * r / rows) for r in (row, row + 1))
-        left, right = left + (gap if column else 0), right - (gap if column + 1 < columns else 0)
-        titles.append(Box(area.x + left, area.y + top, right - left, title_height))
-        boxes.append(
-            Box(area.x + left, area.y + top + title_height, max(1, right - left), max(1, bottom - top - title_height))
-        )
-    font = _font(font_size) if entries else None
+        if captions:  # all panels have one size, so that what they show can be compared
+            left, right = left + gap, left + max(gap + 1, area.width // columns - gap)
+            bottom = top + area.height // rows
+        else:
+            left, right = left + (gap if column else 0), right - (gap if column + 1 < columns else 0)
+        width, height = max(1, right - left), max(1, bottom - top - title_height)
+        title, panel = (height, 0) if captions else (0, title_height)
+        titles.append(Box(area.x + left, area.y + top + title, right - left, title_height))
+        boxes.append(Box(area.x + left, area.y + top + panel, width, height))
+    font = font_of(font_size) if entries else None
     entry_boxes = [
-        Box(x, y, _entry_width(entry, font, font_size), _line(font_size))
+        Box(x, y, entry_width(entry, font, font_size), line_height(font_size))
         for entry, (x, y) in zip(entries, positions, strict=True)
     ]
-    return Page(size, font_size, boxes, titles if titled else [], entry_boxes, entries)
+    return Page(size, font_size, boxes, titles if titled or captions else [], entry_boxes, entries)
 
 
 def check_size(size: tuple[int, int]) -> None:
@@ -103,64 +132,60 @@ def check_size(size: tuple[int, int]) -> None:
 
 
 def draw_page(
-    page: Page, pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), notes: Sequence[str | None] = ()
+    page: Page,
+    pictures: Sequence[NDArray[np.uint8]],
+    titles: Sequence[str] = (),
+    notes: Sequence[str | None] = (),
+    *,
+    wrapped: bool = False,
 ) -> NDArray[np.uint8]:
     """Return the whole picture, (height, width, 3) uint8.
 
     Args:
         page: the layout.
         pictures: the picture of each panel, in the panel's size.
-        titles: the title of each panel; shortened if it is too long.
+        titles: the title or caption of each panel; shortened if it is too long.
         notes: for each panel, a line to write into its middle, or None.
+        wrapped: whether titles are captions, which are broken into lines.
     """
     image_module = import_extra("PIL.Image", "render")
     canvas = np.full((page.size[1], page.size[0], 3), 255, np.uint8)
     for box, picture in zip(page.panels, pictures, strict=True):
         canvas[box.y : box.y + box.height, box.x : box.x + box.width] = picture
     image = image_module.fromarray(canvas)
-    draw, font = import_extra("PIL.ImageDraw", "render").Draw(image), _font(page.font_size)
+    draw, font = import_extra("PIL.ImageDraw", "render").Draw(image), font_of(page.font_size)
     for box, title in zip(page.titles, titles, strict=False):
-        text = _shortened(title, font, box.width - 8)
-        draw.text((box.x + box.width / 2, box.y + box.height / 2), text, _INK, font, anchor="mm")
+        if wrapped:
+            for number, text in enumerate(wrap_text(title, font, box.width)):
+                top = box.y + round(page.font_size * 0.4) + (number + 0.5) * line_height(page.font_size)
+                draw.text((box.x + box.width / 2, top), text, INK, font, anchor="mm")
+            continue
+        text = shorten(title, font, box.width - 8)
+        draw.text((box.x + box.width / 2, box.y + box.height / 2), text, INK, font, anchor="mm")
     for box, note in zip(page.panels, notes, strict=False):
         if note:
-            text = _shortened(note, font, box.width - 8)
-            draw.text((box.x + box.width / 2, box.y + box.height / 2), text, _FAINT, font, anchor="mm")
+            text = shorten(note, font, box.width - 8)
+            draw.text((box.x + box.width / 2, box.y + box.height / 2), text, FAINT, font, anchor="mm")
     for entry, box in zip(page.entries, page.entry_boxes, strict=True):
-        _draw_entry(draw, font, page.font_size, entry, box)
+        draw_entry(draw, font, page.font_size, entry, box.x, box.y + box.height / 2)
     return np.asarray(image)
 
 
-def _draw_entry(draw: Any, font: Any, size: int, entry: Entry, box: Box) -> None:
-    x, swatch = box.x, round(size * 0.95)
-    middle = box.y + box.height / 2
-    top = round(middle - swatch / 2)
-    if entry.color != _NO_SWATCH:
-        draw.rounded_rectangle(
-            (x, top, x + swatch, top + swatch), max(2, size // 6), entry.color, _outline(entry.color)
-        )
-    draw.text((x + swatch + round(size * 0.45), middle), entry.name, _INK, font, anchor="lm")
-
-
-_NO_SWATCH = (-1, -1, -1)
-
-
-def _outline(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    red, green, blue = (round(value * 0.7) for value in color)
-    return red, green, blue
+def _count_lines(text: str, font_size: int, room: float) -> int:
+    return len(wrap_text(text, font_of(font_size), room))
 
 
 def _place_legend(
-    size: tuple[int, int], font_size: int, entries: list[Entry], panels: int, aspect: float
+    size: tuple[int, int], font_size: int, entries: list[Entry], panels: int, aspect: float, wanted: int | None
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
     """Return the entries for which there is space, their positions, and the part of the page that is left for the panels."""
     width, height = size
     page = Box(0, 0, width, height)
     if not entries:
         return [], [], page
-    columns, rows = _tiling(width, height, panels, aspect)
-    font, pad = _font(font_size), font_size
-    widest = max(_entry_width(entry, font, font_size) for entry in entries)
+    columns, rows = _tiling(width, height, panels, aspect, wanted)
+    font, pad = font_of(font_size), font_size
+    widest = max(entry_width(entry, font, font_size) for entry in entries)
     if columns * rows > panels:  # the last cell of the tiling is free
         room = Box(width - width // columns, height - height // rows, width // columns, height // rows)
         if _legend_columns(len(entries), room.height - 2 * pad, font_size) * (widest + pad) + pad <= room.width:
@@ -177,12 +202,12 @@ def _place_legend(
 
 def _legend_columns(entries: int, height: int, font_size: int) -> int:
     """Return how many columns hold all entries; a column has at least one row."""
-    return -(-entries // max(1, height // _line(font_size)))
+    return -(-entries // max(1, height // line_height(font_size)))
 
 
 def _place_in_columns(room: Box, font_size: int, entries: int, widest: int) -> list[tuple[int, int]]:
     """Return positions of all entries, in columns in the middle of a rectangle that is large enough."""
-    pad, line = font_size, _line(font_size)
+    pad, line = font_size, line_height(font_size)
     columns = _legend_columns(entries, room.height - 2 * pad, font_size)
     rows = -(-entries // columns)
     left = room.x + (room.width - columns * (widest + pad) + pad) // 2
@@ -195,13 +220,13 @@ def _place_below(
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
     """Place entries in centred rows at the bottom, in at most 40 % of the page; the last entry counts those left out."""
     width, height = size
-    font, pad, line = _font(font_size), font_size, _line(font_size)
+    font, pad, line = font_of(font_size), font_size, line_height(font_size)
     rows_allowed = max(1, int(0.4 * height) // line)
     lines: list[list[int]] = []
     for room in range(len(entries), 0, -1):
         shown = _cut(entries, room)
-        widths = [_entry_width(entry, font, font_size) for entry in shown]
-        lines = _wrap(widths, width - 2 * pad, pad)
+        widths = [entry_width(entry, font, font_size) for entry in shown]
+        lines = wrap_entries(widths, width - 2 * pad, pad)
         if len(lines) <= rows_allowed:
             break
     top = height - len(lines) * line - pad // 2
@@ -217,56 +242,15 @@ def _place_below(
 def _cut(entries: list[Entry], room: int) -> list[Entry]:
     if len(entries) <= room:
         return entries
-    return [*entries[: room - 1], Entry(f"and {len(entries) - room + 1} more", _NO_SWATCH)]
+    return [*entries[: room - 1], Entry(f"and {len(entries) - room + 1} more", NO_SWATCH)]
 
 
-def _wrap(widths: list[int], room: int, gap: int) -> list[list[int]]:
-    """Break entries into as few rows as possible, of about equal length."""
-    fewest = len(_fill(widths, room, gap))
-    limits = range(max(widths), room, 4)
-    return next(
-        (rows for limit in limits if len(rows := _fill(widths, limit, gap)) == fewest), _fill(widths, room, gap)
-    )
-
-
-def _fill(widths: list[int], limit: int, gap: int) -> list[list[int]]:
-    rows: list[list[int]] = [[]]
-    used = 0
-    for index, width in enumerate(widths):
-        if rows[-1] and used + gap + width > limit:
-            rows.append([])
-            used = 0
-        used += width + (gap if rows[-1] else 0)
-        rows[-1].append(index)
-    return rows
-
-
-def _tiling(width: int, height: int, panels: int, aspect: float) -> tuple[int, int]:
-    """Return the columns and rows in which panels of an aspect are largest; of equal ones, those with more columns."""
+def _tiling(width: int, height: int, panels: int, aspect: float, wanted: int | None) -> tuple[int, int]:
+    """Return the wanted columns and their rows; or those in which panels of an aspect are largest, and of equal ones the most columns."""
 
     def scale(columns: int) -> float:
         rows = -(-panels // columns)
         return min(width / columns / aspect, height / rows)
 
-    columns = max(range(panels, 0, -1), key=scale)
+    columns = min(wanted, panels) if wanted else max(range(panels, 0, -1), key=scale)
     return columns, -(-panels // columns)
-
-
-def _line(font_size: int) -> int:
-    return round(font_size * 1.6)
-
-
-def _entry_width(entry: Entry, font: Any, size: int) -> int:
-    return round(size * 0.95) + round(size * 0.45) + int(np.ceil(font.getlength(entry.name)))
-
-
-def _shortened(text: str, font: Any, room: float) -> str:
-    if font.getlength(text) <= room:
-        return text
-    while text and font.getlength(f"{text}...") > room:
-        text = text[:-1]
-    return f"{text}..."
-
-
-def _font(size: int) -> Any:
-    return import_extra("PIL.ImageFont", "render").load_default(size)

@@ -40,7 +40,7 @@ class Panel:
     Attributes:
         drawing: what is drawn.
         view: "perspective" or "bev" (bird's-eye view).
-        title: line above the panel; "" for none.
+        title: line above the panel, or its caption; "" for none.
         fixed_view: for a camera that is not fitted to the drawing: extent of what it shows, and `drawing_T_view`, the frame of
             that extent.
     """
@@ -58,6 +58,9 @@ def draw_panels(
     size: tuple[int, int] = DEFAULT_SIZE,
     legend: Sequence[Entry] | bool = True,
     axes: Axes = "left",
+    captioned: bool = False,
+    columns: int | None = None,
+    font_size: int | None = None,
 ) -> NDArray[np.uint8]:
     """Draw panels side by side.
 
@@ -67,6 +70,9 @@ def draw_panels(
         size: (width, height) of the whole picture, pixels.
         legend: whether there is a legend; or its entries, so that all pictures of a film have the same legend.
         axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
+        captioned: whether titles are captions: below the panels, in as many lines as needed. All panels then have one size.
+        columns: number of panels in a row; None takes the number with which panels are largest.
+        font_size: pixels; None takes one by the size of the picture.
 
     Returns:
         (height, width, 3) uint8 RGB.
@@ -85,15 +91,19 @@ def draw_panels(
     entries = (
         (merge_legends([p.drawing.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
     )
+    titles = [panel.title for panel in panels]
     page = plan_page(
         size,
         len(panels),
-        titled=any(panel.title for panel in panels),
+        titled=any(titles) and not captioned,
         legend=entries,
         aspect=float(np.mean([1.0 if panel.view == "bev" else 16 / 9 for panel in panels])),
+        captions=titles if captioned else (),
+        columns=columns,
+        font_size=font_size,
     )
     pictures = [_draw(panel, page, number, viewpoint or Viewpoint(), axes) for number, panel in enumerate(panels)]
-    return draw_page(page, pictures, [panel.title for panel in panels], [panel.drawing.note for panel in panels])
+    return draw_page(page, pictures, titles, [panel.drawing.note for panel in panels], wrapped=captioned)
 
 
 def render_grid(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,18 +15,27 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError
 from carlasc.running.engines import Engine
 from carlasc.running.processes import run_all
+from carlasc.storage import Sequence as StoredSequence
+from carlasc.storage import Source
 from carlasc.viewing.colors import merge_legends
 from carlasc.viewing.finding import SceneSource
+from carlasc.viewing.rendering.boxes import check_boxes
 from carlasc.viewing.rendering.cameras import Viewpoint
 from carlasc.viewing.rendering.encoding import FILMS, STILLS, encodable_size, is_film, write_pictures
+from carlasc.viewing.rendering.evidence import GridColor, check_color
 from carlasc.viewing.rendering.frames import FrameRenderer, scan_extent_in, view_of_drive, views_named
 from carlasc.viewing.rendering.pages import check_size
-from carlasc.viewing.rendering.pictures import DEFAULT_SIZE, View
+from carlasc.viewing.rendering.panels import Cell, PictureRenderer, caption_panels, columns_of, plan_cells
+from carlasc.viewing.rendering.pictures import View
+from carlasc.viewing.rendering.styles import Style, StyleName, style_of
+from carlasc.viewing.rendering.texts import draw_legend
 from carlasc.viewing.scene import Scene, SceneReader, as_scene
 from carlasc.viewing.targets import check_target
 
 ORBIT_PICTURES = 120  # of an orbit around a single frame
 _DRIVE_FPS, _ORBIT_FPS = 10.0, 20.0  # frames are 0.1 s apart, so that a film runs at the speed of the drive
+
+_ONE = (Scene, str, os.PathLike, Source, StoredSequence)  # what is one source; anything else is a list of them
 
 
 @dataclass(frozen=True)
@@ -35,7 +44,7 @@ class RenderResult:
 
     Attributes:
         out: the file.
-        sequence: path of the sequence.
+        sequence: path of the sequence; of several, separated by commas.
         what: what is shown, side by side.
         frames: the frames that are shown.
         pictures: number of pictures in the file.
@@ -43,6 +52,7 @@ class RenderResult:
         classes: name of the class table.
         elapsed_s: how long it took, seconds.
         notes: what was chosen where the scene left a choice, and which parts of a picture are empty.
+        legend: the file of the legend if it is apart, or None.
     """
 
     out: Path
@@ -54,15 +64,22 @@ class RenderResult:
     classes: str
     elapsed_s: float
     notes: tuple[str, ...]
+    legend: Path | None = None
 
 
 def render(
-    source: Scene | SceneSource,
+    source: Scene | SceneSource | Sequence[Scene | SceneSource],
     out: str | os.PathLike[str] | None = None,
     *,
     what: str | None = None,
     view: str = "perspective",
-    size: tuple[int, int] = DEFAULT_SIZE,
+    color: GridColor = "class",
+    boxes: bool = False,
+    style: StyleName = "screen",
+    size: tuple[int, int] | str | None = None,
+    dpi: float | None = None,
+    captions: Sequence[str] = (),
+    columns: int | None = None,
     legend: bool = True,
     ego: bool = True,
     viewpoint: Viewpoint | None = None,
@@ -74,18 +91,31 @@ def render(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RenderResult:
-    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4). No screen and no GPU are needed.
+    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). No screen and no GPU are needed.
 
     The camera follows the ego vehicle, because grids and scans are in the frame of its sensor; with `still` it does not move.
 
+    A list of scenes is drawn as panels of one size, from the same camera, with captions: a PNG has a panel for each frame of each
+    scene, a film one for each scene.
+
     Args:
-        source: a `Scene`; or anything that a scene's `source` may be.
-        out: file name that ends in .png, .gif or .mp4; None names the file after the sequence, in the current folder.
+        source: a `Scene`; or anything that a scene's `source` may be; or a list of these.
+        out: file name that ends in .png, .gif, .mp4 or .webp; None names the file after the sequence, in the current folder.
             A scene without `frames` gives a picture of the first frame, or a film of all frames.
         what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by side. None draws the grid,
             with a ground truth also the truth and the errors; or the scan if there is no grid.
         view: "perspective", "bev" (bird's-eye view) or "both".
-        size: (width, height) of the picture, pixels.
+        color: what the colours of the grid mean: "class"; or "confidence" (the probability that a voxel is occupied), "views" (the
+            scans that saw it), "votes", or "inferred" (where the knowledge comes from): see `docs/format.md#evidence`.
+        boxes: whether boxes around actors are drawn: those of the field `boxes`, or else the tightest ones around the points of each
+            actor of `instances`.
+        style: "screen"; or "paper": PNG with 300 pixels per inch, type of 8 points, and the legend in a file of its own,
+            `<name>.legend.png`.
+        size: (width, height) of the picture in pixels, or a text such as "8.8cm x 5cm" or "3.5in x 2in". None takes 1280 x 720
+            pixels, or 8.8 x 5 cm on paper.
+        dpi: pixels per inch, which a PNG says in its metadata. None takes 300 on paper and for a size with a unit.
+        captions: for a list of scenes: a text for each panel, after its letter. Empty names what differs between the panels.
+        columns: for a list of scenes: number of panels in a row. None takes the frames of one scene, or what fits best.
         legend: whether the picture has a legend.
         ego: whether a plain car is drawn at the sensor.
         viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
@@ -109,73 +139,134 @@ def render(
         DependencyError: a package is missing; the message names the extra.
     """
     started = time.monotonic()
-    check_size(size)
-    views, scene = views_named(view), as_scene(source)
-    reader = scene.open(what)
-    film = is_film(Path(out)) if out is not None else orbit or (scene.frames is not None and len(reader.frames) > 1)
-    if scene.frames is None and (orbit or not film):
-        reader = replace(reader, frames=reader.frames[:1])
-    target = _name_after(reader, film) if out is None else Path(out)
+    layout = style_of(style, size, dpi)
+    check_size(layout.size)
+    together = not isinstance(source, _ONE)
+    scenes = [as_scene(source)] if isinstance(source, _ONE) else [as_scene(one) for one in source]
+    _check_together(scenes, captions, columns, together=together)
+    views, readers = views_named(view), [scene.open(what) for scene in scenes]
+    several = any(scene.frames is not None and len(r.frames) > 1 for scene, r in zip(scenes, readers, strict=True))
+    film = is_film(Path(out)) if out is not None else orbit or (several and not together)
+    if orbit or not film:
+        readers = [
+            replace(reader, frames=reader.frames[:1]) if scene.frames is None else reader
+            for scene, reader in zip(scenes, readers, strict=True)
+        ]
+    target = _name_after(readers[0], film) if out is None else Path(out)
     check_target(target, STILLS + FILMS, overwrite)
-    if not film and len(reader.frames) > 1:
-        found = f"{len(reader.frames)} frames for {target.name}"
-        raise ArgumentError("out", expected="a single frame for a PNG", found=found, advice="name a .gif or .mp4")
-    if orbit and not film:
-        raise ArgumentError("orbit", expected="a film", found=target.name, advice="name a .gif or .mp4")
+    legend_file = layout.legend_file(target) if legend and layout.legend_apart else None
+    _check_kind(target, readers[0] if not together else None, layout, film=film, orbit=orbit)
+    if legend_file is not None:
+        check_target(legend_file, STILLS, overwrite)
+    for reader in readers:
+        check_color(color, reader)
+        if boxes:
+            check_boxes(reader.data)
 
-    renderer = _prepare(reader, views, encodable_size(target, size), legend=legend, ego=ego, orbit=orbit, still=still)
-    tasks = _plan(renderer, viewpoint or Viewpoint())
+    layout = replace(layout, size=encodable_size(target, layout.size))
+    renderers = [_prepare(r, views, ego=ego, color=color, boxes=boxes, orbit=orbit, still=still) for r in readers]
+    pictures = plan_cells(renderers, film)
+    entries = (
+        merge_legends(cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells) if legend else []
+    )
+    captioned = caption_panels(pictures[0], captions, film) if together else ()
+    drawer = PictureRenderer(
+        layout,
+        [] if layout.legend_apart else entries,
+        captioned,
+        columns or (columns_of(pictures[0]) if together else None),
+    )
+    tasks = _plan(drawer, pictures, viewpoint or Viewpoint(), orbit=orbit)
     if fps is None:
-        fps = _ORBIT_FPS if orbit and len(reader.frames) == 1 else _DRIVE_FPS
-    with closing(run_all(_render_task, tasks, workers=workers, executor=executor)) as pictures:
-        write_pictures(target, _reported(pictures, len(tasks), progress), fps)
-    notes = list(reader.notes)
-    if len(tasks) == 1:
-        drawings = ((content, renderer.draw(content, reader.frames[0])) for content in reader.contents)
-        notes += [f"{content}: {drawing.note}" for content, drawing in drawings if drawing.note]
+        fps = _ORBIT_FPS if orbit and len(pictures) == 1 else _DRIVE_FPS
+    with closing(run_all(_render_task, tasks, workers=workers, executor=executor)) as drawn:
+        write_pictures(target, _reported(drawn, len(tasks), progress), fps, layout.dpi)
+    if legend_file is not None and entries and layout.font_size is not None:
+        write_pictures(legend_file, [draw_legend(entries, layout.font_size, layout.size[0])], fps, layout.dpi)
     return RenderResult(
-        target, reader.path, reader.contents, reader.frames, len(tasks), renderer.size,
-        reader.table.name, time.monotonic() - started, tuple(notes),
-    )  # fmt: skip
+        target,
+        ", ".join(dict.fromkeys(reader.path for reader in readers)),
+        readers[0].contents,
+        tuple(sorted({cell.frame for cells in pictures for cell in cells})),
+        len(tasks),
+        layout.size,
+        readers[0].table.name,
+        time.monotonic() - started,
+        tuple(_notes_of(readers, pictures)),
+        legend_file if entries else None,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    renderer: FrameRenderer
-    frame: int
+    drawer: PictureRenderer
+    cells: list[Cell]
     viewpoint: Viewpoint
 
 
 def _render_task(task: _Task) -> NDArray[np.uint8]:
-    return task.renderer.render(task.frame, task.viewpoint)
+    return task.drawer.render(task.cells, task.viewpoint)
+
+
+def _check_together(scenes: Sequence[Scene], captions: Sequence[str], columns: int | None, *, together: bool) -> None:
+    """Raise ArgumentError for arguments that have no meaning with this number of scenes."""
+    if not scenes:
+        raise ArgumentError("source", expected="at least one source", found="none")
+    if not together and (captions or columns is not None):
+        name = "captions" if captions else "columns"
+        raise ArgumentError(name, expected="several sources or frames in one picture", found="one")
+    if columns is not None and columns < 1:
+        raise ArgumentError("columns", expected="1 or more", found=str(columns))
+
+
+def _check_kind(target: Path, alone: SceneReader | None, style: Style, *, film: bool, orbit: bool) -> None:
+    """Raise ArgumentError if a still picture cannot hold what is asked for, or a film has the style of paper.
+
+    `alone` is the reader if each of its frames is a picture of its own, or None.
+    """
+    advice = "name a .gif, .mp4 or .webp"
+    if not film and alone is not None and len(alone.frames) > 1:
+        found = f"{len(alone.frames)} frames for {target.name}"
+        raise ArgumentError("out", expected="a single frame for a PNG", found=found, advice=advice)
+    if orbit and not film:
+        raise ArgumentError("orbit", expected="a film", found=target.name, advice=advice)
+    if style.legend_apart and film:
+        raise ArgumentError("style", expected="screen for a film", found=style.name, advice="name a .png")
+
+
+def _notes_of(readers: Sequence[SceneReader], pictures: list[list[Cell]]) -> dict[str, None]:
+    """Return what readers chose and, for a single picture, which parts are empty; each note once, in order."""
+    notes = [note for reader in readers for note in reader.notes]
+    for cell in pictures[0] if len(pictures) == 1 else []:
+        drawings = ((content, cell.renderer.draw(content, cell.frame)) for content in cell.renderer.reader.contents)
+        notes += [f"{content}: {drawing.note}" for content, drawing in drawings if drawing.note]
+    return dict.fromkeys(notes)
 
 
 def _prepare(
     reader: SceneReader,
     views: tuple[View, ...],
-    size: tuple[int, int],
     *,
-    legend: bool,
     ego: bool,
+    color: GridColor,
+    boxes: bool,
     orbit: bool,
     still: bool,
 ) -> FrameRenderer:
-    """Return a renderer whose extent, legend and fixed view are the same in all frames."""
+    """Return a renderer whose extent and fixed view are the same in all frames."""
     extent = scan_extent_in(reader)
     fixed_view = view_of_drive(reader, extent) if still else None
-    renderer = FrameRenderer(reader, views, extent, size, ego, fixed_view=fixed_view, orbit=orbit)
-    return renderer if not legend else replace(renderer, legend=merge_legends(map(renderer.legend_of, reader.frames)))
+    return FrameRenderer(reader, views, extent, ego, color, boxes, fixed_view, orbit)
 
 
-def _plan(renderer: FrameRenderer, viewpoint: Viewpoint) -> list[_Task]:
-    """Return which frame is seen from where in each picture."""
-    frames = list(renderer.reader.frames)
-    if not renderer.orbit:
-        return [_Task(renderer, frame, viewpoint) for frame in frames]
-    if len(frames) == 1:
-        frames *= ORBIT_PICTURES
-    angles = 2 * np.pi * np.arange(len(frames)) / len(frames)
-    return [_Task(renderer, frame, viewpoint.turned(float(angle))) for frame, angle in zip(frames, angles, strict=True)]
+def _plan(drawer: PictureRenderer, pictures: list[list[Cell]], viewpoint: Viewpoint, *, orbit: bool) -> list[_Task]:
+    """Return which frames are seen from where in each picture."""
+    if not orbit:
+        return [_Task(drawer, cells, viewpoint) for cells in pictures]
+    if len(pictures) == 1:
+        pictures = pictures * ORBIT_PICTURES
+    angles = 2 * np.pi * np.arange(len(pictures)) / len(pictures)
+    return [_Task(drawer, cells, viewpoint.turned(float(a))) for cells, a in zip(pictures, angles, strict=True)]
 
 
 def _reported(

@@ -39,7 +39,25 @@ def test_a_gif_has_every_picture_at_its_rate_and_runs_on(tmp_path):
         assert abs(int(np.asarray(film.convert("RGB")).mean()) - (20 + 10 * i)) <= 1
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4"])
+@pytest.mark.parametrize("size", [(64, 48), (65, 49)])
+def test_a_webp_has_every_picture_at_its_rate_and_runs_on(tmp_path, size):
+    write_pictures(tmp_path / "a.webp", flat_pictures(7, size), 12.5)
+    film = Image.open(tmp_path / "a.webp")
+    assert (film.size, film.n_frames, film.info["loop"]) == (size, 7, 0)
+    for i in range(7):
+        film.seek(i)
+        assert abs(np.asarray(film.convert("RGB")).mean() - (20 + 10 * i)) <= 3
+        assert film.info["duration"] == 80
+
+
+def test_a_png_says_its_resolution_where_one_is_given(tmp_path):
+    for name, dpi in (("a.png", 300), ("b.png", None)):
+        write_pictures(tmp_path / name, flat_pictures(1), 10, dpi)
+    assert Image.open(tmp_path / "a.png").info["dpi"] == pytest.approx((300, 300), abs=0.01)
+    assert "dpi" not in Image.open(tmp_path / "b.png").info
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4", "a.webp"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, CarlascError])
 def test_interrupted_pictures_leave_no_file(tmp_path, name, error):
     before = os.listdir("/tmp")
