@@ -88,7 +88,8 @@ def card(
     else:
         for note in result.notes:
             echo(note)
-        echo(f"{result.frames} frames in {result.sequences} sequences, licence {', '.join(result.licenses)}")
+        sequences = "1 sequence" if result.sequences == 1 else f"{result.sequences} sequences"
+        echo(f"{result.frames} frames in {sequences}, licence {', '.join(result.licenses)}")
         for file in result.files:
             echo(file)
     report_failures(list(result.failures), result.frames, "files")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.sequences import files_of, write_dataset
+from helpers.tiny_kitti import write_tiny_kitti
 from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 
@@ -108,7 +109,7 @@ def test_the_card_of_simulated_data_is_valid_croissant_with_its_responsible_fiel
         "Data collection",
         "Ground truth",
     ]
-    assert "prov:wasDerivedFrom" not in content
+    assert content["prov:wasDerivedFrom"] == ["no other data set: recorded in a simulator"]
     assert all(value not in ("", [], [""]) for name, value in content.items() if name.startswith("rai:"))
     assert content["license"] == "https://creativecommons.org/licenses/by/4.0/"
     assert content["creator"] == [{"@type": "sc:Organization", "name": "Town Lab"}]
@@ -287,6 +288,7 @@ def test_a_non_commercial_set_stays_so_and_each_source_keeps_its_licence(mixed: 
     row = next(line for line in text.splitlines() if line.startswith("| set of Tra"))
     assert "non-commercial use only" in row and "carlasc.json of the sequences" in row
     assert "not for commercial use" in text
+    assert "- set of Tra: see the page of its publishers" in text
     assert "Who uses all of them together keeps the conditions of all of them" in text
 
 
@@ -350,6 +352,29 @@ def test_an_existing_readme_is_not_replaced_unasked(tmp_path: Path) -> None:
     assert (root / "README.md").read_text() == "mine"
     carlasc.card(root, **SAID, pictures=False, overwrite=True)
     assert (root / "README.md").read_text().startswith("---\n")
+
+
+def test_an_existing_picture_is_found_before_anything_is_counted(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data")
+    (root / "images").mkdir()
+    (root / "images" / "grid.png").write_bytes(b"mine")
+    with pytest.raises(ConflictError, match=r"grid\.png: exists already"):
+        carlasc.card(root, **SAID, progress=lambda done, total: pytest.fail("counted"))
+    assert not (root / "README.md").exists()
+
+
+def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    fsspec = pytest.importorskip("fsspec")
+    source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")
+    fsspec.filesystem("memory").pipe("/cards/x.zip", source.read_bytes())
+    with pytest.raises(ArgumentError, match=r"out: expected a folder for the card of memory://cards/x\.zip"):
+        carlasc.card("memory://cards/x.zip", **SAID, pictures=False)
+    carlasc.card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
+    (file,) = [file for file in croissant(tmp_path / "card")["distribution"] if file["@type"] == "cr:FileObject"]
+    assert (file["contentUrl"], file["encodingFormat"]) == ("x.zip", "application/zip")
+    assert file["sha256"] == hashlib.sha256(source.read_bytes()).hexdigest()
+    assert front_matter(tmp_path / "card")["pretty_name"] == "x"
+    validated(tmp_path / "card", caplog)
 
 
 def test_a_source_without_sequences_is_one_line(town: Path, tmp_path: Path) -> None:
@@ -430,6 +455,47 @@ def test_the_command_prints_what_it_wrote(tmp_path: Path) -> None:
     assert found["files"] == [str(tmp_path / "c" / name) for name in ("README.md", "croissant.json")]
     assert croissant(tmp_path / "c")["citeAs"] == "@misc{town}"
     assert [author["name"] for author in croissant(tmp_path / "c")["creator"]] == ["A", "B"]
+
+
+def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_tiny_kitti(tmp_path / "kitti", frames=2)
+    carlasc.convert("kitti", tmp_path / "kitti", tmp_path / "out", grids="none", poses="file", workers=1)
+    assert carlasc.card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == ("CC BY-NC-SA 3.0",)
+    text, content = (tmp_path / "out" / "README.md").read_text(), croissant(tmp_path / "out")
+    assert front_matter(tmp_path / "out")["license"] == "cc-by-nc-sa-3.0"
+    assert "- kitti kitti: J. Behley et al., SemanticKITTI, ICCV 2019" in text
+    assert "Velodyne HDL-64E" in text and "nearer than 2.5 m" in text
+    assert content["citeAs"].startswith("J. Behley et al., SemanticKITTI")
+    assert content["rai:hasSyntheticData"] is False
+    assert content["rai:dataCollectionType"] == ["Secondary Data analysis"]
+    assert "without faces" in content["rai:personalSensitiveInformation"][0]
+    validated(tmp_path / "out", caplog)
+
+
+def test_data_that_were_converted_from_another_simulator_are_synthetic(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data")
+    licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "MIT"))
+    carlasc.card(root, pictures=False)
+    assert croissant(root)["rai:hasSyntheticData"] is False
+    file = root / WHOLE / "carlasc.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"simulated": True}))
+    carlasc.card(root, pictures=False, overwrite=True)
+    assert croissant(root)["rai:hasSyntheticData"] is True
+
+
+@pytest.mark.needs("pyarrow")
+def test_rounded_coordinates_are_said(town: Path, tmp_path: Path) -> None:
+    from carlasc.storage.packed.protocol import Options
+    from carlasc.storage.packed.tables.writing import ParquetSink
+
+    with ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
+        writer.write("points", 0, np.ones((3, 4), np.float32))
+    carlasc.card(tmp_path / "x.parquet", **SAID, pictures=False)
+    text = (tmp_path / "x.parquet" / "README.md").read_text()
+    assert "`x`, `y` and `z` are whole numbers of 2 mm." in text
+    assert "Coordinates of points are rounded to steps of 2 mm." in text
 
 
 def test_every_text_of_responsibility_is_filled_for_converted_data_too(mixed: Path) -> None:

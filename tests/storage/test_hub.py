@@ -101,6 +101,15 @@ def test_commands_read_a_data_set(server: Hub, tmp_path: Path) -> None:
     assert len(carlasc.open(tmp_path / "x.zarr").sequences()[WHOLE].frames("points")) == len(FRAMES)
 
 
+def test_the_card_of_a_data_set_of_the_hub_is_written_here(server: Hub, tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        app,
+        ["card", URL, "-o", str(tmp_path / "card"), "--license", "mit", "--no-pictures", "--published", "2026-11-22"],
+    )
+    assert result.exit_code == 0, result.output
+    assert 'pretty_name: "town"' in (tmp_path / "card" / "README.md").read_text()
+
+
 def test_a_revision_and_a_folder_in_a_data_set_are_read(server: Hub) -> None:
     assert set(carlasc.open(f"{URL}@main/{WHOLE}").sequences()) == {""}
 

@@ -120,20 +120,18 @@ def card(
     _check(version, day, url)
     opened = as_source(source)
     place, folder = place_of(opened if isinstance(source, Source) else source, None if out is None else Path(out), url)
-    _check_free(folder, overwrite)
+    _check_free(folder, overwrite, pictures)
     facts = gather(opened, stated, every, workers, progress)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
     details = Details(name or place.title, description, tuple(authors), version, day, url, contact, citation)
     told = description or _describe(facts)
+    described = croissant(facts, details, place, tables, told)
     drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
-    files = {
-        folder / CROISSANT: croissant(facts, details, place, tables, told),
-        folder / README: readme(
-            facts, details, place, tables, told, [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
-        ),
-    }
-    for path, data in files.items():
-        write_output(path, data)
+    shown = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
+    write_output(folder / CROISSANT, described)
+    write_output(
+        folder / README, readme(facts, details, place, tables, told, shown)
+    )  # last: it says that the card is whole
     return CardResult(
         folder,
         (folder / README, folder / CROISSANT, *(path for path, _ in drawn)),
@@ -156,11 +154,12 @@ def _check(version: str, day: str, url: str | None) -> None:
         raise ArgumentError("url", expected="an address that begins with https://", found=repr(url))
 
 
-def _check_free(folder: Path, overwrite: bool) -> None:
+def _check_free(folder: Path, overwrite: bool, pictures: bool) -> None:
     """Check that no card exists, before anything is counted."""
     if folder.exists() and not folder.is_dir():
         raise ArgumentError("out", expected="a folder", found=f"the file {folder}")
-    for path in (folder / README, folder / CROISSANT):
+    drawn = [folder / PICTURES / f"{what}.png" for what in ("grid", "scan")] if pictures else []
+    for path in (folder / README, folder / CROISSANT, *drawn):
         if path.exists() and not overwrite:
             raise ConflictError(
                 path, problem="exists already", advice="choose another folder, or replace it with `overwrite=True`"

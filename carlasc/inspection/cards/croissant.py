@@ -52,7 +52,7 @@ def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Tab
         "license": licenses[0] if len(licenses) == 1 else licenses,
         "version": details.version,
         "datePublished": details.published,
-        "citeAs": details.citation or MOTIONSC,
+        "citeAs": details.citation or _papers(facts),
         "keywords": list(KEYWORDS),
         "isLiveDataset": False,
     }
@@ -61,8 +61,7 @@ def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Tab
     if details.authors:
         content["creator"] = [{"@type": "sc:Organization", "name": name} for name in details.authors]
     content |= {f"rai:{name}": value for name, value in responsibility(facts, details).items()}
-    if facts.sources:
-        content["prov:wasDerivedFrom"] = facts.sources
+    content["prov:wasDerivedFrom"] = facts.sources or ["no other data set: recorded in a simulator"]
     content["prov:wasGeneratedBy"] = [
         _activity("Data collection", " ".join(collection(facts))),
         _activity("Ground truth", " ".join(made(facts))),
@@ -70,6 +69,12 @@ def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Tab
     content["distribution"] = [*_files(facts, place, tables)]
     content["recordSet"] = [*_classes(facts), _sequences(facts), *(_record_set(table) for table in tables)]
     return (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
+
+
+def _papers(facts: Facts) -> str:
+    """Return what to cite: the papers of the sources, or that which introduced CarlaSC."""
+    papers = list(dict.fromkeys(filter(None, facts.citations.values())))
+    return "; ".join(papers) if papers and not facts.simulated else MOTIONSC
 
 
 def _id(name: str) -> str:

@@ -16,8 +16,6 @@ from carlasc.storage import layout
 from carlasc.storage.packed.protocol import PackedSource
 from carlasc.storage.protocol import Sequence, Source
 
-_SYNTHETIC = ("carlaocc", "synthcity")  # data sets that carlasc converts and that were recorded in a simulator
-
 MOTIONSC = """@article{wilson2022motionsc,
   title = {MotionSC: Data Set and Network for Real-Time Semantic Mapping in Dynamic Environments},
   author = {Wilson, Joey and Song, Jingyu and Fu, Yuewei and Zhang, Arthur and Capodieci, Andrew and Jayakumar, Paramsothy and Barton, Kira and Ghaffari, Maani},
@@ -135,7 +133,13 @@ class Facts:
     @property
     def synthetic(self) -> bool:
         """Whether some sequences were recorded in a simulator, by us or by others."""
-        return self.simulated or any(source.split()[0] in _SYNTHETIC for source in self.sources if source.split())
+        return self.simulated or any(one.metadata.extra.get("simulated") is True for one in self.sequences.values())
+
+    @cached_property
+    def citations(self) -> dict[str, str]:
+        """What to cite for each source; "" where carlasc.json does not say it."""
+        said = {one.metadata.source: one.metadata.extra.get("citation") for one in self.sequences.values()}
+        return {source: text if isinstance(text := said.get(source), str) else "" for source in self.sources}
 
     @cached_property
     def sensors(self) -> list[str]:

@@ -17,6 +17,7 @@ from carlasc.inspection.cards.responsibility import (
     collection,
     how_made,
     limitations,
+    preprocessing,
     responsibility,
     uses,
 )
@@ -162,7 +163,7 @@ def _opening(facts: Facts, place: Place, tables: Sequence[Table]) -> str:
         split = json.dumps(sorted(config.files, key=_SPLITS.index)[0])
         text.append("With [datasets](https://huggingface.co/docs/datasets), one row per point, voxel or frame:")
         text.append(
-            f"```python\nfrom pathlib import Path\n\nfrom datasets import load_dataset\n\n{_data_set(place)}\n"
+            f"```python\n{_data_set(place)}\n"
             f"frames = load_dataset(data, split={split})\n"
             f"one = load_dataset(data, {json.dumps(config.name)}, split={split},\n"
             f'                   filters=[("sequence", "==", frames[0]["sequence"]), ("frame", "==", frames[0]["frame"])])\n'
@@ -181,10 +182,14 @@ def _opening(facts: Facts, place: Place, tables: Sequence[Table]) -> str:
 
 
 def _data_set(place: Place) -> str:
-    """Return a line of Python that names the data for `load_dataset`: "." would be a data set without a name."""
+    """Return lines of Python that name the data for `load_dataset`: "." would be a data set without a name."""
     if place.repository:
-        return f"data = {json.dumps(place.repository.partition('/datasets/')[2])}"
-    return "data = str(Path().resolve())  # the folder of this file; at the Hugging Face Hub, ORG/NAME"
+        name = json.dumps(place.repository.partition("/datasets/")[2])
+        return f"from datasets import load_dataset\n\ndata = {name}"
+    return (
+        "from pathlib import Path\n\nfrom datasets import load_dataset\n\n"
+        "data = str(Path().resolve())  # the folder of this file; at the Hugging Face Hub, ORG/NAME"
+    )
 
 
 def _first_read(first: SequenceOverview) -> str:
@@ -217,11 +222,9 @@ def _classes(facts: Facts) -> str:
         ]
         text.append(f"The class table is `{_text(one.classes.name)}`; classes that do not occur are left out.")
         text.append(_table(["id", "class", "points %", "known voxels %"], rows))
-    share = facts.known_share()
-    if share is not None and any(one.total.grids for one in facts.statistics):
-        text.append(
-            f"Class 0 is unlabelled on points and free in voxels. {share:.1%} of the voxels are known; the others have count 0."
-        )
+    share = facts.known_share() if any(one.total.grids for one in facts.statistics) else None
+    known = "" if share is None else f" {share:.1%} of the voxels are known; the others have count 0."
+    text.append(f"Class 0 is unlabelled on points and free in voxels.{known}")
     if facts.every > 1:
         text.append(f"Counted on every {facts.every}th frame.")
     return "\n\n".join(text)
@@ -242,7 +245,7 @@ def _sequences(facts: Facts) -> str:
 
 
 def _making(facts: Facts) -> str:
-    text = [_text(" ".join([*collection(facts), *annotation(facts)]))]
+    text = [_text(" ".join([*collection(facts), *annotation(facts), *preprocessing(facts)]))]
     rows = [[grid.name, str(count), f"{frames:,}", how_made(grid.made)] for grid, count, frames in facts.grids]
     if rows:
         text.append(_table(["grid", "sequences", "frames", "how it was made"], rows))
@@ -260,9 +263,10 @@ def _making(facts: Facts) -> str:
         text.append("From the reports (`carlasc-report.json`) that the runs left beside the grids:")
         header = ["grid", "known voxels %", "occupied of these %", "changed with a tenth fewer scans %", "made with"]
         text.append(_table(header, rows[:_MOST_SEQUENCES]))
-    text.append(
-        "`params.json` beside each grid has all settings; `carlasc validate` compares the files with their digests."
-    )
+    if facts.grids:
+        text.append(
+            "`params.json` beside each grid has all settings; `carlasc validate` compares the files with their digests."
+        )
     return "\n\n".join(text)
 
 
@@ -304,13 +308,14 @@ def _limits(facts: Facts, details: Details) -> str:
 
 
 def _citation(facts: Facts, details: Details) -> str:
-    text = []
-    if details.citation:
-        text.append(_code(details.citation))
+    text = [_code(details.citation)] if details.citation else []
+    if facts.sources:
+        papers = [f"{source}: {paper or 'see the page of its publishers'}" for source, paper in facts.citations.items()]
+        text.append("Sequences were converted from these data, which are to be cited as well:")
+        text.append("\n".join(f"- {_text(line)}" for line in papers))
+    if details.citation or not facts.simulated:
         text.append("The layout and the classes are those of CarlaSC:")
     text.append(_code(MOTIONSC))
-    if facts.sources:
-        text.append(f"Cite the papers of {_text(', '.join(facts.sources))} as well: their licences ask for it.")
     text.append("Made with carlasc; its CITATION.cff says how to cite the software.")
     return "\n\n".join(text)
 

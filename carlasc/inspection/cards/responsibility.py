@@ -176,13 +176,15 @@ def biases(facts: Facts) -> list[str]:
         sentences.append(
             "Converted sequences have the biases of their source: its places, weather, vehicles and sensors."
         )
-    sentences.append("Voxels near the vehicle and its path are seen more often than those far away or behind others.")
+    near = "Voxels" if facts.grids else "Surfaces"
+    sentences.append(f"{near} near the vehicle and its path are seen more often than those far away or behind others.")
     return sentences
 
 
 def uses(facts: Facts) -> list[str]:
     """Return what the data are for."""
-    found = ["semantic scene completion and occupancy prediction", "semantic mapping in dynamic environments"]
+    found = ["semantic scene completion and occupancy prediction"] if facts.grids else []
+    found.append("semantic mapping in dynamic environments")
     if "labels" in facts.fields:
         found.append("semantic segmentation of LiDAR scans")
     if "flow" in facts.fields:
@@ -199,7 +201,7 @@ def limitations(facts: Facts) -> list[str]:
         sentences.append(
             "Simulated LiDAR has no rain, fog, beam divergence or interference; models trained on it alone fail on real scans more often."
         )
-    sentences += missing(facts)
+    sentences += missing(facts) if facts.gaps else [text for text in missing(facts) if "no gaps" not in text]
     if facts.lossy_mm:
         sentences.append(f"Coordinates of points are rounded to steps of {facts.lossy_mm:g} mm.")
     if any(grid.made is not None and grid.made.get("observe") == "scans" for grid, _, _ in facts.grids):
