@@ -87,10 +87,11 @@ def place_of(source: str | os.PathLike[str] | Source, out: Path | None, url: str
         tree = RemoteTree(location)
         name = PurePosixPath(location.partition("://")[2].partition("?")[0]).name
         return Place(location, None, name, tree.size() is not None, repository), out
-    local = Path(location.removeprefix("file://")).resolve()
-    if not local.exists():
+    given = Path(location.removeprefix("file://"))
+    if not given.exists():
         raise ArgumentError("source", expected="data on this machine, or their URL", found=location)
-    beside = local.is_file() or (local / "zarr.json").is_file()
-    folder = (out or (local.parent if beside else local)).resolve()
+    beside = given.is_file() or (given / "zarr.json").is_file()
+    chosen = out or (given.parent if beside else given)
+    local, folder = given.resolve(), chosen.resolve()
     name = local.relative_to(folder).as_posix() if local.is_relative_to(folder) else local.name
-    return Place(location, local, "" if name == "." else name, local.is_file(), repository), out or folder
+    return Place(location, local, "" if name == "." else name, local.is_file(), repository), chosen
