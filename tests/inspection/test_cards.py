@@ -363,6 +363,19 @@ def test_an_existing_picture_is_found_before_anything_is_counted(tmp_path: Path)
     assert not (root / "README.md").exists()
 
 
+def test_a_run_that_was_killed_is_finished_by_the_next(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data")
+    carlasc.card(root, **SAID, pictures=False)
+    whole = (root / "README.md").read_bytes()
+    (root / "README.md").unlink()  # the last file
+    carlasc.card(root, **SAID, pictures=False)
+    assert (root / "README.md").read_bytes() == whole
+    (root / "README.md").unlink()
+    (root / "croissant.json").write_text('{"name": "mine"}')
+    with pytest.raises(ConflictError, match=r"croissant\.json: exists already"):
+        carlasc.card(root, **SAID, pictures=False)
+
+
 def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     fsspec = pytest.importorskip("fsspec")
     source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")

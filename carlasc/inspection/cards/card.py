@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import ArgumentError, ConflictError, DependencyError, MissingDataError
-from carlasc.inspection.cards.croissant import croissant
+from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
+from carlasc.inspection.cards.croissant import WRITER, croissant
 from carlasc.inspection.cards.facts import Details, Facts, gather
 from carlasc.inspection.cards.licenses import license_given
 from carlasc.inspection.cards.places import place_of
 from carlasc.inspection.cards.readme import readme
 from carlasc.inspection.cards.tables import tables_of
 from carlasc.storage import as_source
-from carlasc.storage.files import write_output
+from carlasc.storage.files import parse_json, write_output
 from carlasc.storage.packed.tables.reading import ParquetSource
 from carlasc.storage.protocol import Source
 
@@ -120,18 +120,15 @@ def card(
     _check(version, day, url)
     opened = as_source(source)
     place, folder = place_of(opened if isinstance(source, Source) else source, None if out is None else Path(out), url)
-    _check_free(folder, overwrite, pictures)
+    overwrite = _check_free(folder, overwrite, pictures)
     facts = gather(opened, stated, every, workers, progress)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
     details = Details(name or place.title, description, tuple(authors), version, day, url, contact, citation)
     told = description or _describe(facts)
-    described = croissant(facts, details, place, tables, told)
+    write_output(folder / CROISSANT, croissant(facts, details, place, tables, told))
     drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
     shown = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
-    write_output(folder / CROISSANT, described)
-    write_output(
-        folder / README, readme(facts, details, place, tables, told, shown)
-    )  # last: it says that the card is whole
+    write_output(folder / README, readme(facts, details, place, tables, told, shown))
     return CardResult(
         folder,
         (folder / README, folder / CROISSANT, *(path for path, _ in drawn)),
@@ -154,16 +151,31 @@ def _check(version: str, day: str, url: str | None) -> None:
         raise ArgumentError("url", expected="an address that begins with https://", found=repr(url))
 
 
-def _check_free(folder: Path, overwrite: bool, pictures: bool) -> None:
-    """Check that no card exists, before anything is counted."""
+def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
+    """Check that no card exists, before anything is counted; return whether files may be replaced.
+
+    croissant.json is the first file of a card and README.md the last: what lies beside the one without the other is what a killed run left.
+    """
     if folder.exists() and not folder.is_dir():
         raise ArgumentError("out", expected="a folder", found=f"the file {folder}")
+    if overwrite or (not (folder / README).exists() and _is_ours(folder / CROISSANT)):
+        return True
     drawn = [folder / PICTURES / f"{what}.png" for what in ("grid", "scan")] if pictures else []
     for path in (folder / README, folder / CROISSANT, *drawn):
-        if path.exists() and not overwrite:
+        if path.exists():
             raise ConflictError(
                 path, problem="exists already", advice="choose another folder, or replace it with `overwrite=True`"
             )
+    return False
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is a croissant.json that carlasc wrote."""
+    try:
+        writer = parse_json(path.read_bytes(), str(path)).get("sdPublisher")
+    except (OSError, FormatError):
+        return False
+    return isinstance(writer, dict) and writer.get("name") == WRITER
 
 
 def _describe(facts: Facts) -> str:

@@ -16,6 +16,8 @@ from carlasc.storage import layout
 
 Json = dict[str, Any]
 
+WRITER = "carlasc"
+"""Who wrote the file, as its `sdPublisher` says."""
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0")
 KEYWORDS = ("LiDAR", "voxel grid", "semantic scene completion", "semantic mapping", "occupancy", "scene flow")
 _PARQUET = "application/x-parquet"
@@ -55,6 +57,7 @@ def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Tab
         "citeAs": details.citation or _papers(facts),
         "keywords": list(KEYWORDS),
         "isLiveDataset": False,
+        "sdPublisher": {"@type": "sc:Organization", "name": WRITER},
     }
     if details.url:
         content["url"] = details.url
