@@ -456,6 +456,15 @@ def test_frames_that_cannot_be_read_are_listed_and_end_with_1(tmp_path: Path) ->
     assert "1 files could not be read" in (root / "README.md").read_text()
 
 
+def test_a_grid_that_cannot_be_described_is_not_left_out(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "data")
+    (root / WHOLE / "evaluation" / "params.json").write_text("{}")
+    with pytest.raises(FormatError, match=r"params\.json") as caught:
+        carlasc.card(root, **SAID, pictures=False)
+    assert "\n" not in str(caught.value)
+    assert not (root / "README.md").exists()
+
+
 def test_the_command_prints_what_it_wrote(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (tmp_path / "cite.bib").write_text("@misc{town}")

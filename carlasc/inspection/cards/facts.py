@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
 from carlasc.inspection.overview import GridOverview, Overview, info
@@ -178,6 +178,7 @@ def gather(
 
     Raises:
         MissingDataError: the source has no sequences.
+        FormatError: a sequence cannot be described.
         ArgumentError, FormatError, CarlascError: see `licensed_parts` and `stats`.
     """
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
@@ -191,8 +192,12 @@ def gather(
             if name in sequence.documents():
                 where = f"{sequence.location}/{name}"
                 reports[f"{path}/{grid}" if path else grid] = Report.from_json(sequence.read_document(name), where)
+    overview = info(source)
+    for one in overview.sequences:
+        if one.problem:  # a grid that cannot be described would be missing from the card, and nobody would know
+            raise FormatError(one.path or source.location, problem=one.problem)
     return Facts(
-        info(source),
+        overview,
         sequences,
         parts,
         _count(source.location, sequences, every, workers, progress),
