@@ -120,6 +120,19 @@ def test_a_folder_with_the_name_of_the_data_set_is_listed(server: Hub, published
     assert f"town/{WHOLE}" in carlasc.open("hf://datasets/lab2/town").sequences()
 
 
+def test_a_cache_fetches_each_file_once(server: Hub, published: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    carlasc.pack(published, folder / "x.zarr")
+    server.folders["lab/cached"] = folder
+    for _ in range(2):
+        server.requests.clear()
+        source = carlasc.open("hf://datasets/lab/cached/x.zarr", cache=tmp_path / "cache")
+        assert len(source.sequences()[WHOLE].read("points", 5))
+        fetched = [path for path in server.requests if "/resolve/" in path and "/points/" in path]
+    assert not fetched
+
+
 def test_requests_that_fail_are_sent_again(server: Hub, published: Path) -> None:
     sequence = carlasc.open(URL).sequences()[WHOLE]
     server.faults += [503, 429, 500]
