@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
 from carlasc.loading import late_names
 from carlasc.storage.metadata import Axes
 
 if TYPE_CHECKING:
-    from carlasc.converting.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
     from carlasc.converting.exporter import Exported, Exporter, Files, FrameExporter, SequenceExporter, SequenceFile
     from carlasc.converting.exporting import ExportResult, export
     from carlasc.converting.options import option_names
@@ -37,7 +37,6 @@ else:
     __getattr__, __dir__ = late_names(
         __name__,
         {
-            "axes": ("mirror_boxes", "mirror_grid", "mirror_points", "mirror_poses", "mirror_spec"),
             "exporter": ("Exported", "Exporter", "Files", "FrameExporter", "SequenceExporter", "SequenceFile"),
             "exporting": ("ExportResult", "export"),
             "options": ("option_names",),

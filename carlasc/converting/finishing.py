@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from carlasc.converting.actors import Velocity
 from carlasc.converting.assembling import Motion, Rig, assemble
-from carlasc.converting.axes import mirror_boxes, mirror_points
 from carlasc.converting.nearby import labels_nearby
 from carlasc.converting.outcomes import Fields, Outcome, written_in_worker
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.scans import make_fields
 from carlasc.converting.target import Target
+from carlasc.core.axes import mirror_boxes, mirror_points
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 import carlasc
 from carlasc.converting.assembling import Motion, Rig
-from carlasc.converting.axes import mirror_poses, mirror_spec
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
 from carlasc.converting.target import Target
 from carlasc.converting.trajectory import (
@@ -26,6 +25,7 @@ from carlasc.converting.trajectory import (
     read_trajectory,
     scan_poses,
 )
+from carlasc.core.axes import mirror_poses, mirror_spec
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec

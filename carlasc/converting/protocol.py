@@ -260,6 +260,8 @@ class Converter(ABC):
         min_range_m: nearer points are left out of grids: they belong to the vehicle that carries the sensor.
         max_range_m: farther points are left out of grids: they are too sparse to tell free space from occupied space.
         license: licence of the data, such as "CC BY-NC-SA 4.0", which holds for what is made from them too; None if it is not known.
+        citation: what to cite for the data, in one line; None if it is not known.
+        simulated: whether the data were recorded in a simulator.
     """
 
     title: ClassVar[str]
@@ -270,6 +272,8 @@ class Converter(ABC):
     min_range_m: ClassVar[float | None] = None
     max_range_m: ClassVar[float | None] = None
     license: ClassVar[str | None] = None
+    citation: ClassVar[str | None] = None
+    simulated: ClassVar[bool] = False
 
     def __init__(self, source: Path, **options: str) -> None:
         """Remember where the data set is.

@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.axes import mirror_grid, mirror_spec
+from carlasc.core.axes import mirror_grid, mirror_spec
 from carlasc.core.grids import GridSpec, most_frequent
 from carlasc.storage.metadata import Axes
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -140,7 +140,7 @@ def convert(
         converter.min_range_m,
         converter.max_range_m,
         f"{name if isinstance(name, str) else name.__name__} {root.name}",
-        {} if converter.license is None else {"license": converter.license},
+        _provenance(converter),
     )
     plans = [
         plan_recording(recording, converter, sink, poses, flow=flow == "auto", force=force) for recording in recordings
@@ -180,6 +180,12 @@ def convert(
         tuple(notes),
         time.perf_counter() - start,
     )
+
+
+def _provenance(converter: type[Converter]) -> dict[str, Any]:
+    """Return what carlasc.json says of the data that a sequence was made from, as far as the converter knows it."""
+    said = {"license": converter.license, "citation": converter.citation, "simulated": converter.simulated or None}
+    return {key: value for key, value in said.items() if value is not None}
 
 
 def _deal(recordings: Sequence[Recording], part: Part) -> list[Recording]:

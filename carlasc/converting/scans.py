@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from carlasc.converting.actors import ActorSighting, find_actors
 from carlasc.converting.assembling import Assembled, Motion, Rig, assemble
-from carlasc.converting.axes import mirror_grid, mirror_points
 from carlasc.converting.outcomes import Fields, Outcome, written_in_worker
 from carlasc.converting.protocol import FrameHandle
 from carlasc.converting.target import Target
+from carlasc.core.axes import mirror_grid, mirror_points
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.motion.odometry import usable_points

@@ -1,4 +1,4 @@
-"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`)."""
+"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`), and all of that to publish (`card`)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from carlasc.loading import late_names
 
 if TYPE_CHECKING:
+    from carlasc.inspection.cards.card import CardResult, card
     from carlasc.inspection.findings import Finding, ValidationResult
     from carlasc.inspection.heldout import HoldoutResult, holdout
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
@@ -19,6 +20,7 @@ else:
     __getattr__, __dir__ = late_names(
         __name__,
         {
+            "cards.card": ("CardResult", "card"),
             "findings": ("Finding", "ValidationResult"),
             "heldout": ("HoldoutResult", "holdout"),
             "heldout_scores": ("HeldOutScores", "RayShares"),
@@ -31,6 +33,7 @@ else:
     )
 
 __all__ = [
+    "CardResult",
     "Finding",
     "HeldOutScores",
     "HoldoutResult",
@@ -39,6 +42,7 @@ __all__ = [
     "ReportResult",
     "Statistics",
     "ValidationResult",
+    "card",
     "holdout",
     "info",
     "report",

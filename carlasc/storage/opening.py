@@ -10,6 +10,7 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.parts import Part
 from carlasc.storage.caching import Cache, CachedTree
 from carlasc.storage.folders.folder import FolderSink, FolderSource
+from carlasc.storage.folders.hub import HUB
 from carlasc.storage.folders.published import PublishedSource
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, is_url
 from carlasc.storage.folders.zipped import ZipTree
@@ -167,6 +168,9 @@ def _open_folder(tree: Tree) -> Source:
             tree.location,
             expected="a folder, a zip or a packed store",
             found="nothing (or a folder that cannot be listed)",
+            advice="check the name; private and gated data need a token in HF_TOKEN"
+            if tree.location.startswith(f"{HUB}://")
+            else "",
         )
     return source or PublishedSource(tree)
 

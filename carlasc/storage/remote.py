@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError
+from carlasc.storage.folders.hub import HUB
 from carlasc.storage.folders.names import leads_outside
 from carlasc.storage.folders.requests import Request, exists_error, fail
 from carlasc.storage.folders.trees import RemoteTree, is_url
@@ -37,7 +38,7 @@ class RemoteTarget(Target):
         """Take a folder's URL, and fsspec's storage options; nothing is requested yet.
 
         Raises:
-            ArgumentError: nothing can be written there, as with http.
+            ArgumentError: nothing can be written there, as with http and the Hugging Face Hub.
             DependencyError: the URL needs a package that is not installed.
         """
         self.tree = RemoteTree(url, options)
@@ -47,6 +48,13 @@ class RemoteTarget(Target):
                 self.location,
                 expected="a folder, or a URL of an object store",
                 found="a web server, which is only read",
+            )
+        if self.tree.requests.scheme == HUB:
+            raise ArgumentError(
+                self.location,
+                expected="a folder, or a URL of an object store",
+                found="the Hugging Face Hub, where each file would be a commit",
+                advice="write it here, then upload it with `hf upload-large-folder`",
             )
         self.exclusive = url.partition("://")[0] in _EXCLUSIVE
 

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
+from carlasc.core.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames

@@ -34,6 +34,7 @@ class Argoverse2(Converter):
 
     title: ClassVar[str] = "Argoverse 2, sensor data set"
     license = "CC BY-NC-SA 4.0"
+    citation = "B. Wilson et al., Argoverse 2, NeurIPS Datasets and Benchmarks 2021"
     classes = ARGOVERSE2
     to_carla = TO_CARLA
     sensor = "two Velodyne VLP-32C, one above the other"

@@ -59,6 +59,10 @@ class CarlaOcc(Converter):
     """
 
     title: ClassVar[str] = "CarlaOcc: CARLA 0.10 with voxels from meshes"
+    citation = (
+        "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for Autonomous Driving, CVPR 2026"
+    )
+    simulated = True
     option_names = ("voxels",)
     classes = CLASSES
     to_carla = Remap(

@@ -45,6 +45,10 @@ class SemanticKitti(KittiConverter):
     """Reads SemanticKITTI, one of its sequences, or KITTI odometry data."""
 
     title: ClassVar[str] = "SemanticKITTI, or KITTI odometry data without labels"
+    citation = (
+        "J. Behley et al., SemanticKITTI, ICCV 2019; A. Geiger, P. Lenz, R. Urtasun, Are we ready for "
+        "Autonomous Driving?, CVPR 2012"
+    )
     classes = SEMANTICKITTI
     to_carla = REMAPS["semantickitti_to_carla"]
 

@@ -35,6 +35,7 @@ class Kitti360(KittiConverter):
     """Reads KITTI-360: the whole data set, or one of its drives."""
 
     title: ClassVar[str] = "KITTI-360: Velodyne scans, with labels of the accumulated clouds where they exist"
+    citation = "Y. Liao, J. Xie, A. Geiger, KITTI-360, PAMI 2022"
     classes = KITTI360
     to_carla = KITTI360_TO_CARLA
 

@@ -38,6 +38,7 @@ class KittiRaw(KittiConverter):
     """Reads KITTI's raw data (the "synced+rectified" drives): all dates, one date, or one drive."""
 
     title: ClassVar[str] = "KITTI raw data: synced drives, with tracklets where they exist"
+    citation = "A. Geiger, P. Lenz, C. Stiller, R. Urtasun, Vision meets Robotics: The KITTI Dataset, IJRR 2013"
     classes = KITTI
     to_carla = KITTI_TO_CARLA
 

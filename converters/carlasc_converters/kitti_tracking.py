@@ -38,6 +38,7 @@ class KittiTracking(KittiConverter):
     """Reads KITTI's tracking benchmark: both parts, or one of them."""
 
     title: ClassVar[str] = "KITTI tracking benchmark, with or without oxts"
+    citation = "A. Geiger, P. Lenz, R. Urtasun, Are we ready for Autonomous Driving?, CVPR 2012"
     classes = KITTI
     to_carla = KITTI_TO_CARLA
 

@@ -31,6 +31,7 @@ class NuScenes(Converter):
 
     title: ClassVar[str] = "nuScenes, with lidarseg and panoptic labels where they are installed"
     license = "CC BY-NC-SA 4.0"
+    citation = "H. Caesar et al., nuScenes, CVPR 2020; W. K. Fong et al., Panoptic nuScenes, RA-L 2022"
     option_names = ("version", "sweeps")
     classes = NUSCENES
     to_carla = TO_CARLA

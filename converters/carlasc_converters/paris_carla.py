@@ -35,6 +35,7 @@ class ParisCarla3D(Converter):
 
     title: ClassVar[str] = "Paris-CARLA-3D, its towns of CARLA"
     license = "CC BY-NC-ND 3.0"
+    citation = "J.-E. Deschaud et al., Paris-CARLA-3D, Remote Sensing 13(22), 2021"
     classes = CARLA
     to_carla = Remap("paris_carla_to_carla", CARLA, CARLA, {tag: tag for tag in CARLA.names})
     sensor = "simulated Velodyne HDL-32E, tilted"

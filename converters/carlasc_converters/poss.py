@@ -19,6 +19,7 @@ class SemanticPoss(Converter):
     """Reads SemanticPOSS, or one of its sequences."""
 
     title: ClassVar[str] = "SemanticPOSS"
+    citation = "Y. Pan et al., SemanticPOSS, IV 2020"
     classes = SEMANTICPOSS
     to_carla = REMAPS["semanticposs_to_carla"]
     sensor = "Hesai Pandora, 40 channels"

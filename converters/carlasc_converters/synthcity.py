@@ -61,6 +61,8 @@ class SynthCity(Converter):
     """
 
     title: ClassVar[str] = "SynthCity: tiles of a static cloud, voxels without free space"
+    citation = "D. Griffiths, J. Boehm, SynthCity: A large scale synthetic point cloud, 2019"
+    simulated = True
     option_names = ("columns", "grid")
     classes = CLASSES
     to_carla = Remap("synthcity_to_carla", CLASSES, CARLA, _TARGETS)

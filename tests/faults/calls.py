@@ -44,7 +44,7 @@ GOES_ON = ("convert", "convert-zarr", "convert-parquet", "regrid-hdf5", "regrid-
 """Commands that go on past a frame of the input that cannot be read, and whose next run does not replace what was made without it: the frames beside it, or
 a store of one writer, which is finished. docs/reliability.md says so."""
 
-PARTIAL = ("report", "stats")
+PARTIAL = ("card", "report", "stats")
 """Commands that say what they found in the frames that can be read, name the others, and end with exit code 1."""
 
 

@@ -121,6 +121,12 @@ _ALL = (
     Command("render-gif", f"render scene -o out.gif {PICTURE}", ("scene",), "out.gif", _PICTURES),
     Command("render-film", f"render scene -o out.mp4 {PICTURE}", ("scene",), "out.mp4", _PICTURES),
     Command("report", "report scene --html out.html --save --remake --holdout", ("scene",), "out.html", timed=True),
+    Command(
+        "card",
+        "card scene -o out --license cc0-1.0 --published 2026-11-22 --no-pictures --overwrite",
+        ("scene",),
+        "out",
+    ),
     Command("stats", "stats scene --grid evaluation_16x16x8 --plot out.png", ("scene",), "out.png", ("matplotlib",)),
     Command("download", f"download out --split val --base-url {URL}", (), "out", workers=None),
     Command("download-extract", f"download out --split val --extract --base-url {URL}", (), "out", workers=None),

@@ -58,10 +58,31 @@ def test_frames_are_rows_with_pose_time_and_statistics(published: Path, packed: 
 def test_any_parquet_reader_gets_points_as_columns(published: Path, packed: Path) -> None:
     reference = FolderSource(published).sequences()[WHOLE]
     table = parquet.read_table(packed / WHOLE / "points.parquet", filters=[("frame", "=", 5)])
-    assert table.column_names == ["frame", "x", "y", "z", "fourth"]
+    assert table.column_names == ["sequence", "frame", "x", "y", "z", "fourth"]
     assert np.array_equal(
         np.stack([table[axis].to_numpy() for axis in "xyz"], axis=1), reference.read("points", 5)[:, :3]
     )
+
+
+def test_tables_of_several_sequences_are_told_apart_by_a_number(packed: Path) -> None:
+    frames = [parquet.read_table(path).to_pylist() for path in packed.rglob("frames.parquet")]
+    paths = {row["sequence"]: row["path"] for rows in frames for row in rows}
+    assert sorted(paths.values()) == sorted(carlasc.open(packed).sequences())
+    for path in packed.rglob("labels.parquet"):
+        (number,) = set(parquet.read_table(path)["sequence"].to_pylist())
+        assert path.relative_to(packed).as_posix().startswith(f"{paths[number]}/")
+
+
+def test_a_second_run_goes_on_with_the_numbers_of_the_first(tmp_path: Path) -> None:
+    labels = np.arange(3, dtype=np.uint32)
+    with ParquetSink(tmp_path / "x.parquet").sequence(SCANS) as writer:
+        writer.write("labels", 0, labels)
+    with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(WHOLE) as writer:
+        writer.write("labels", 0, labels)
+    numbers = [
+        parquet.read_table(tmp_path / "x.parquet" / path / "labels.parquet")["sequence"] for path in (SCANS, WHOLE)
+    ]
+    assert [number.to_pylist() for number in numbers] == [[0] * 3, [1] * 3]
 
 
 def test_negative_zeros_and_nan_payloads_survive(tmp_path: Path) -> None:
@@ -77,7 +98,7 @@ def test_negative_zeros_and_nan_payloads_survive(tmp_path: Path) -> None:
 
 def test_a_corrupted_page_names_field_and_frame(store: Path) -> None:
     file = store / WHOLE / "points.parquet"
-    column = parquet.ParquetFile(file).metadata.row_group(2).column(2)  # the third scan that is not empty: frame 5
+    column = parquet.ParquetFile(file).metadata.row_group(2).column(3)  # the third scan that is not empty: frame 5
     data = bytearray(file.read_bytes())
     data[column.data_page_offset + column.total_compressed_size // 2] ^= 1
     file.write_bytes(data)

@@ -45,3 +45,14 @@ async def read_body(content: Any, most: int, patience_s: float) -> bytes:
         if elapsed_s > patience_s and len(data) < _SLOWEST * elapsed_s:
             raise TimeoutError(f"{len(data)} bytes in {elapsed_s:.0f} s")
     return bytes(data)
+
+
+def check_range(found: str | None, start: int, end: int | None) -> None:
+    """Compare the header Content-Range, "bytes 0-99/1000", with the range that was asked for; the file may end before it.
+
+    Raises:
+        WrongAnswerError: it is another range.
+    """
+    first, _, last = (found or "").removeprefix("bytes ").partition("/")[0].partition("-")
+    if found is not None and not (first == str(start) and last.isdigit() and (end is None or int(last) < end)):
+        raise WrongAnswerError("another range of the file")

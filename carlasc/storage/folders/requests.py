@@ -12,22 +12,30 @@ import os
 import random
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NoReturn
 
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError, StorageError, import_extra
-from carlasc.storage.folders.bodies import MOST_BYTES, WrongAnswerError, bounded_response, read_body
+from carlasc.storage.folders.bodies import MOST_BYTES, WrongAnswerError, bounded_response, check_range, read_body
+from carlasc.storage.folders.hub import HUB, get_from_hub, is_offline
 
-_EXTRAS = {"http": "aiohttp", "https": "aiohttp", "s3": "s3fs", "s3a": "s3fs"}  # packages of the extra `remote`
+_EXTRAS = {  # the package that a scheme needs, and the extra that installs it
+    "http": ("aiohttp", "remote"),
+    "https": ("aiohttp", "remote"),
+    "s3": ("s3fs", "remote"),
+    "s3a": ("s3fs", "remote"),
+    HUB: ("huggingface_hub", "hub"),
+}
 _S3, _HTTP = ("s3", "s3a"), ("http", "https")
 _RANDOM = random.SystemRandom()  # of its own: a failure must not change what a program draws, nor two forks wait alike
 _BUSY = frozenset({408, 409, 425, 429})  # of the statuses below 500, those of requests that may succeed later
 _BUSY_CODES = frozenset({"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"})
-_SENT_AGAIN = (  # names of errors of the connection, as aiohttp, botocore and requests have them
+_SENT_AGAIN = (  # names of errors of the connection, as aiohttp, botocore, requests and httpx have them
     "ConnectionError", "ClientConnectionError", "ClientPayloadError", "HTTPClientError", "ResponseParserError", "FlexibleChecksumError",
     "FSTimeoutError", "IncompleteRead", "IncompleteReadError", "HttpProcessingError", "ChunkedEncodingError",
-    "ResponseStreamingError", "TransferEncodingError",
+    "ResponseStreamingError", "TransferEncodingError", "TransportError",
 )  # fmt: skip
 
 
@@ -111,7 +119,7 @@ class Requests:
         self.settings = RemoteSettings.from_environment()
         self._opened: tuple[int, Any] | None = None
         if self.scheme in _EXTRAS:
-            import_extra(_EXTRAS[self.scheme], "remote")
+            import_extra(*_EXTRAS[self.scheme])
 
     @property
     def fs(self) -> Any:
@@ -170,8 +178,13 @@ class Requests:
 
     def _send_once(self, requests: Sequence[Request]) -> list[Any]:
         fs = self.fs
+        if (
+            self.scheme == HUB and len(requests) > 1
+        ):  # a file system that knows no asyncio, and may be used by several threads
+            with ThreadPoolExecutor(min(self.settings.requests, len(requests))) as threads:
+                return list(threads.map(partial(_plain_call, fs, self.settings), requests))
         if not fs.async_impl:
-            return [_plain_call(fs, request) for request in requests]
+            return [_plain_call(fs, self.settings, request) for request in requests]
         from fsspec.asyn import sync
 
         return sync(fs.loop, partial(_gather, fs, requests, self.settings, self.scheme))
@@ -198,10 +211,13 @@ async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings
     return await asyncio.gather(*map(one, requests), return_exceptions=True)
 
 
-def _plain_call(fs: Any, request: Request) -> Any:
-    name = "cat_file" if request.name == "get" else request.name
+def _plain_call(fs: Any, settings: RemoteSettings, request: Request) -> Any:
     try:
-        answer = getattr(fs, name)(*request.arguments(), **request.options)
+        if request.name == "get" and HUB in fs.protocol:
+            answer = get_from_hub(fs, str(request.url), settings.timeout_s, **request.options)
+        else:
+            name = "cat_file" if request.name == "get" else request.name
+            answer = getattr(fs, name)(*request.arguments(), **request.options)
         if request.check is not None:
             request.check(answer)
     except Exception as error:  # noqa: BLE001 (each file system raises its own types)
@@ -234,7 +250,7 @@ async def _get_s3(fs: Any, url: str, start: int | None, end: int | None) -> byte
     async with answer["Body"] as body:
         data = bytes(await body.read())
     if start is not None:
-        _check_range(answer.get("ContentRange"), start, end)
+        check_range(answer.get("ContentRange"), start, end)
     return data
 
 
@@ -253,19 +269,14 @@ async def _get_http(fs: Any, url: str, start: int | None, end: int | None, patie
         most = MOST_BYTES if start is None or end is None else end - start
         data = await read_body(answer.content, most, patience_s)
     if start is not None:
-        _check_range(answer.headers.get("Content-Range"), start, end)
+        check_range(answer.headers.get("Content-Range"), start, end)
     return data
-
-
-def _check_range(found: str | None, start: int, end: int | None) -> None:
-    """Compare the header Content-Range, "bytes 0-99/1000", with the range that was asked for; the file may end before it."""
-    first, _, last = (found or "").removeprefix("bytes ").partition("/")[0].partition("-")
-    if found is not None and not (first == str(start) and last.isdigit() and (end is None or int(last) < end)):
-        raise WrongAnswerError("another range of the file")
 
 
 def is_temporary(error: BaseException) -> bool:
     """Whether a request that failed with an error may succeed when it is sent again."""
+    if is_offline(error):
+        return False
     if _is_of_connection(error):
         return True
     status, code = _status_and_code(error)
@@ -351,6 +362,8 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
             problem=f"{verb}: no credentials were found",
             advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a public bucket",
         ) from None
+    if is_offline(error):
+        raise kind(where, problem=f"{verb}: HF_HUB_OFFLINE is set", advice="unset it to use the network") from None
     if is_temporary(error):
         raise kind(
             where,

@@ -37,6 +37,7 @@ _CHANGES = (
     "last_modified",
     "mtime",
     "created",
+    "blob_id",
 )
 
 
@@ -210,17 +211,22 @@ class RemoteTree(Tree):
                 found = []
             elif isinstance(found, Exception):
                 fail(self.where(folder), found)
-            listed, own = {}, self.where(folder).rpartition("/")[2]
+            listed, own = {}, self._own_name(folder)
             for entry in found:
                 name = str(entry["name"])
                 folder_like = entry["type"] == "directory" or name.endswith("/")
                 base = name.rstrip("/").rpartition("/")[2]
-                if base and base != own and "?" not in base:
+                if base and name.strip("/") != own and "?" not in base:
                     listed[base] = folder_like
                     if not folder_like and isinstance(entry.get("size"), int):
                         self._sizes[f"{folder}/{base}" if folder else base] = entry["size"]
             self._listed[folder] = listed
         return self._listed[folder]
+
+    def _own_name(self, folder: str) -> str:
+        """Return how listings name the folder itself: object stores list it among its files."""
+        place = f"{self._base}/{folder}" if folder else self._base
+        return (place if place.startswith("http") else self.requests.fs._strip_protocol(place)).strip("/")
 
     def refresh(self) -> None:
         """Forget listings: other processes may have written files since."""

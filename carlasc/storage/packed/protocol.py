@@ -57,6 +57,7 @@ class PackedSource(Source):
     Attributes:
         version: version of the store's format.
         nodes: the group (or folder) of each sequence in the store, by the sequence's path.
+        lossy_mm: step to which coordinates of points were rounded, millimetres; None if every bit was kept.
         newest: the newest version that this class reads.
     """
 
@@ -73,6 +74,8 @@ class PackedSource(Source):
         self.location = location
         self.nodes = _check_root(root, location, self.newest)
         self.version = (root or {}).get("version", VERSION)
+        lossy = (root or {}).get("lossy_mm")
+        self.lossy_mm = float(lossy) if isinstance(lossy, int | float) and lossy else None
 
     def published_bytes(self) -> dict[str, int]:
         """Return the bytes that the published files of each field have; empty where the store does not say it."""

@@ -26,6 +26,7 @@ from carlasc.storage.packed.tables.footers import check_footer
 from carlasc.storage.protocol import Sequence
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
+NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables, which older stores do not have
 FOOTERS = "footers"  # its key with the checksums of the footers of the tables, which older stores do not have
 FRAMES = "frames.parquet"  # one row per frame
 DOCUMENTS = "documents.parquet"  # one row per text file

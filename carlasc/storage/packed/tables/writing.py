@@ -34,7 +34,7 @@ from carlasc.storage.packed.protocol import (
 )
 from carlasc.storage.packed.tables.columns import statistics, table_field
 from carlasc.storage.packed.tables.footers import footer_checksums
-from carlasc.storage.packed.tables.reading import DOCUMENTS, FOOTERS, FRAMES, SEQUENCE
+from carlasc.storage.packed.tables.reading import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE
 
 _LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
 _PAGE = 8 << 20  # bytes: one page holds a scan's column
@@ -67,11 +67,11 @@ class ParquetSink(PackedSink):
             remove(self._part)
             write_atomic(self._part / UNFINISHED_MARK, run)
         remove_stale(self._part)
-        done = sorted(self._part.rglob(SEQUENCE))
+        done = {file: parse_json(file.read_bytes(), str(file)) for file in sorted(self._part.rglob(SEQUENCE))}
         self._sequences = {
-            parse_json(file.read_bytes(), str(file))["path"]: file.parent.relative_to(self._part).as_posix()
-            for file in done
+            about["path"]: file.parent.relative_to(self._part).as_posix() for file, about in done.items()
         }
+        self._next_number = 1 + max((about.get(NUMBER, -1) for about in done.values()), default=-1)
 
     def finished(self, path: str) -> bool:
         """Whether an earlier run that was interrupted has written this sequence whole."""
@@ -82,7 +82,8 @@ class ParquetSink(PackedSink):
         folder = node_of(path, self.location)
         self._sequences.pop(path, None)
         remove(self._part / folder)
-        return ParquetWriter(self._part, path, folder, self.options, self._sequences)
+        number, self._next_number = self._next_number, self._next_number + 1
+        return ParquetWriter(self._part, path, folder, number, self.options, self._sequences)
 
     def finish(self, *, incomplete: bool = False) -> None:
         """Mark the store as finished and give it its name."""
@@ -101,16 +102,19 @@ class ParquetSink(PackedSink):
 class ParquetWriter(PackedWriter):
     """Writes one sequence of a store of tables."""
 
-    def __init__(self, root: Path, path: str, folder: str, options: Options, finished: dict[str, str]) -> None:
+    def __init__(
+        self, root: Path, path: str, folder: str, number: int, options: Options, finished: dict[str, str]
+    ) -> None:
         super().__init__(str(root / folder), path)
         self._folder = root / folder
         self._name = folder
+        self._number = number
         self._options = options
         self._finished = finished
         self._statistics: dict[int, dict[str, Any]] = {}
 
     def _start_field(self, field: str) -> FieldWriter:
-        return _TableWriter(self._folder / f"{field}.parquet", field, self._options)
+        return _TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Append one frame as a row group.
@@ -128,7 +132,8 @@ class ParquetWriter(PackedWriter):
         self._write_frames()
         self._write_documents()
         sync_tree(self._folder)  # before the mark that says so
-        write_atomic(self._folder / SEQUENCE, to_json(self.about() | {FOOTERS: footer_checksums(self._folder)}))
+        about = {NUMBER: self._number, FOOTERS: footer_checksums(self._folder)}
+        write_atomic(self._folder / SEQUENCE, to_json(self.about() | about))
         self._finished[self.path] = self._name
 
     def _write_documents(self) -> None:
@@ -139,10 +144,14 @@ class ParquetWriter(PackedWriter):
         _write_table(pa.table(columns), self._folder / DOCUMENTS)
 
     def _write_frames(self) -> None:
-        """Write the table with one row per frame: pose, time, statistics."""
+        """Write the table with one row per frame: its sequence, pose, time, statistics."""
         pa = import_extra("pyarrow", "parquet")
         frames = sorted(self._statistics)
-        columns: dict[str, Any] = {"frame": pa.array(frames, pa.int64())}
+        columns: dict[str, Any] = {
+            "sequence": pa.array([self._number] * len(frames), pa.int32()),
+            "path": pa.array([self.path] * len(frames), pa.string()),
+            "frame": pa.array(frames, pa.int64()),
+        }
         for name, document, decode in (
             ("time_s", layout.TIMES, layout.decode_times),
             ("pose", layout.POSES, layout.decode_poses),
@@ -173,8 +182,9 @@ def _write_table(table: Any, path: Path) -> None:
 class _TableWriter(FieldWriter):
     """Writes one field's file, row group by row group."""
 
-    def __init__(self, path: Path, field: str, options: Options) -> None:
+    def __init__(self, path: Path, field: str, number: int, options: Options) -> None:
         super().__init__(field)
+        self._number = number
         self.kind = table_field(field)
         self.path = path
         self.scale_m = options.scale_m if field == "points" else None
@@ -190,7 +200,8 @@ class _TableWriter(FieldWriter):
         columns = self.kind.split(array, self.attributes)
         count = len(next(iter(columns.values())))
         if count:
-            arrays = [pa.array(np.full(count, frame, np.int64)), *map(pa.array, columns.values())]
+            place = (np.full(count, self._number, np.int32), np.full(count, frame, np.int64))
+            arrays = [*map(pa.array, place), *map(pa.array, columns.values())]
             self._writer.write_table(pa.table(arrays, schema=self._schema), row_group_size=count)
             self._file.check()
         self.rows.append(count)
@@ -205,14 +216,15 @@ class _TableWriter(FieldWriter):
         } | self.kind.describe(array, self.scale_m)
         types, is_picture = self.kind.columns(self.attributes), self.entry.kind == "picture"
         self._schema = pa.schema(
-            [("frame", pa.int64())] + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
+            [("sequence", pa.int32()), ("frame", pa.int64())]
+            + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
         split = {name: "BYTE_STREAM_SPLIT" for name in types if name in self.kind.split_bytes}
         self._file = PatientFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
             self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
-            use_dictionary=[name for name in ("frame", *types) if name not in split and not is_picture], column_encoding=split or None,
-            data_page_size=_PAGE, dictionary_pagesize_limit=_PAGE, write_page_checksum=True, write_statistics=["frame"],
+            use_dictionary=[name for name in ("sequence", "frame", *types) if name not in split and not is_picture], column_encoding=split or None,
+            data_page_size=_PAGE, dictionary_pagesize_limit=_PAGE, write_page_checksum=True, write_statistics=["sequence", "frame"],
         )  # fmt: skip
 
     def close(self) -> None:

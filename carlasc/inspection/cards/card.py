@@ -1,0 +1,223 @@
+"""Writing the card of a data set: README.md, croissant.json and pictures."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
+from carlasc.inspection.cards.croissant import WRITER, croissant
+from carlasc.inspection.cards.facts import Details, Facts, gather
+from carlasc.inspection.cards.licenses import license_given
+from carlasc.inspection.cards.places import place_of
+from carlasc.inspection.cards.readme import readme
+from carlasc.inspection.cards.tables import tables_of
+from carlasc.storage import as_source
+from carlasc.storage.files import parse_json, write_output
+from carlasc.storage.packed.tables.reading import ParquetSource
+from carlasc.storage.protocol import Source
+
+README, CROISSANT, PICTURES = "README.md", "croissant.json", "images"
+_SIZE = (960, 540)  # of a picture, pixels
+
+
+@dataclass(frozen=True)
+class CardResult:
+    """What was written.
+
+    Attributes:
+        folder: the folder of the card.
+        files: the files, README.md first.
+        frames: number of frames of the data set.
+        sequences: number of its sequences.
+        licenses: names of the licences that hold, the strictest first.
+        notes: what the card lacks, and why.
+        failures: (file, message) of what could not be read.
+    """
+
+    folder: Path
+    files: tuple[Path, ...]
+    frames: int
+    sequences: int
+    licenses: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    failures: tuple[tuple[str, str], ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        return {
+            "folder": str(self.folder),
+            "files": [str(path) for path in self.files],
+            "frames": self.frames,
+            "sequences": self.sequences,
+            "licenses": list(self.licenses),
+            "notes": list(self.notes),
+            "failures": [list(failure) for failure in self.failures],
+        }
+
+
+def card(
+    source: str | os.PathLike[str] | Source,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    description: str | None = None,
+    authors: Sequence[str] = (),
+    license: str | None = None,
+    citation: str | None = None,
+    url: str | None = None,
+    contact: str | None = None,
+    version: str = "1.0.0",
+    published: str | None = None,
+    pictures: bool = True,
+    every: int = 1,
+    workers: int | None = 1,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> CardResult:
+    """Write the card of a data set: README.md with the YAML that the Hugging Face Hub reads, croissant.json, and pictures.
+
+    Counts, classes, splits, sensors, licences, sources, settings and limits are read from the data. What the data cannot say is given here.
+
+    Args:
+        source: a path or URL that `carlasc.open` knows, or a Source at such a place.
+        out: folder of the card, the root of what is published. None: the data themselves, if they are a folder or a Parquet store;
+            otherwise the folder that they are in.
+        name: name of the data set; None takes that of the source.
+        description: what it is, in a sentence or two; None makes one from the data.
+        authors: names of the people or groups that publish it.
+        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the address of its text. The licence of data that were
+            converted holds for what was made from them, whatever is given here.
+        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is named in any case.
+        url: address of the page where the data are published, such as "https://huggingface.co/datasets/ORG/NAME".
+        contact: whom to ask.
+        version: version of the data.
+        published: date of the publication, YYYY-MM-DD; None takes today.
+        pictures: whether a grid and a scan are drawn, which needs the extra `render`.
+        every: count the classes of every N-th frame.
+        workers: processes that count side by side; None for one per core.
+        overwrite: whether an existing card is replaced.
+        progress: called with (frames counted, frames in total).
+
+    Returns:
+        What was written. Frames that could not be read are listed in `failures`.
+
+    Raises:
+        MissingDataError: there is no data set, or it has no sequences.
+        ArgumentError: a licence, a version or a date is not one; no licence is known; or the licence contradicts that of the source.
+        FormatError: the data do not have the format, or the licence in carlasc.json is not known.
+        CarlascError: the licence of the source forbids passing on what is made from it.
+        ConflictError: a card exists, and `overwrite` is not given.
+        StorageError: the folder cannot be written to.
+    """
+    stated = None if license is None else license_given(license)
+    day = published or datetime.datetime.now(datetime.UTC).date().isoformat()
+    _check(version, day, url)
+    opened = as_source(source)
+    place, folder = place_of(opened if isinstance(source, Source) else source, None if out is None else Path(out), url)
+    overwrite = _check_free(folder, overwrite, pictures)
+    facts = gather(opened, stated, every, workers, progress)
+    tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
+    details = Details(name or place.title, description, tuple(authors), version, day, url, contact, citation)
+    told = description or _describe(facts)
+    write_output(folder / CROISSANT, croissant(facts, details, place, tables, told))
+    drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
+    shown = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
+    write_output(folder / README, readme(facts, details, place, tables, told, shown))
+    return CardResult(
+        folder,
+        (folder / README, folder / CROISSANT, *(path for path, _ in drawn)),
+        facts.frames,
+        len(facts.overview.sequences),
+        tuple(one.name for one in facts.licenses),
+        tuple(notes),
+        tuple(facts.failures),
+    )
+
+
+def _check(version: str, day: str, url: str | None) -> None:
+    if not re.fullmatch(r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", version):
+        raise ArgumentError("version", expected="a version such as 1.0.0", found=repr(version))
+    try:
+        datetime.date.fromisoformat(day)
+    except ValueError:
+        raise ArgumentError("published", expected="a date YYYY-MM-DD", found=repr(day)) from None
+    if url is not None and not re.fullmatch(r"https?://[^\s\"'<>]+", url):
+        raise ArgumentError("url", expected="an address that begins with https://", found=repr(url))
+
+
+def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
+    """Check that no card exists, before anything is counted; return whether files may be replaced.
+
+    croissant.json is the first file of a card and README.md the last: what lies beside the one without the other is what a killed run left.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ArgumentError("out", expected="a folder", found=f"the file {folder}")
+    if overwrite or (not (folder / README).exists() and _is_ours(folder / CROISSANT)):
+        return True
+    drawn = [folder / PICTURES / f"{what}.png" for what in ("grid", "scan")] if pictures else []
+    for path in (folder / README, folder / CROISSANT, *drawn):
+        if path.exists():
+            raise ConflictError(
+                path, problem="exists already", advice="choose another folder, or replace it with `overwrite=True`"
+            )
+    return False
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is a croissant.json that carlasc wrote."""
+    try:
+        writer = parse_json(path.read_bytes(), str(path)).get("sdPublisher")
+    except (OSError, FormatError):
+        return False
+    return isinstance(writer, dict) and writer.get("name") == WRITER
+
+
+def _describe(facts: Facts) -> str:
+    """Return what the data set is, in two sentences."""
+    grids = ", ".join(f"{grid.name} ({' x '.join(map(str, grid.size))})" for grid, _, _ in facts.grids[:3])
+    what = f"with voxel grids of complete semantic scenes: {grids}" if grids else "without voxel grids"
+    made = " and ".join(
+        text
+        for text, holds in (
+            ("recorded in a simulator", facts.simulated),
+            (f"converted from {', '.join(facts.sources)}", bool(facts.sources)),
+        )
+        if holds
+    )
+    return f"{facts.frames:,} LiDAR frames in {facts.sequences_told}, {what}. The data were {made}, and are in the layout of CarlaSC."
+
+
+def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:
+    """Draw a grid and a scan; return (file, what it shows) of each picture, and notes on those that could not be drawn."""
+    from carlasc.viewing import Scene, render
+
+    drawn, notes = [], []
+    with_content = {
+        "grid": [path for path, one in facts.sequences.items() if one.grids],
+        "scan": [path for path, one in facts.sequences.items() if "points" in one.fields()],
+    }
+    for what, paths in with_content.items():
+        if not paths:
+            continue
+        path = paths[0]
+        sequence = facts.sequences[path]
+        target = folder / PICTURES / f"{what}.png"
+        try:
+            field = "points" if what == "scan" else next(f"{grid}/labels" for grid in sequence.grids)
+            frames = sequence.frames(field)
+            frame = int(frames[len(frames) // 2])
+            scene = Scene(
+                sequence, frames=(frame, frame + 1), grid=None if what == "scan" else next(iter(sequence.grids))
+            )
+            result = render(scene, target, what=what, size=_SIZE, overwrite=overwrite)
+        except (DependencyError, MissingDataError) as error:
+            notes.append(f"no picture of a {what}: {error}")
+            continue
+        drawn.append((result.out, f"Frame {frame} of {path or sequence.name}: {what}"))
+    return drawn, notes

@@ -1,0 +1,211 @@
+"""Licences of data: what they are called, what they permit, and which of them hold for the sequences of a data set."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from carlasc.errors import ArgumentError, CarlascError, FormatError
+from carlasc.storage import layout
+from carlasc.storage.protocol import Sequence
+
+_OTHER = "other"  # what the Hugging Face Hub calls a licence that it has no name for
+
+
+@dataclass(frozen=True)
+class License:
+    """One licence.
+
+    Attributes:
+        name: its usual name, such as "CC BY-NC-SA 4.0".
+        url: the address of its text.
+        hub: its name at the Hugging Face Hub; "other" for one that the Hub does not know.
+        derivatives: whether what is made from the data may be passed on; None if that is not known.
+        commercial: whether commercial use is permitted; None if that is not known.
+        share_alike: whether what is made from the data must have the same licence; None if that is not known.
+    """
+
+    name: str
+    url: str
+    hub: str
+    derivatives: bool | None = True
+    commercial: bool | None = True
+    share_alike: bool | None = False
+
+    @property
+    def conditions(self) -> str:
+        """What it demands, in words."""
+        if self.derivatives is None:
+            return "read its text"
+        demands = [
+            text
+            for text, holds in (
+                ("name the authors", self.name.startswith(("CC BY", "ODC-BY"))),
+                ("non-commercial use only", not self.commercial),
+                ("the same licence for what is made from the data", self.share_alike),
+                ("no passing on of what is made from the data", not self.derivatives),
+            )
+            if holds
+        ]
+        return ", ".join(demands) or "any use"
+
+    @property
+    def strictness(self) -> tuple[bool, bool, bool]:
+        """A key by which stricter licences sort last."""
+        return self.derivatives is not True, self.commercial is not True, self.share_alike is not False
+
+
+def _creative_commons() -> Iterable[License]:
+    """Yield the licences of Creative Commons with all versions that exist; the Hub has names for some."""
+    on_hub = {
+        "by": ("2.0", "2.5", "3.0", "4.0"),
+        "by-sa": ("3.0", "4.0"),
+        "by-nc": ("2.0", "3.0", "4.0"),
+        "by-nd": ("4.0",),
+        "by-nc-nd": ("3.0", "4.0"),
+        "by-nc-sa": ("2.0", "3.0", "4.0"),
+    }
+    for kind, known in on_hub.items():
+        for version in ("1.0", "2.0", "2.5", "3.0", "4.0"):
+            yield License(
+                f"CC {kind.upper()} {version}",
+                f"https://creativecommons.org/licenses/{kind}/{version}/",
+                f"cc-{kind}-{version}" if version in known else _OTHER,
+                derivatives="nd" not in kind,
+                commercial="nc" not in kind,
+                share_alike="sa" in kind,
+            )
+
+
+_LICENSES = {
+    re.sub(r"[^a-z0-9.]+", "-", one.name.lower()): one
+    for one in (
+        *_creative_commons(),
+        License("CC0 1.0", "https://creativecommons.org/publicdomain/zero/1.0/", "cc0-1.0"),
+        License("PDDL 1.0", "https://opendatacommons.org/licenses/pddl/1-0/", "pddl"),
+        License("ODC-BY 1.0", "https://opendatacommons.org/licenses/by/1-0/", "odc-by"),
+        License("ODbL 1.0", "https://opendatacommons.org/licenses/odbl/1-0/", "odbl", share_alike=True),
+        License("CDLA-Permissive 2.0", "https://cdla.dev/permissive-2-0/", "cdla-permissive-2.0"),
+        License("CDLA-Sharing 1.0", "https://cdla.dev/sharing-1-0/", "cdla-sharing-1.0", share_alike=True),
+        License("MIT", "https://opensource.org/license/mit", "mit"),
+        License("Apache 2.0", "https://www.apache.org/licenses/LICENSE-2.0", "apache-2.0"),
+        License("BSD 3-Clause", "https://opensource.org/license/bsd-3-clause", "bsd-3-clause"),
+    )
+}
+_SHORT = {"pddl": "pddl-1.0", "odc-by": "odc-by-1.0", "odbl": "odbl-1.0", "cc0": "cc0-1.0", "cc-zero-1.0": "cc0-1.0"}
+
+
+def find_license(text: str) -> License | None:
+    """Return the licence of a name such as "CC BY 4.0" or "cc-by-4.0", or of the address of a licence's text; None for another text."""
+    stripped = text.strip()
+    if re.fullmatch(r"https?://[^\s\"'<>]+", stripped):
+        if deed := re.match(r"https?://(?:www\.)?creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b", stripped):
+            return _LICENSES.get(f"cc-{deed[1]}-{deed[2]}")  # also where /deed.en, /legalcode or a country follows
+        address = re.sub(r"^https?://(www\.)?", "", stripped).rstrip("/")
+        known = (one for one in _LICENSES.values() if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address)
+        return next(known, License(stripped, stripped, _OTHER, None, None, None))
+    key = re.sub(r"\blicen[cs]e\b|\bv(?=\d)", "", stripped.lower().replace("creative commons", "cc"))
+    key = re.sub(r"[^a-z0-9.]+", "-", key).strip("-")
+    return _LICENSES.get(_SHORT.get(key, key))
+
+
+def license_given(text: str) -> License:
+    """Return the licence that the author of a card names.
+
+    Raises:
+        ArgumentError: no licence has this name.
+    """
+    found = find_license(text)
+    if found is None:
+        near = difflib.get_close_matches(text.lower(), [one.hub for one in _LICENSES.values()], 3, 0.5)
+        raise ArgumentError(
+            "license",
+            expected=f"the name of a licence, such as {', '.join(near or ['cc-by-4.0', 'cc-by-nc-sa-4.0', 'mit'])}",
+            found=repr(text),
+            advice="for another licence, give the address of its text (https://...)",
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class LicensedPart:
+    """The sequences of a data set that come from one source under one licence.
+
+    Attributes:
+        source: what they were converted from, as carlasc.json says; None for sequences that were converted from nothing.
+        license: the licence that holds for them.
+        stated: whether the author of the card named the licence, because the data do not.
+        paths: the sequences.
+    """
+
+    source: str | None
+    license: License
+    stated: bool
+    paths: tuple[str, ...]
+
+
+def licensed_parts(sequences: Iterable[Sequence], given: License | None, location: str) -> tuple[LicensedPart, ...]:
+    """Return the licences of a data set, the strictest first.
+
+    The licence of the data that a sequence was converted from holds for the sequence. `given` holds for those that name none.
+
+    Args:
+        sequences: the sequences.
+        given: the licence that the author of the card names; None for none.
+        location: the data set, for errors.
+
+    Raises:
+        FormatError: the text in carlasc.json is no licence that is known.
+        ArgumentError: sequences without a licence, and none is given; or one is given, and all sequences have another.
+        CarlascError: a licence forbids passing on what is made from the data.
+    """
+    found: dict[tuple[str | None, License | None], list[str]] = {}
+    for sequence in sequences:
+        license_, source = _license_of(sequence), sequence.metadata.source
+        if license_ is not None and license_.derivatives is False:
+            raise CarlascError(
+                sequence.location,
+                expected="a licence under which what is made from the data may be passed on",
+                found=f"{license_.name} of {source or 'its source'}, which forbids that",
+                advice="publish how you made the data instead: others can convert their own copy",
+            )
+        found.setdefault((source, license_), []).append(sequence.path)
+    known = {license_ for _, license_ in found if license_ is not None}
+    without = sorted({source or "" for source, license_ in found if license_ is None})
+    if without and given is None:
+        of = " and ".join(source for source in without if source)
+        raise ArgumentError(
+            "license",
+            expected=f"the licence of {of}" if of else "the licence under which you publish these data",
+            found=f"none, neither given nor in {layout.METADATA} of {location}",
+            advice="name it with `license`, such as cc-by-4.0",
+        )
+    if given is not None and not without and given not in known:
+        raise ArgumentError(
+            "license",
+            expected=f"{', '.join(sorted(one.name for one in known))}, which holds for what is made from the source of the data",
+            found=given.name,
+        )
+    parts = []
+    for (source, license_), paths in found.items():
+        holds = given if license_ is None else license_
+        assert holds is not None  # checked above
+        parts.append(LicensedPart(source, holds, license_ is None, tuple(paths)))
+    return tuple(sorted(parts, key=lambda part: (part.license.strictness, part.source or ""), reverse=True))
+
+
+def _license_of(sequence: Sequence) -> License | None:
+    text = sequence.metadata.extra.get("license")
+    if text is None:
+        return None
+    found = find_license(text) if isinstance(text, str) else None
+    if found is None:
+        raise FormatError(
+            f"{sequence.location}/{layout.METADATA}",
+            expected="the name of a licence, or the address of its text, in license",
+            found=repr(text),
+            advice="look it up, and write it as CC BY-NC-SA 4.0 or as https://...",
+        )
+    return found
