@@ -44,6 +44,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.groundtruth import FromScans as FromScans
     from carlasc.groundtruth import Voting as Voting
     from carlasc.groundtruth import regrid as regrid
+    from carlasc.inspection import doctor as doctor
     from carlasc.inspection import info as info
     from carlasc.inspection import report as report
     from carlasc.inspection import stats as stats
@@ -126,6 +127,7 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
     ),
     "metrics": ("evaluate", "scores"),
     "inspection": (
+        "doctor",
         "info",
         "report",
         "stats",

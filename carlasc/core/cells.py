@@ -17,8 +17,11 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from carlasc import first_use
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
+
+first_use.connect()
 
 Real = Any  # float32 or float64: compiled code keeps them apart, NumPy's stubs do not
 Triple = tuple[float, float, float]

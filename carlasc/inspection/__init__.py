@@ -1,4 +1,4 @@
-"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`)."""
+"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`); and what is installed (`doctor`)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from carlasc.inspection.findings import Finding, ValidationResult
     from carlasc.inspection.heldout import HoldoutResult, holdout
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
+    from carlasc.inspection.installation import Installation, doctor
     from carlasc.inspection.overview import Overview, info
     from carlasc.inspection.report_page import write_report_page
     from carlasc.inspection.reports import ReportResult, report
@@ -22,6 +23,7 @@ else:
             "findings": ("Finding", "ValidationResult"),
             "heldout": ("HoldoutResult", "holdout"),
             "heldout_scores": ("HeldOutScores", "RayShares"),
+            "installation": ("Installation", "doctor"),
             "overview": ("Overview", "info"),
             "report_page": ("write_report_page",),
             "reports": ("ReportResult", "report"),
@@ -34,11 +36,13 @@ __all__ = [
     "Finding",
     "HeldOutScores",
     "HoldoutResult",
+    "Installation",
     "Overview",
     "RayShares",
     "ReportResult",
     "Statistics",
     "ValidationResult",
+    "doctor",
     "holdout",
     "info",
     "report",
