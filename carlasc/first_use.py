@@ -1,6 +1,6 @@
-"""Who is told that Numba compiles: on the first use in an environment, loops are compiled for seconds before anything is computed.
+"""Who is told that Numba compiles: on the first use on a machine, loops are compiled for seconds before anything is computed.
 
-Importing this module loads nothing heavy, so that a program can ask before it knows whether anything will be compiled. `carlasc.core.cells`,
+Importing this module loads nothing heavy, so that a program can ask before it knows whether anything will be compiled. `carlasc.core.compiling`,
 from which compiled loops take their decorators, connects what was asked for with Numba.
 """
 

@@ -49,7 +49,6 @@ from carlasc.first_use import note_compiling
 note_compiling(lambda: print("told"), after_s=float(sys.argv[1]))
 assert "numba" not in sys.modules
 import numpy as np
-import carlasc.core.cells
 from carlasc.metrics.counting import count_arrays
 labels = np.zeros(9, np.uint8)
 count_arrays(labels, labels, None, 3)

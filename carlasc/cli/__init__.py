@@ -152,5 +152,5 @@ def _root(
 def main() -> None:
     """Run the command line: the entry point `carlasc`."""
     if sys.stderr is not None and sys.stderr.isatty():  # as progress: logs and programs that read stderr are not told
-        note_compiling(lambda: echo("compiling (once per environment) ...", err=True))
+        note_compiling(lambda: echo("compiling (once per machine) ...", err=True))
     app()

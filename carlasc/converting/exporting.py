@@ -24,7 +24,7 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageE
 from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
 from carlasc.running.processes import count_workers, one_pool, run_all
-from carlasc.storage.durability import rename, sync_tree
+from carlasc.storage.durability import make_folder, rename, sync_tree
 from carlasc.storage.files import has_content, remove_stale, write_many
 
 
@@ -284,7 +284,7 @@ def _export_file(
     jobs = [_Job(exporter, sequence, frame, folder) for frame in exported.frames]
     failures = []
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         part.unlink(missing_ok=True)  # of a run that was killed
         with closing(run(_make_frame, jobs)) as results, exporter.open(part, sequence) as file:
             for frame, made in zip(exported.frames, results, strict=True):

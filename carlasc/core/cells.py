@@ -10,29 +10,18 @@ See the format page, `docs/format.md#cells`.
 from __future__ import annotations
 
 import math
-import zlib
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
-from carlasc import first_use
+from carlasc.core.compiling import fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
-
-first_use.connect()
 
 Real = Any  # float32 or float64: compiled code keeps them apart, NumPy's stubs do not
 Triple = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """The upper 3 x 4 of a transform, row-major, as scalars."""
-
-jit = numba.njit(nogil=True, error_model="numpy")
-inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
-# Where margins cover the rounding, a product and a sum may become one operation.
-fused = numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})
-cached = numba.njit(nogil=True, error_model="numpy", cache=True)  # what Python calls; the rest is compiled into it
 
 
 class Cells(NamedTuple):
@@ -129,12 +118,3 @@ def fast_azimuth(x: float, y: float) -> float:
     angle = math.pi / 2 - angle if steep else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
-
-
-def fingerprint(*files: str | Path) -> int:
-    """Return a number that changes with this file or one of the others.
-
-    Numba's cache of a function notices changes of that function's own file only. A cached function that closes over this number is
-    compiled again when a file changes whose functions are compiled into it.
-    """
-    return zlib.crc32(b"".join(Path(file).read_bytes() for file in (__file__, *files)))

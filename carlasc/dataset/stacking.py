@@ -15,7 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import AZIMUTH_ERROR, Cells, cached, fast_azimuth, find_voxel, fingerprint
+from carlasc.core.cells import AZIMUTH_ERROR, Cells, fast_azimuth, find_voxel
+from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
 _BLOCK = 128  # points at once: their columns and cells take 6 KB of the first-level cache, and half a page of the file
@@ -193,38 +194,29 @@ def _bin_block(x, y, z, radius, azimuth, found, count, rows, cells, geometry, ra
     _mark(found, count, grid)
 
 
-def _compile(sources: int):  # type: ignore[no-untyped-def]
-    """Return the two functions below. Their closure over `sources` invalidates the cache of Numba when the cell rule changes."""
-
-    @cached
-    def bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
-        _ = sources
-        x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-        radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
-        found = np.empty(_BLOCK, np.int32)
-        for start in range(0, len(words), 2 * _BLOCK):
-            block = words[start : start + 2 * _BLOCK]
-            _split_columns(block, x, y, z)
-            _bin_block(x, y, z, radius, azimuth, found, len(block) // 2, rows, cells, geometry, ranges, grid)
-
-    @cached
-    def bin_planes(xs, ys, zs, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
-        _ = sources
-        x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-        radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
-        found = np.empty(_BLOCK, np.int32)
-        for start in range(0, len(xs), _BLOCK):
-            xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
-            _copy_columns(xb, yb, zb, x, y, z)
-            _bin_block(x, y, z, radius, azimuth, found, len(xb), rows, cells, geometry, ranges, grid)
-
-    return bin_rows, bin_planes
+@cached
+def _bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    found = np.empty(_BLOCK, np.int32)
+    for start in range(0, len(words), 2 * _BLOCK):
+        block = words[start : start + 2 * _BLOCK]
+        _split_columns(block, x, y, z)
+        _bin_block(x, y, z, radius, azimuth, found, len(block) // 2, rows, cells, geometry, ranges, grid)
 
 
-_bin_rows, _bin_planes = _compile(fingerprint(__file__))
+@cached
+def _bin_planes(xs, ys, zs, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    found = np.empty(_BLOCK, np.int32)
+    for start in range(0, len(xs), _BLOCK):
+        xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
+        _copy_columns(xb, yb, zb, x, y, z)
+        _bin_block(x, y, z, radius, azimuth, found, len(xb), rows, cells, geometry, ranges, grid)
 
 
-@numba.njit(nogil=True, cache=True)
+@cached(error_model="python")
 def _look_up(labels, table, found):  # type: ignore[no-untyped-def]
     size = len(table)
     complete = True

@@ -354,7 +354,7 @@ def _look_at_compiled_code() -> CompiledCode:
     """
     import numba
 
-    from carlasc.core.cells import cached
+    from carlasc.core.compiling import cached
 
     loop: Any = cached(_next)
     start = time.perf_counter()

@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Triple, cached
+from carlasc.core.cells import Triple
+from carlasc.core.compiling import cached
 from carlasc.core.grids import Grid
 
 KNOWN, RIGHT, OCCUPIED = 0, 1, 2

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, transform_points
 
 _FITS = ((2.0, 8), (1.0, 16))  # from a coarse fit to a fine one: the size of cells in metres, and the most iterations
@@ -115,7 +115,7 @@ class _Cells:
         return flat_cells(points, self.cell_m, self.lower, self.size)
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def flat_cells(
     points: NDArray[np.float64], cell_m: float, lower: NDArray[np.float64], size: NDArray[np.int64]
 ) -> NDArray[np.int64]:
@@ -136,7 +136,7 @@ def flat_cells(
     return flat
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def add_squares(
     points: NDArray[np.float64], row: NDArray[np.int64], means: NDArray[np.float64], squares: NDArray[np.float64]
 ) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform
 from carlasc.inspection.structure import MAX_RANGE_M
 
@@ -33,7 +33,7 @@ def overlap(occupied: NDArray[np.bool_], motion: Transform, points: NDArray[np.f
     return count_occupied(occupied, motion, points, MAX_RANGE_M, VOXEL_M) / len(points)
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def occupy(occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: float, voxel_m: float) -> None:
     """Mark the cells of a grid that hold points; the arguments are those of `count_occupied`."""
     cells = len(occupied)
@@ -44,7 +44,7 @@ def occupy(occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: fl
             occupied[int(a), int(b), int(c)] = True
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def count_occupied(
     occupied: NDArray[np.bool_],
     motion: NDArray[np.float64],

@@ -6,11 +6,11 @@ the poses of a sensor that does not move. Points on moving objects, and points s
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
+from carlasc.core.compiling import cached
 from carlasc.errors import CarlascError
 from carlasc.storage.protocol import Sequence
 
@@ -49,7 +49,7 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     return points[np.flatnonzero(keep)].astype(np.float64)
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDArray[np.bool_]:
     """Return (N,) which of (N, 3) points have a distance from the sensor between two others. Points that are not finite have none."""
     found = np.empty(len(points), np.bool_)

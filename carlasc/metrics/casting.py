@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 
@@ -104,7 +104,7 @@ def follow_rays(
     return first, passed
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached
 def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[no-untyped-def]
     """Walk every ray from voxel to voxel, in units of voxels; the parameter t is 0 at the origin and 1 at the point."""
     step, cell, last = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
@@ -147,7 +147,7 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
                 break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached
 def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-def]
     """Walk every ray from voxel to voxel (Amanatides and Woo), in units of voxels; the distance along the ray is in metres."""
     num_grids = len(found)
@@ -209,7 +209,7 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
                 voxel += step
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@jit
 def _entry(start, step, size):  # type: ignore[no-untyped-def]
     """Return the distance at which a ray from outside enters the grid, -1 if it does not enter the grid."""
     near, far = 0.0, np.inf

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.errors import FormatError
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def _in_range(labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int
     return np.where(counted, labels, 0)
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def _count_pairs(
     prediction: NDArray[Any], truth: NDArray[Any], counted: NDArray[np.bool_], num_classes: int
 ) -> NDArray[np.int64]:

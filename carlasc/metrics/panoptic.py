@@ -6,10 +6,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.counting import to_numpy
 
@@ -223,7 +223,7 @@ def match_segments(
     return Segments(pred_keys >> 32, pred_size, true_keys >> 32, true_size, overlaps[same])
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
     """Number the segments of both sides in the order in which they occur, and count elements and overlaps, in one pass.
 

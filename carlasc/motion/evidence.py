@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import as_pose, cached
+from carlasc.core.cells import as_pose
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, thin, transform_points, translation
 from carlasc.core.scans import runs_of_origins
 from carlasc.errors import FormatError

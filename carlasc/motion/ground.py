@@ -12,7 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import cached, fast_azimuth, fingerprint
+from carlasc.core.cells import fast_azimuth
+from carlasc.core.compiling import cached
 
 _SECTORS, _RINGS, _RING_M = 120, 160, 0.5
 _BLIND_M = 1.0  # nearer points are on the vehicle
@@ -75,7 +76,6 @@ def ground_height(points: NDArray[np.floating]) -> float:
 @cached
 def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
     """Return (N,) the sector and the ring of each point, and (S, R) the lowest point of each cell, -1 where there is none."""
-    _ = _CODE
     lowest = np.full((_SECTORS, _RINGS), -1, np.int64)
     sector, ring = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
     for i in range(len(points)):
@@ -119,7 +119,6 @@ def _ground(
     lowest: NDArray[np.int64],
     plane: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    _ = _CODE
     heights = np.empty((_SECTORS, _RINGS))  # above the plane
     least = np.empty(_RINGS)
     for s in range(_SECTORS):
@@ -165,6 +164,3 @@ def _follow(lowest: NDArray[np.float64], heights: NDArray[np.float64]) -> None:
         slope = (at - heights[before]) / _TREND_M if before >= 0 else 0.0
     for k in range(last + 1, _RINGS):
         heights[k] = at
-
-
-_CODE = fingerprint(__file__)

@@ -7,10 +7,10 @@ if they were computed anew.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, thin
 
 _CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most so many
@@ -81,7 +81,7 @@ def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors[:, :, 0] * np.sqrt(flat)[:, None]
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return (N,) which of (N, 3) cells are different from those before them."""
     size = 2
@@ -103,7 +103,7 @@ def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     return first
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def extend_sums(model: NDArray[np.float64], known: int, radius: float, sums: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Add new points to the sums of the points within a radius of each point.
 
@@ -136,7 +136,7 @@ def extend_sums(model: NDArray[np.float64], known: int, radius: float, sums: NDA
     return changed
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def nearest_within(
     points: NDArray[np.float64],
     pose: NDArray[np.float64],

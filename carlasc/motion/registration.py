@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes
 from carlasc.motion.smoothing import smooth_at
@@ -114,7 +114,7 @@ def _register(
     return state
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def lay(
     points: NDArray[np.float64],
     place: NDArray[np.float64],
@@ -208,7 +208,7 @@ def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
     return int(np.argmax(counts * np.clip(np.array(across) / _SIDE_M**2, 1e-6, 1.0) * amid))
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def nearest_points(
     points: NDArray[np.float64], model: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Pose, cached, fast_azimuth, fingerprint, inlined, transform
+from carlasc.core.cells import Pose, fast_azimuth, transform
+from carlasc.core.compiling import cached, inlined
 
 _COLUMNS = 1024
 _PER_RAD = _COLUMNS / (2 * math.pi)
@@ -58,7 +59,6 @@ class View:
 
 @cached
 def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    _ = _CODE
     n = len(points)
     column, slope, distance = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
@@ -98,7 +98,6 @@ def look_up(
         free: (M,) gets the bit where the place of the point was free.
         hit: (M,) gets the bit where it was occupied.
     """
-    _ = _CODE
     flag = np.uint32(1) << np.uint32(bit)
     for i in range(len(points)):
         x, y, z = transform(pose, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
@@ -158,6 +157,3 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
     if near <= below_range <= beyond and near <= above_range <= beyond:
         return HIT
     return 0
-
-
-_CODE = fingerprint(__file__)

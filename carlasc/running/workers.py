@@ -1,4 +1,4 @@
-"""What a worker of a cluster does before its first task: it compares versions, limits threads, and lets one worker of a host compile."""
+"""What a worker of a cluster does before its first task: it compares versions and limits threads."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import hashlib
 import os
 import pickle
 import platform
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, fields
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
@@ -109,8 +107,7 @@ def run_task(session: Session, call: bytes) -> Any:
             problem=f"it cannot load the work: {error}",
             advice="install the same packages on all workers",
         ) from error
-    with _compiling(session, function, item):
-        return function(item)
+    return function(item)
 
 
 @cache
@@ -127,32 +124,3 @@ def _name() -> str:
     from distributed import get_worker
 
     return str(get_worker().address)
-
-
-_compiled: set[tuple[str, str]] = set()
-
-
-@contextmanager
-def _compiling(session: Session, function: Callable[[Any], Any], item: Any) -> Iterator[None]:
-    """Let the first task of a kind run alone on its host: what it compiles is cached, and the other workers load it."""
-    import fcntl
-
-    called = function.func if isinstance(function, partial) else function
-    name = f"{called.__module__}.{getattr(called, '__qualname__', type(called).__qualname__)}.{type(item).__qualname__}"
-    if (session.name, name) in _compiled:
-        yield
-        return
-    folder = Path(tempfile.gettempdir()) / f"carlasc-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    digest = hashlib.sha256(name.encode()).hexdigest()[:16]
-    with (folder / f"{digest}.lock").open("a+") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # it is free again when this process ends, however it ends
-        file.seek(0)
-        if file.read() == session.name:
-            fcntl.flock(file, fcntl.LOCK_UN)
-            yield
-        else:
-            yield
-            file.truncate(0)
-            file.write(session.name)
-    _compiled.add((session.name, name))

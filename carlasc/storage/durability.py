@@ -76,6 +76,13 @@ def rename(old: Path, new: Path) -> None:
     sync_all([new.parent])
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, if it exists, and wait until its name is gone from the disk, where the file would mean something to the next run."""
+    if path.exists():
+        path.unlink(missing_ok=True)
+        sync_all([path.parent])
+
+
 def make_folder(folder: Path) -> None:
     """Create a folder, and those above it, unless they exist, and wait until the names of the new ones are on the disk."""
     if folder.is_dir():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carlasc.core.cells import AZIMUTH_ERROR, Cells, as_pose, fast_azimuth, find_voxel, fingerprint, transform
+from carlasc.core.cells import AZIMUTH_ERROR, Cells, as_pose, fast_azimuth, find_voxel, transform
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 
@@ -58,11 +58,3 @@ def test_the_fast_azimuth_is_within_its_error():
 def test_a_pose_as_scalars_moves_points_as_the_matrix_does():
     pose = translation((1, 2, 3)) @ rotation_z(0.3)
     assert transform(as_pose(pose), 4.0, 5.0, 6.0) == pytest.approx(transform_points(pose, np.array([4.0, 5.0, 6.0])))
-
-
-def test_the_fingerprint_changes_with_the_files(tmp_path):
-    file = tmp_path / "a.py"
-    file.write_text("1")
-    first = fingerprint(file)
-    file.write_text("2")
-    assert fingerprint(file) != first != fingerprint()

@@ -26,7 +26,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import carlasc
+from carlasc.core.compiling import cache_folder
 from carlasc.errors import CarlascError
 from faults.commands import MESSAGES, TEMPORARY, start, wait
 from faults.outcome import Outcome
@@ -153,7 +153,7 @@ def restrict(work: Path, noted: Path, environment: dict[str, str]) -> None:
         str(work / MESSAGES),
         os.devnull,
     )
-    cache = os.environ.get("NUMBA_CACHE_DIR", str(Path(carlasc.__file__).parent))
+    cache = os.path.realpath(cache_folder().parent)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event == "open":

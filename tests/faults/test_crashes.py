@@ -27,6 +27,14 @@ def test_after_a_power_failure_files_are_whole_or_absent_and_the_next_run_finish
 
 @needs_compiler
 @pytest.mark.slow
+def test_a_power_failure_at_any_call_of_a_download_loses_nothing(tmp_path: Path) -> None:
+    outcome = crashes.run(0, 0, tmp_path, ["download", "download-extract"])
+    assert outcome.found == []
+    assert outcome.tried > 200
+
+
+@needs_compiler
+@pytest.mark.slow
 def test_after_a_power_failure_of_any_command_the_next_run_finishes(tmp_path: Path) -> None:
     outcome = crashes.run(200, 0, tmp_path)
     assert outcome.found == []

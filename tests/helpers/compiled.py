@@ -1,8 +1,8 @@
 """A compiled function, whose cache the tests look at."""
 
-import numba
+from carlasc.core.compiling import cached
 
 
-@numba.njit(cache=True)
+@cached
 def add_one(number: int) -> int:
     return number + 1

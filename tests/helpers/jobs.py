@@ -95,13 +95,6 @@ def write_own_number(path: Path) -> int:
     return int(path.name)
 
 
-def take_time(_: object) -> tuple[float, float]:
-    """Return when a task began and ended, in seconds of a clock that all processes share."""
-    begin = time.monotonic()
-    time.sleep(0.3)
-    return begin, time.monotonic()
-
-
 def compile_something(_: object) -> tuple[int, int]:
     """Return this process, and how often it compiled a function that it did not find in the cache."""
     from helpers.compiled import add_one

@@ -52,6 +52,15 @@ def test_several_files_are_synced_before_any_gets_its_name(tmp_path: Path, synce
     assert [(tmp_path / name).read_bytes() for name in ("a", "x/b", "c")] == [b"1", b"2", b"3"]
 
 
+@needs_proc
+def test_a_file_that_is_removed_stays_removed(tmp_path: Path, synced: list[str]) -> None:
+    (tmp_path / "mark.json").write_bytes(b"{}")
+    durability.remove_file(tmp_path / "mark.json")
+    durability.remove_file(tmp_path / "never.json")
+    assert not list(tmp_path.iterdir())
+    assert synced == [tmp_path.name]
+
+
 def test_nothing_is_synced_where_it_is_turned_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synced: list[str]
 ) -> None:

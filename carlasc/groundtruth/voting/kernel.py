@@ -8,13 +8,13 @@ per voxel.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Cells, Pose, cached, fingerprint, inlined, jit, transform
+from carlasc.core.cells import Cells, Pose, transform
+from carlasc.core.compiling import cached, inlined, jit
 from carlasc.groundtruth.voting.observations import NOWHERE
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
@@ -220,59 +220,49 @@ def vote_free_by_rule(
         step += 1.0
 
 
-def _compile_vote(sources: int):  # type: ignore[no-untyped-def]
-    """Return the function below. Its closure over `sources` invalidates Numba's cache, which knows only this file, when others change."""
+@cached
+def vote(
+    points: NDArray[np.float32],
+    labels: NDArray[np.uint16],
+    hit_labels: NDArray[np.uint16],
+    pose: Pose,
+    view: View,
+    cells: Cells,
+    free_step_m: float,
+    voter: int,
+    hit_region: int,
+    free_region: int,
+    tally: Tally,
+) -> None:
+    """Add the votes of one observation.
 
-    @cached
-    def vote(
-        points: NDArray[np.float32],
-        labels: NDArray[np.uint16],
-        hit_labels: NDArray[np.uint16],
-        pose: Pose,
-        view: View,
-        cells: Cells,
-        free_step_m: float,
-        voter: int,
-        hit_region: int,
-        free_region: int,
-        tally: Tally,
-    ) -> None:
-        """Add the votes of one observation.
-
-        Args:
-            points: (3 N,) float32, metres, x, y, z of each point in the sensor's frame.
-            labels: (N,) uint16; points labelled 0 and their rays do not vote.
-            hit_labels: (N,) uint16, the classes that the points vote for; 0 where only the ray votes.
-            pose: grid_T_sensor.
-            view: the grid as seen from the sensor.
-            cells: the cells of the grid.
-            free_step_m: distance between two free samples, metres.
-            voter: number of the observation.
-            hit_region: region in which points vote, or ANYWHERE.
-            free_region: region in which rays vote, ANYWHERE, or NOWHERE.
-            tally: the votes so far, with room for N more candidates.
-        """
-        _ = sources
-        rays, hits = empty_rays(BLOCK), np.empty(BLOCK, np.int32)
-        for begin in range(0, len(labels), BLOCK):
-            block = labels[begin : begin + BLOCK]
-            corner = points[3 * begin : 3 * (begin + len(block))]
-            clip(corner, block, free_step_m, view, rays)
-            place_points(rays, view, hits)
-            own = hit_labels[begin : begin + BLOCK]
-            vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
-            if free_region != NOWHERE:
-                vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
-        if tally.once:
-            if free_region != ANYWHERE:
-                for v in range(len(tally.passed)):
-                    tally.passed[v] &= np.uint8(tally.regions[v] == free_region)
+    Args:
+        points: (3 N,) float32, metres, x, y, z of each point in the sensor's frame.
+        labels: (N,) uint16; points labelled 0 and their rays do not vote.
+        hit_labels: (N,) uint16, the classes that the points vote for; 0 where only the ray votes.
+        pose: grid_T_sensor.
+        view: the grid as seen from the sensor.
+        cells: the cells of the grid.
+        free_step_m: distance between two free samples, metres.
+        voter: number of the observation.
+        hit_region: region in which points vote, or ANYWHERE.
+        free_region: region in which rays vote, ANYWHERE, or NOWHERE.
+        tally: the votes so far, with room for N more candidates.
+    """
+    rays, hits = empty_rays(BLOCK), np.empty(BLOCK, np.int32)
+    for begin in range(0, len(labels), BLOCK):
+        block = labels[begin : begin + BLOCK]
+        corner = points[3 * begin : 3 * (begin + len(block))]
+        clip(corner, block, free_step_m, view, rays)
+        place_points(rays, view, hits)
+        own = hit_labels[begin : begin + BLOCK]
+        vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
+        if free_region != NOWHERE:
+            vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
+    if tally.once:
+        if free_region != ANYWHERE:
             for v in range(len(tally.passed)):
-                tally.free[v] += tally.passed[v]
-                tally.passed[v] = 0
-
-    return vote
-
-
-_SOURCES = ("observations.py", "rule.py", "rays.py", "kernel.py")
-vote = _compile_vote(fingerprint(*(Path(__file__).parent / name for name in _SOURCES)))
+                tally.passed[v] &= np.uint8(tally.regions[v] == free_region)
+        for v in range(len(tally.passed)):
+            tally.free[v] += tally.passed[v]
+            tally.passed[v] = 0

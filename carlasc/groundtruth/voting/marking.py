@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Cells, Pose, as_pose, cached, find_voxel, fingerprint, transform
+from carlasc.core.cells import Cells, Pose, as_pose, find_voxel, transform
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 
@@ -28,19 +27,10 @@ def mark(
     return marked
 
 
-def _compile_mark(sources: int):  # type: ignore[no-untyped-def]
-    """Return the function below, which is compiled again when the rule of `carlasc.core.cells` changes: see `fingerprint`."""
-
-    @cached
-    def mark_voxels(points: NDArray[np.float64], pose: Pose, cells: Cells, marked: NDArray[np.bool_]) -> None:
-        _ = sources
-        for i in range(len(points)):
-            x, y, z = transform(pose, points[i, 0], points[i, 1], points[i, 2])
-            voxel = find_voxel(x, y, z, cells)
-            if voxel < len(marked):
-                marked[voxel] = True
-
-    return mark_voxels
-
-
-_mark = _compile_mark(fingerprint(Path(__file__)))
+@cached
+def _mark(points: NDArray[np.float64], pose: Pose, cells: Cells, marked: NDArray[np.bool_]) -> None:
+    for i in range(len(points)):
+        x, y, z = transform(pose, points[i, 0], points[i, 1], points[i, 2])
+        voxel = find_voxel(x, y, z, cells)
+        if voxel < len(marked):
+            marked[voxel] = True

@@ -14,18 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import (
-    AZIMUTH_ERROR,
-    Cells,
-    Pose,
-    Real,
-    Triple,
-    fast_azimuth,
-    fused,
-    inlined,
-    jit,
-    transform,
-)
+from carlasc.core.cells import AZIMUTH_ERROR, Cells, Pose, Real, Triple, fast_azimuth, transform
+from carlasc.core.compiling import fused, inlined, jit
 from carlasc.groundtruth.voting.rule import before_sensor, unit_ray
 
 DOUBTFUL = -1  # index of a sample that is too near an edge of its cell

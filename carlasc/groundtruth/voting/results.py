@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import cached
+from carlasc.core.compiling import cached
 from carlasc.groundtruth.voting.kernel import NONE
 
 

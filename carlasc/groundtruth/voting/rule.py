@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from carlasc.core.cells import Cells, Pose, Real, find_voxel, inlined, jit, transform
+from carlasc.core.cells import Cells, Pose, Real, find_voxel, transform
+from carlasc.core.compiling import inlined, jit
 
 
 @inlined

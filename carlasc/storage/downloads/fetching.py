@@ -14,6 +14,7 @@ from carlasc.storage.downloads.archives import SEQUENCES, Archive, choose_archiv
 from carlasc.storage.downloads.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.downloads.http import RemoteFile
 from carlasc.storage.downloads.transfer import TransferSettings, discard_record, find_file, remaining_bytes, transfer
+from carlasc.storage.durability import make_folder, remove_file
 from carlasc.storage.files import parse_json, remove_stale, write_json, writing
 
 Progress = Callable[[int, int], None]
@@ -96,7 +97,7 @@ def download(
     archives = choose_archives([split] if isinstance(split, str) else split, what)
     folder = Path(out)
     with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
     pending = [archive for archive in archives if done.get(archive) is None]
@@ -154,7 +155,7 @@ def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, pro
     if not keep:  # record that it was extracted: the next run would fetch it again
         write_json(_record(folder, archive), {"size": path.stat().st_size, "files": files})
         with writing(path):
-            path.unlink()
+            remove_file(path)
     kept = str(path) if keep else None
     return Downloaded(result.name, kept, result.size, result.fetched, str(target), files)
 
@@ -163,7 +164,7 @@ def _remove_left(path: Path, size: int | None) -> None:
     """Remove a zip that was extracted, if the run that did so was ended before it could."""
     if path.is_file() and path.stat().st_size == size:
         with writing(path):
-            path.unlink()
+            remove_file(path)
 
 
 def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:

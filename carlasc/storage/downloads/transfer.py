@@ -25,7 +25,7 @@ from carlasc.storage.downloads.http import (
     read_range,
     read_whole,
 )
-from carlasc.storage.durability import rename, sync_file
+from carlasc.storage.durability import remove_file, rename, sync_file
 from carlasc.storage.files import parse_json, storage_error, write_json, writing
 
 _T = TypeVar("_T")
@@ -276,7 +276,7 @@ def discard_record(path: Path) -> None:
         StorageError: it cannot be removed.
     """
     with writing(_record(path)):
-        _record(path).unlink(missing_ok=True)
+        remove_file(_record(path))
 
 
 def _check_zip(file: BinaryIO, path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
-from carlasc.storage.durability import rename
+from carlasc.storage.durability import make_folder, rename
 from carlasc.storage.files import storage_error
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
@@ -105,7 +105,7 @@ class PatientFile(io.RawIOBase):
         self._position = self._size = 0
         self._error: OSError | None = None
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
             raise storage_error(place, error) from error

@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import ArgumentError
 from carlasc.storage.metadata import Axes
@@ -227,7 +227,7 @@ def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[floa
     return float(max(*distances, _NEAREST_M - z.min())), (float(shifts[0]), float(shifts[1]))
 
 
-@numba.njit(cache=True)
+@cached(error_model="python")
 def _rays(position, axes, step, flat, width, height, first, last):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     origins = np.empty(((last - first) * width, 3), np.float32)
     directions = np.empty(((last - first) * width, 3), np.float32)

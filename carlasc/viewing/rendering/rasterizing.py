@@ -7,10 +7,10 @@ share an edge compute the same number for it with opposite signs, so no sample f
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached, jit
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
@@ -44,7 +44,7 @@ def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -
     return seen
 
 
-@numba.njit(cache=True, error_model="numpy")
+@cached
 def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Fill the triangles of quads. `nearness` is 1 / depth for a pinhole camera, -depth for an orthographic one: both are linear."""
     height, width = seen.shape
@@ -91,13 +91,13 @@ def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyp
                         nearness[row, column], seen[row, column] = near, 2 * quad + half
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _point(corner):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return a corner as a tuple: assigning arrays to arrays would take seconds to compile."""
     return corner[0], corner[1], corner[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _bounds(points, flat):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return left, right, top and bottom of the part of a triangle before the camera; left > right where there is none."""
     left, right, top, bottom = np.inf, -np.inf, -np.inf, np.inf
@@ -116,12 +116,12 @@ def _bounds(points, flat):  # type: ignore[no-untyped-def]  # pragma: no cover (
     return left, right, top, bottom
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@cached
 def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return where rays hit given triangles: the weights u and v of the second and third corner, and the depth; float32.
 
@@ -165,28 +165,28 @@ def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def
     return u, v, depth
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _plus(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _minus(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _fused(a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return a b + c, rounded once."""
     return np.float32(np.float64(a) * np.float64(b) + np.float64(c))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _dot(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return _fused(a[0], b[0], _fused(a[1], b[1], a[2] * b[2]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@jit
 def _cross32(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return (
         _fused(a[1], b[2], -(a[2] * b[1])),

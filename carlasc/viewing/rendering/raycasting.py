@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.errors import import_extra
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.rendering.cameras import Camera
@@ -146,7 +146,7 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
     return np.where(mesh.open_sky, np.float32(1), visible / _SKY_RAYS)
 
 
-@numba.njit(cache=True)
+@cached(error_model="python")
 def _shadow_rays(normals, triangle, origins, directions, depth, suns, which):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Return starts and directions of the rays towards the sun from the points that face it, and the samples that they belong to."""
     count = 0
@@ -169,7 +169,7 @@ def _shadow_rays(normals, triangle, origins, directions, depth, suns, which):  #
     return starts, towards, facing[:count]
 
 
-@numba.njit(cache=True, fastmath=True)
+@cached(fastmath=True, error_model="python")
 def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     extents,
     normals,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.raycasting import Frame
 
@@ -43,7 +43,7 @@ def splat(
     _darken_behind(frame.colors, frame.depth, drawn)
 
 
-@numba.njit(cache=True)
+@cached(error_model="python")
 def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     height, width = out_depth.shape
     for i in range(len(columns)):
@@ -61,7 +61,7 @@ def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  #
                 drawn[y, x] = True
 
 
-@numba.njit(cache=True)
+@cached(error_model="python")
 def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Eye-dome lighting: the farther a point is behind its neighbours in the picture, the darker it is."""
     height, width = depth.shape

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
 _BITS = 32  # voxels of a column that one integer stands for
@@ -103,7 +104,7 @@ def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
     return _Heights(ends, stages.astype(np.int32), below, np.uint32(bits[up].sum()), np.uint32(bits[~up].sum()))
 
 
-@numba.njit(cache=True, nogil=True)
+@cached(error_model="python")
 def _occlude(columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, occluded: NDArray[np.bool_]) -> None:
     """Walk from every column to the sensor.
 

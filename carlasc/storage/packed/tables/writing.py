@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.durability import sync_tree
+from carlasc.storage.durability import remove_file, sync_tree
 from carlasc.storage.files import parse_json, remove_stale, to_json, write_atomic
 from carlasc.storage.packed.output import (
     TABLES_MARK,
@@ -94,7 +94,7 @@ class ParquetSink(PackedSink):
             "lossy_mm": self.options.lossy_mm,
         }
         write_atomic(self._part / TABLES_MARK, to_json(root))
-        (self._part / UNFINISHED_MARK).unlink()
+        remove_file(self._part / UNFINISHED_MARK)
         put_in_place(self._part, self.path, self.overwrite)
 
 
