@@ -7,6 +7,7 @@ import dataclasses
 import datetime
 import json
 import os
+import platform
 import subprocess
 import sys
 import tempfile
@@ -141,7 +142,7 @@ def _describe_run(size: str) -> dict[str, Any]:
         "target": found.processor.target,
         "cores": found.processor.usable,
         "load": round(os.getloadavg()[0], 2),
-        "system": found.system,
+        "system": f"{platform.system()} {platform.machine()}",
         "python": found.python.split()[0],
         "versions": {"carlasc": found.version}
         | {package.name: package.version for package in found.packages if package.name in ("numpy", "numba")},
