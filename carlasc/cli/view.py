@@ -28,7 +28,11 @@ def view(
     out: Annotated[
         Path | None,
         file_option(
-            "-o", "--out", text="Write a self-contained .html page for any browser, instead of opening a window."
+            "-o",
+            "--out",
+            "--to",
+            text="Write a file instead of opening a window: a self-contained .html page for any browser, an .rrd recording for Rerun, or an .mcap"
+            " recording for Foxglove.",
         ),
     ] = None,
     frames: FramesOption = None,
@@ -46,13 +50,20 @@ def view(
     thin_m: Annotated[
         float, typer.Option("--thin", help="Thin the points of a page to one per cell of this side length, metres.")
     ] = 0.2,
+    full_points: Annotated[
+        bool,
+        typer.Option(
+            "--full-points",
+            help="Keep all points in a recording, and say first how large it becomes. Default: 30,000 a frame.",
+        ),
+    ] = False,
     overwrite: OverwriteOption = False,
     as_json: Json = False,
 ) -> None:
-    """Show a sequence in a window (Open3D), or write it as a page that any browser opens without a network (--out).
+    """Show a sequence in a window (Open3D), or write it as a page for any browser or as a recording for Rerun or Foxglove (--out).
 
-    Both can be rotated and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes.
-    Without --frames, a window shows all frames and a page shows the first 60.
+    All can be rotated and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes.
+    Without --frames, a window shows all frames and a file shows the first 60.
     """
     from carlasc import viewing
 
@@ -73,12 +84,21 @@ def view(
             raise ArgumentError("--json", problem="a window has no figures to print", advice="write a page with `out`")
         viewing.view(scene, report=echo)
         return
-    with progress_bar("Writing the page") as progress:
-        result = viewing.view(scene, out, thin_m=thin_m, overwrite=overwrite, progress=progress)
+    with progress_bar("Writing the file") as progress:
+        result = viewing.view(
+            scene,
+            out,
+            thin_m=thin_m,
+            full_points=full_points,
+            overwrite=overwrite,
+            progress=progress,
+            report=None if as_json else echo,
+        )
     if as_json:
         print_json(result)
         return
     for note in result.notes:
         echo(note)
     size = f"{result.size_bytes / 1e6:.1f} MB"
-    echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: open it in a browser")
+    opened = {".rrd": "with `rerun`", ".mcap": "in Foxglove"}.get(out.suffix.lower(), "in a browser")
+    echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: open it {opened}")

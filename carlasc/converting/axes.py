@@ -5,13 +5,15 @@ Mirroring is its own inverse, so each function serves both directions.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
-from carlasc.core.grids import GridSpec
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.scans import Scan
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
@@ -35,12 +37,29 @@ def mirror_boxes(boxes: Boxes) -> Boxes:
 
 
 def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
-    """Mirror a Cartesian (X, Y, Z) grid."""
+    """Mirror an (X, Y, Z) grid: y of a Cartesian one, the azimuth of a cylindrical one."""
     mirrored: NDArray[Any] = grid[:, ::-1]
     return mirrored
 
 
 def mirror_spec(spec: GridSpec) -> GridSpec:
-    """Return the geometry of a mirrored Cartesian grid: the bounds of y change places and signs."""
+    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, change places and signs."""
     (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
     return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
+
+
+def mirror_voxels(grid: Grid) -> Grid:
+    """Mirror a grid with its geometry."""
+    counts = None if grid.counts is None else mirror_grid(grid.counts)
+    return Grid(mirror_spec(grid.spec), mirror_grid(grid.labels), counts)
+
+
+def mirror_scan(scan: Scan) -> Scan:
+    """Mirror the points of a scan, their flow, the places where their rays began, and the boxes."""
+    return replace(
+        scan,
+        points=mirror_points(scan.points),
+        flow=None if scan.flow is None else mirror_points(scan.flow),
+        others={name: mirror_points(v) if name == "origins" else v for name, v in scan.others.items()},
+        boxes=None if scan.boxes is None else mirror_boxes(scan.boxes),
+    )

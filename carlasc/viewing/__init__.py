@@ -1,4 +1,4 @@
-"""Looking at sequences: pictures and films, a page for any browser, a window on the desktop."""
+"""Looking at sequences: pictures and films, a page for any browser, recordings for other viewers, a window on the desktop."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from carlasc.loading import late_names
 if TYPE_CHECKING:
     from carlasc.viewing.colors import ClassColors, Entry, colorblind_palette
     from carlasc.viewing.page.page import PageResult
+    from carlasc.viewing.recordings.run import RecordingResult
     from carlasc.viewing.rendering.cameras import Viewpoint
     from carlasc.viewing.rendering.drawings import Drawing, error_drawing, flow_drawing, grid_drawing, scan_drawing
     from carlasc.viewing.rendering.pictures import Panel, draw_panels, render_comparison, render_grid, render_scan
@@ -22,6 +23,7 @@ else:
         {
             "colors": ("ClassColors", "Entry", "colorblind_palette"),
             "page.page": ("PageResult",),
+            "recordings.run": ("RecordingResult",),
             "rendering.cameras": ("Viewpoint",),
             "rendering.drawings": ("Drawing", "error_drawing", "flow_drawing", "grid_drawing", "scan_drawing"),
             "rendering.pictures": ("Panel", "draw_panels", "render_comparison", "render_grid", "render_scan"),
@@ -40,6 +42,7 @@ __all__ = [
     "GridPanel",
     "PageResult",
     "Panel",
+    "RecordingResult",
     "RenderResult",
     "Scene",
     "SceneReader",

@@ -45,6 +45,7 @@ STATIC = (188, 191, 196)
 ARROW = (20, 20, 24)
 EGO, GLASS = (250, 250, 250), (120, 132, 148)
 UNLABELLED = (150, 150, 150)
+PATH = (70, 110, 170)
 
 _GROUPS: dict[int, Color] = {  # by id in the paper's eleven classes
     0: (255, 255, 255),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -64,10 +65,25 @@ class RemappedSequence:
             FormatError: the scan does not have the format, or a label is not in its class table.
         """
         scan = without_invalid_points(self.sequence.scan(frame))
+        if scan.boxes is not None:
+            scan = replace(scan, boxes=self._remap_boxes(scan.boxes, frame))
         if scan.labels is None:
             return scan
         where = f"{self.sequence.location}: labels, frame {frame}"
         return replace(scan, labels=self._remap(scan.labels, self.scan_table, where))
+
+    def read_boxes(self, frame: int) -> Boxes | None:
+        """Read the tracked boxes of a frame, in the table that is shown; None where it was not annotated.
+
+        Raises:
+            FormatError: the boxes do not have the format, or a label is not in its class table.
+        """
+        boxes = self.sequence.boxes(frame)
+        return None if boxes is None else self._remap_boxes(boxes, frame)
+
+    def _remap_boxes(self, boxes: Boxes, frame: int) -> Boxes:
+        where = f"{self.sequence.location}: boxes, frame {frame}"
+        return replace(boxes, labels=self._remap(boxes.labels, self.scan_table, where))
 
     def _remap(
         self, labels: NDArray[np.unsignedinteger], stored: ClassTable, where: str

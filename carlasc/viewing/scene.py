@@ -1,6 +1,6 @@
-"""What to look at: frames of a sequence with a grid, its ground truth and its points, all in one class table.
+"""What to look at: frames of a sequence with a grid, its ground truth, points, boxes and pose, all in one class table.
 
-Pictures, pages and windows, and whatever else shows data, take a `Scene` and read it through a `SceneReader`.
+Pictures, pages, recordings and windows, and whatever else shows data, take a `Scene` and read it through a `SceneReader`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.converting.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
+from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.core.tables import TABLES, remaps_between
+from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.comparison import check_same_geometry, compare_grids
-from carlasc.storage import Sequence, layout
+from carlasc.storage import layout
+from carlasc.storage.metadata import Axes
+from carlasc.viewing.choosing import choose_grid, common_table, describe_frames, frames_with, list_fields, table_of
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
 from carlasc.viewing.finding import FoundSequence, SceneSource, find_sequence, find_truth
 from carlasc.viewing.remapping import RemappedSequence
@@ -86,17 +91,17 @@ class Scene:
         found = find_sequence(self.source, self.sequence)
         truth = None if self.truth is None else find_truth(self.truth, found.sequence)
         contents = self._default_contents(found) if what is None else self._check_contents(what)
-        grid = _choose_grid(found, self.grid) if {"grid", "errors"} & set(contents) else ""
-        data = RemappedSequence(found.sequence, grid, stored=_table_of(self.source_classes))
+        grid = choose_grid(found, self.grid) if {"grid", "errors"} & set(contents) else ""
+        data = RemappedSequence(found.sequence, grid, stored=table_of(self.source_classes))
         reference = None
         if truth is not None:
-            reference = RemappedSequence(truth.sequence, _choose_grid(truth, self.truth_grid))
+            reference = RemappedSequence(truth.sequence, choose_grid(truth, self.truth_grid))
             if "errors" in contents:
                 check_same_geometry(data.spec, reference.spec)
-        table = _common_table(data, reference, _table_of(self.classes))
+        table = common_table(data, reference, table_of(self.classes))
         data = replace(data, shown=table)
         reference = None if reference is None else replace(reference, shown=table)
-        frames = self._choose_frames(found, _frames_with(data, reference, contents))
+        frames = self._choose_frames(found, frames_with(data, reference, contents))
         notes = () if found.note is None else (found.note,)
         return SceneReader(data, reference, contents, frames, self.palette, notes)
 
@@ -107,7 +112,7 @@ class Scene:
             return ("grid",) if self.truth is None else ("grid", "truth", "errors")
         if "points" in found.sequence.fields():
             return ("scan",)
-        raise MissingDataError(found.sequence.location, expected="a grid or points", found=_list_fields(found.sequence))
+        raise MissingDataError(found.sequence.location, expected="a grid or points", found=list_fields(found.sequence))
 
     def _check_contents(self, what: str | Iterable[str]) -> tuple[str, ...]:
         contents = tuple(what.split(",") if isinstance(what, str) else what)
@@ -129,7 +134,7 @@ class Scene:
             raise MissingDataError(
                 found.sequence.location,
                 expected=f"frames {frames}",
-                found=_describe_frames(available),
+                found=describe_frames(available),
                 advice="choose others with `frames`",
             )
         return tuple(int(frame) for frame in chosen)
@@ -148,11 +153,13 @@ class GridPanel:
         title: "prediction", "truth", "errors"; or the size of the grid if there is only one.
         spec: geometry.
         colors: colours of its labels.
+        name: "prediction", "truth", "errors"; or "grid" if there is only one.
     """
 
     title: str
     spec: GridSpec
     colors: ClassColors
+    name: str = "grid"
 
 
 @dataclass(frozen=True)
@@ -163,11 +170,15 @@ class FrameContent:
         grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.Outcome`).
         scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
         time_s: seconds since the first frame, or None if the sequence has no times.
+        boxes: tracked boxes, sensor frame; None where the frame was not annotated.
+        pose: (4, 4) first_T_sensor, or None if the sequence has no poses.
     """
 
     grids: tuple[Grid, ...]
     scan: Scan | None
     time_s: float | None
+    boxes: Boxes | None = None
+    pose: Transform | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +192,7 @@ class SceneReader:
         frames: the frame numbers.
         palette: "class", "colorblind" or "height".
         notes: what was chosen where the scene left a choice, one sentence each.
+        mirrored: whether y is mirrored: what `right_handed` returns for left-handed data.
     """
 
     data: RemappedSequence
@@ -189,6 +201,7 @@ class SceneReader:
     frames: tuple[int, ...]
     palette: PaletteName = "class"
     notes: tuple[str, ...] = ()
+    mirrored: bool = False
 
     @property
     def name(self) -> str:
@@ -203,9 +216,22 @@ class SceneReader:
         return self.data.sequence.path or self.data.sequence.location
 
     @property
+    def axes(self) -> Axes:
+        """The handedness of everything that is read: "left" where y points to the right of the vehicle."""
+        return "right" if self.mirrored else self.data.sequence.metadata.axes
+
+    @property
     def left_handed(self) -> bool:
         """Whether y points to the right of the vehicle."""
-        return self.data.sequence.metadata.axes == "left"
+        return self.axes == "left"
+
+    def right_handed(self) -> SceneReader:
+        """Return a reader of the same frames in right-handed axes, for programs that know no others: y points to the left."""
+        return replace(self, mirrored=True) if self.left_handed else self
+
+    def has(self, field: str) -> bool:
+        """Whether some frame of the sequence has a field, such as "points" or "flow" (see `carlasc.storage.layout`)."""
+        return field in self.data.sequence.fields()
 
     @property
     def table(self) -> ClassTable:
@@ -222,13 +248,13 @@ class SceneReader:
         """The grids that are shown side by side; empty if only points are shown."""
         if not self.data.grid:
             return ()
-        spec = self.data.spec
+        spec = mirror_spec(self.data.spec) if self.mirrored else self.data.spec
         if self.truth is None:
             return (GridPanel(str(spec), spec, self.colors),)
         return (
-            GridPanel("prediction", spec, self.colors),
-            GridPanel("truth", spec, self.colors),
-            GridPanel("errors", spec, ClassColors(ERRORS)),
+            GridPanel("prediction", spec, self.colors, "prediction"),
+            GridPanel("truth", spec, self.colors, "truth"),
+            GridPanel("errors", spec, ClassColors(ERRORS), "errors"),
         )
 
     def read(self, frame: int) -> FrameContent:
@@ -237,8 +263,20 @@ class SceneReader:
         Raises:
             FormatError: the data do not have the format.
         """
-        scan = self.data.read_scan(frame) if frame in self.data.sequence.frames("points") else None
-        return FrameContent(self._read_grids(frame), scan, self.read_time(frame))
+        scan = self.read_scan(frame)
+        boxes = self._read_boxes(frame) if scan is None else scan.boxes
+        return FrameContent(self._read_grids(frame), scan, self.read_time(frame), boxes, self.read_pose(frame))
+
+    def read_scan(self, frame: int) -> Scan | None:
+        """Read the points of a frame with all of their fields, without those that are not finite; None if it has no points.
+
+        Raises:
+            FormatError: the data do not have the format.
+        """
+        if frame not in self.data.sequence.frames("points"):
+            return None
+        scan = self.data.read_scan(frame)
+        return mirror_scan(scan) if self.mirrored else scan
 
     def read_time(self, frame: int) -> float | None:
         """Return the seconds since the first frame, or None if the sequence has no times."""
@@ -247,80 +285,44 @@ class SceneReader:
         except MissingDataError:
             return None
 
+    def read_pose(self, frame: int) -> Transform | None:
+        """Return (4, 4) first_T_sensor of a frame, or None if the sequence has no poses.
+
+        Raises:
+            FormatError: the frame has no line in the file of poses, or its line is no rigid transform.
+        """
+        sequence = self.data.sequence
+        try:
+            pose = check_rigid(sequence.read_pose(frame), f"{sequence.location}/{layout.POSES}: frame {frame}")
+        except MissingDataError:
+            return None
+        return mirror_poses(pose) if self.mirrored else pose
+
+    def path_of_ego(self) -> NDArray[np.float64]:
+        """Return the (F, 3) positions of the sensor in all frames, metres in the frame of the first scan; none without poses."""
+        poses = [pose for pose in map(self.read_pose, self.frames) if pose is not None]
+        return np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
+
+    def read_picture(self, frame: int) -> bytes | None:
+        """Return the bird's-eye camera picture of a frame as its JPEG bytes, or None if it has none.
+
+        Raises:
+            FormatError: the data do not have the format.
+        """
+        if frame not in self.data.sequence.frames("bev"):
+            return None
+        return self.data.sequence.read("bev", frame).tobytes()
+
+    def _read_boxes(self, frame: int) -> Boxes | None:
+        boxes = self.data.read_boxes(frame)
+        return mirror_boxes(boxes) if self.mirrored and boxes is not None else boxes
+
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:
         if not self.data.grid:
             return ()
         grid = self.data.read_grid(frame)
-        if self.truth is None:
-            return (grid,)
-        truth = self.truth.read_grid(frame)
-        return grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
-
-
-def _table_of(classes: ClassTable | str | None) -> ClassTable | None:
-    return TABLES[classes] if isinstance(classes, str) else classes
-
-
-def _choose_grid(found: FoundSequence, name: str | None) -> str:
-    """Return the grid that is asked for, the one that the path names, `evaluation`, or the first."""
-    names = list(found.sequence.grids)
-    wanted = name or found.grid
-    if wanted is None:
-        wanted = layout.EVALUATION if layout.EVALUATION in names else next(iter(names), layout.EVALUATION)
-    if wanted not in names:
-        raise MissingDataError(
-            found.sequence.location, expected=f"the grid {wanted}", found=", ".join(names) or "no grid"
-        )
-    return wanted
-
-
-def _common_table(data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None) -> ClassTable:
-    """Return the class table that all labels are shown in: the wanted one, the data's, or the truth's."""
-    stored = [data.stored_table] + ([] if truth is None else [truth.stored_table])
-    candidates = stored if wanted is None else [wanted]
-    for table in candidates[:-1]:
-        try:
-            _check_remaps(stored, table)
-        except ArgumentError:
-            continue
-        return table
-    _check_remaps(stored, candidates[-1])
-    return candidates[-1]
-
-
-def _check_remaps(stored: Iterable[ClassTable], target: ClassTable) -> None:
-    """Raise ArgumentError if labels of one of the tables cannot be shown in the target."""
-    for table in stored:
-        remaps_between(table, target)
-
-
-def _frames_with(
-    data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]
-) -> NDArray[np.int64]:
-    """Return the frames that have everything that is shown."""
-    own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
-    needed = [(data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))]
-    if truth is not None and {"truth", "errors"} & set(contents):
-        needed.append((truth.sequence, f"{truth.grid}/labels"))
-    frames: NDArray[np.int64] | None = None
-    for sequence, name in needed:
-        available = sequence.frames(name)
-        if not len(available):
-            raise MissingDataError(sequence.location, expected=f"the field {name}", found=_list_fields(sequence))
-        common = available if frames is None else np.intersect1d(frames, available)
-        if frames is not None and not len(common):
-            raise MissingDataError(
-                sequence.location,
-                expected=f"{name} of frames {_describe_frames(frames)}",
-                found=f"frames {_describe_frames(available)}",
-            )
-        frames = common
-    return np.empty(0, np.int64) if frames is None else frames
-
-
-def _list_fields(sequence: Sequence) -> str:
-    return ", ".join(sorted(sequence.fields())) or "nothing"
-
-
-def _describe_frames(frames: NDArray[np.int64]) -> str:
-    return f"{frames[0]} to {frames[-1]} ({len(frames)} frames)"
+        grids: tuple[Grid, ...] = (grid,)
+        if self.truth is not None:
+            truth = self.truth.read_grid(frame)
+            grids = grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
+        return tuple(map(mirror_voxels, grids)) if self.mirrored else grids

@@ -1,4 +1,4 @@
-"""`view`: a scene in a page for any browser, or in a window."""
+"""`view`: a scene in a page for any browser, in a recording for another viewer, or in a window."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import overload
 from carlasc.errors import ArgumentError
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.page import PageResult, write_page
+from carlasc.viewing.recordings.run import RECORDINGS, RecordingResult, write_recording
 from carlasc.viewing.scene import Scene, as_scene
 from carlasc.viewing.window.window import show_window
 
@@ -20,9 +21,11 @@ def view(
     out: str | os.PathLike[str],
     *,
     thin_m: float = ...,
+    full_points: bool = ...,
     overwrite: bool = ...,
     progress: Callable[[int, int], None] | None = ...,
-) -> PageResult: ...
+    report: Callable[[str], None] | None = ...,
+) -> PageResult | RecordingResult: ...
 
 
 @overload
@@ -39,23 +42,27 @@ def view(
     out: str | os.PathLike[str] | None = None,
     *,
     thin_m: float = 0.2,
+    full_points: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     report: Callable[[str], None] | None = None,
-) -> PageResult | None:
-    """Write a scene as a self-contained HTML page, or, without `out`, show it in a window until that is closed.
+) -> PageResult | RecordingResult | None:
+    """Write a scene as a self-contained HTML page or as a recording, or, without `out`, show it in a window until that is closed.
 
     Args:
-        source: a `Scene`; or anything that a scene's `source` may be. Its palette is "class" or "colorblind". A page of a scene
+        source: a `Scene`; or anything that a scene's `source` may be. Its palette is "class" or "colorblind". A file of a scene
             without `frames` shows the first 60 frames.
-        out: file name of the page, which ends in .html; None opens a window.
+        out: file name, whose ending decides: .html is a page, .rrd a recording for Rerun, .mcap one for Foxglove. None opens a
+            window.
         thin_m: points in a page are thinned to one per cell of this side length, metres.
-        overwrite: whether an existing page is replaced.
-        progress: called with (frames done, frames in all) while a page is written.
-        report: called with a line of text for what a key did in the window; first with the keys and the classes.
+        full_points: whether a recording keeps all points; otherwise at most 30,000 of each frame.
+        overwrite: whether an existing file is replaced.
+        progress: called with (frames done, frames in all) while a file is written.
+        report: called with a line of text: for a recording with `full_points` first about how large it becomes; for a window with
+            the keys and the classes, then with what each key did.
 
     Returns:
-        What the page shows and where it is; None for a window.
+        What the file shows and where it is; None for a window.
 
     Raises:
         ArgumentError: an argument has no meaning.
@@ -63,12 +70,20 @@ def view(
         FormatError: the data do not have the format.
         ConflictError: `out` exists.
         StorageError: `out` cannot be written; nothing is left behind.
-        DependencyError: for a window, Open3D or a library that it needs is missing, or there is no screen.
+        DependencyError: the SDK of Rerun or of Foxglove is missing; or for a window, Open3D or a library that it needs is
+            missing, or there is no screen.
     """
     scene = as_scene(source)
     if scene.palette == "height":
         raise ArgumentError("palette", expected="class or colorblind", found="height")
-    if out is not None:
-        return write_page(scene, Path(out), thin_m=thin_m, overwrite=overwrite, progress=progress)
+    target = None if out is None else Path(out)
+    if target is not None and target.suffix.lower() in RECORDINGS:
+        return write_recording(
+            scene, target, full_points=full_points, overwrite=overwrite, progress=progress, report=report
+        )
+    if full_points:
+        raise ArgumentError("full_points", expected="a recording, .rrd or .mcap", found=str(out or "a window"))
+    if target is not None:
+        return write_page(scene, target, thin_m=thin_m, overwrite=overwrite, progress=progress)
     show_window(scene, report=report)
     return None

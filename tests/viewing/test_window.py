@@ -138,8 +138,8 @@ def test_keys_do_what_the_help_says(blocks, open_window):
     assert window.state.playing
     press(" ")
     assert not window.state.playing
-    assert window.state.layers == {"grid", "flow", "vehicle"}
-    for key, layer in (("G", "grid"), ("P", "points"), ("F", "flow"), ("V", "vehicle")):
+    assert window.state.layers == {"grid", "flow", "boxes", "vehicle"}
+    for key, layer in (("G", "grid"), ("P", "points"), ("F", "flow"), ("B", "boxes"), ("V", "vehicle")):
         before = set(window.state.layers)
         press(key)
         assert window.state.layers ^ before == {layer}

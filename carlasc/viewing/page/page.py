@@ -90,7 +90,6 @@ def encode_frame(reader: SceneReader, frame: int, thin_m: float) -> bytes:
 def describe(reader: SceneReader, thin_m: float) -> dict[str, Any]:
     """Return what the scripts of the page need to know besides the blocks of the frames."""
     tables = {colors.table.name: colors for colors in (reader.colors, *(panel.colors for panel in reader.panels))}
-    fields = reader.data.sequence.fields()
     return {
         "name": reader.name,
         "leftHanded": reader.left_handed,
@@ -99,8 +98,8 @@ def describe(reader: SceneReader, thin_m: float) -> dict[str, Any]:
         "panels": [_describe_panel(panel) for panel in reader.panels],
         "frames": list(reader.frames),
         "times": [reader.read_time(frame) for frame in reader.frames],
-        "hasPoints": "points" in fields,
-        "hasFlow": "flow" in fields,
+        "hasPoints": reader.has("points"),
+        "hasFlow": reader.has("flow"),
         "pointCell": thin_m,
         "offsetSteps": OFFSET_STEPS,
     }

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, check_rigid, transform_points
-from carlasc.errors import ArgumentError
+from carlasc.core.geometry import Transform, transform_points
+from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
 from carlasc.viewing.remapping import RemappedSequence
@@ -64,7 +64,7 @@ class FrameRenderer:
             viewpoint=viewpoint,
             size=self.size,
             legend=self.legend,
-            axes=self.reader.data.sequence.metadata.axes,
+            axes=self.reader.axes,
         )
 
     def draw(self, content: str, frame: int) -> Drawing:
@@ -99,7 +99,7 @@ class FrameRenderer:
         if self.fixed_view is None:
             return (_swept_extent(drawing.extent), np.eye(4)) if orbits else None
         extent, world_T_view = self.fixed_view
-        drawing_T_view = np.linalg.inv(self.reader.data.sequence.read_pose(frame)) @ world_T_view
+        drawing_T_view = np.linalg.inv(_pose_of(self.reader, frame)) @ world_T_view
         return (_swept_extent(extent) if orbits else extent), drawing_T_view
 
     def _title(self, content: str) -> str:
@@ -141,17 +141,24 @@ def view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transfor
 
     Raises:
         MissingDataError: the sequence has no poses.
-        FormatError: the middle one is none.
+        FormatError: one of them is none.
     """
-    sequence = reader.data.sequence
-    middle = reader.frames[len(reader.frames) // 2]
-    world_T_middle = check_rigid(sequence.read_pose(middle), f"{sequence.location}/{layout.POSES}: frame {middle}")
+    world_T_middle = _pose_of(reader, reader.frames[len(reader.frames) // 2])
     middle_T_world = np.linalg.inv(world_T_middle)
-    seen = [transform_points(middle_T_world @ sequence.read_pose(frame), extent) for frame in reader.frames]
+    seen = [transform_points(middle_T_world @ _pose_of(reader, frame), extent) for frame in reader.frames]
     points = np.concatenate(seen)
     box = np.array([points.min(0), points.max(0)])
     corners = np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     return corners, world_T_middle
+
+
+def _pose_of(reader: SceneReader, frame: int) -> Transform:
+    pose = reader.read_pose(frame)
+    if pose is None:
+        raise MissingDataError(
+            reader.path, expected=layout.POSES, found="none", advice="let the camera follow the vehicle"
+        )
+    return pose
 
 
 def _swept_extent(extent: Extent) -> Extent:

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.grids import GridSpec
 
+_Value = TypeVar("_Value", bound=np.generic)
 _WIDEST_ARC_RAD = np.deg2rad(4.0)  # wider cylindrical cells are drawn in several flat pieces
-_SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))  # corners of a face, in order around it
+SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
+"""Corners of a face, in order around it."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +50,7 @@ class QuadMesh:
 def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
     """Return several meshes as one."""
     return QuadMesh(
-        *(
-            np.concatenate([getattr(mesh, name) for mesh in meshes])
-            for name in ("corners", "normals", "colors", "openness", "edges", "open_sky")
-        )
+        *(np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in QuadMesh.__dataclass_fields__)
     )
 
 
@@ -81,17 +81,29 @@ def grid_mesh(
         occupied: (X, Y, Z) bool.
         on_floor: whether the grid stands on a floor, which hides the lowest faces of the lowest cells: they are left out.
     """
-    pieces = 1
-    if spec.coordinates == "cylindrical":
-        pieces = int(np.ceil(spec.voxel_size[1] / _WIDEST_ARC_RAD))
-        spec = spec.with_size((spec.size[0], spec.size[1] * pieces, spec.size[2]))
-        occupied, colors = np.repeat(occupied, pieces, axis=1), np.repeat(colors, pieces, axis=1)
-    solid = _surrounded(spec, occupied)
+    whole = spec
+    spec, occupied = split_arcs(whole, occupied)
+    _, colors = split_arcs(whole, colors)
+    pieces = spec.size[1] // whole.size[1]
+    solid = surrounded(spec, occupied)
     sides = [(axis, side) for axis in range(3) for side in (0, 1)]
     return join([_faces(spec, colors, solid, axis, side, pieces, on_floor) for axis, side in sides])
 
 
-def _surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def split_arcs(spec: GridSpec, values: NDArray[_Value]) -> tuple[GridSpec, NDArray[_Value]]:
+    """Return a grid whose wide cylindrical cells are divided into narrow ones, which are drawn flat; other grids as they are.
+
+    Args:
+        spec: geometry.
+        values: (X, Y, Z, ...) values of the cells.
+    """
+    if spec.coordinates != "cylindrical":
+        return spec, values
+    pieces = int(np.ceil(spec.voxel_size[1] / _WIDEST_ARC_RAD))
+    return spec.with_size((spec.size[0], spec.size[1] * pieces, spec.size[2])), np.repeat(values, pieces, axis=1)
+
+
+def surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the cells padded by one empty cell on each side; a full turn of azimuth continues on its other side."""
     solid = np.pad(occupied, 1)
     if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
@@ -124,7 +136,7 @@ def _faces(
     edges = [spec.edges(a) for a in range(3)]
     corners: NDArray[np.floating] = np.empty((len(cells), 4, 3))
     openness = np.empty((len(cells), 4), np.float32)
-    for number, (first, second) in enumerate(_SQUARE):
+    for number, (first, second) in enumerate(SQUARE):
         offset = np.zeros(3, np.int64)
         offset[[axis, across, along]] = side, first, second
         lattice = cells + offset
@@ -177,7 +189,7 @@ def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
         pieces = (16, int(np.ceil((spec.upper[1] - spec.lower[1]) / _WIDEST_ARC_RAD)))
     first, second = (np.linspace(spec.lower[a], spec.upper[a], pieces[a] + 1) for a in range(2))
     corners = [
-        [(first[i + di], second[j + dj], height) for di, dj in _SQUARE]
+        [(first[i + di], second[j + dj], height) for di, dj in SQUARE]
         for i in range(pieces[0])
         for j in range(pieces[1])
     ]
@@ -192,7 +204,7 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 
     for axis in range(3):
         for side in (0, 1):
             face = np.empty((4, 3), np.float32)
-            for number, (first, second) in enumerate(_SQUARE):
+            for number, (first, second) in enumerate(SQUARE):
                 pick = np.zeros(3, np.int64)
                 pick[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, first, second
                 face[number] = low_high[pick, np.arange(3)] + pick[2] * inwards[pick, np.arange(3)]

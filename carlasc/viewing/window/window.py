@@ -23,11 +23,11 @@ from carlasc.viewing.rendering.meshes import QuadMesh, arrows, grid_mesh
 from carlasc.viewing.scene import FrameContent, Scene, SceneReader
 from carlasc.viewing.window.libraries import PAGE_ADVICE, import_open3d
 
-LAYERS = {"g": "grid", "p": "points", "f": "flow", "v": "vehicle"}
+LAYERS = {"g": "grid", "p": "points", "f": "flow", "b": "boxes", "v": "vehicle"}
 KEYS = {
     "right, left": "next or previous frame",
     "space": "play or stop",
-    "g p f v": "show or hide the grid, points, flow, vehicle",
+    "g p f b v": "show or hide the grid, points, flow, boxes, vehicle",
     "t": "switch between prediction, truth and errors",
     "1 .. 9 0": "show or hide one of classes 1 to 10; with Shift 11 to 20, with Ctrl 21 to 30",
     "a": "show all classes",
@@ -38,6 +38,10 @@ _RIGHT, _LEFT, _SPACE = 262, 263, 32  # key codes of GLFW
 _PRESSED, _SHIFT, _CONTROL = 1, 1, 2
 _SUN = np.array([-0.38, -0.5, 0.78]) / np.linalg.norm([0.38, 0.5, 0.78])
 _BACKGROUND = (0.96, 0.965, 0.972)
+_BOX_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+_BOX_EDGES = np.array(
+    [(a, b) for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)]
+)  # corners that differ in one axis
 _EDGE = 0.8  # brightness of the edges of voxels, relative to their faces
 
 
@@ -82,11 +86,11 @@ class Window:
         Raises:
             DependencyError: Open3D or a library that it needs is missing, or there is no screen.
         """
-        self.reader, self.state, self.report = reader, WindowState(), report or (lambda _: None)
+        self.reader = reader = reader.right_handed()  # as Open3D is
+        self.state, self.report = WindowState(), report or (lambda _: None)
         if reader.panels:
             self.state.layers.discard("points")
         self.o3d = import_open3d()
-        self._mirror = np.array([1.0, -1.0, 1.0]) if reader.left_handed else np.ones(3)  # Open3D is right-handed
         self._content = self._read()
         self._shown: dict[str, Any] = {}
         self._due = time.monotonic()
@@ -187,7 +191,7 @@ class Window:
         rim = np.array([(x, y, lower[2]) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], np.float64)
         rim[:, :2] = lower[:2] + rim[:, :2] * (upper - lower)[:2]
         lines = self.o3d.geometry.LineSet(
-            self.o3d.utility.Vector3dVector(rim * self._mirror),
+            self._vectors(rim),
             self.o3d.utility.Vector2iVector(np.array([(0, 1), (1, 2), (2, 3), (3, 0)])),
         )
         lines.paint_uniform_color((0.55, 0.58, 0.63))
@@ -229,6 +233,7 @@ class Window:
         self._replace("grid", self._grid() if content.grids and "grid" in layers else None)
         self._replace("points", self._points() if content.scan is not None and "points" in layers else None)
         self._replace("flow", self._flow() if content.scan is not None and "flow" in layers else None)
+        self._replace("boxes", self._boxes() if content.boxes is not None and "boxes" in layers else None)
         self._replace("vehicle", self._mesh(ego_vehicle()) if "vehicle" in layers else None)
 
     def _replace(self, name: str, geometry: Any) -> None:
@@ -285,6 +290,23 @@ class Window:
             tails, vectors = tails[inside], vectors[inside]
         return self._mesh(arrows(tails, vectors, palette.ARROW, 0.24)) if len(tails) else None
 
+    def _boxes(self) -> Any:
+        """Return the edges of the boxes as lines in the colours of their classes."""
+        boxes = self._content.boxes
+        if boxes is None or not len(boxes):
+            return None
+        corners = boxes.centers[:, None] + np.einsum(
+            "nij,nkj->nki", boxes.sensor_T_box[:, :3, :3], _BOX_CORNERS * boxes.sizes[:, None] / 2
+        )
+        edges = 8 * np.arange(len(boxes))[:, None, None] + _BOX_EDGES
+        lines = self.o3d.geometry.LineSet(
+            self._vectors(corners.reshape(-1, 3)),
+            self.o3d.utility.Vector2iVector(edges.reshape(-1, 2).astype(np.int32)),
+        )
+        colors = np.repeat(self.reader.colors.by_id[boxes.labels], len(_BOX_EDGES), axis=0)
+        lines.colors = self.o3d.utility.Vector3dVector(colors / 255.0)
+        return lines
+
     def _mesh(self, mesh: QuadMesh) -> Any:
         """Return a mesh for Open3D, with the light of sun and sky in the colours of its corners."""
         corners, triangles = mesh.triangles()
@@ -302,7 +324,7 @@ class Window:
         return 0.58 + 0.42 * np.minimum(lit, 1.25)
 
     def _vectors(self, points: NDArray[np.floating]) -> Any:
-        return self.o3d.utility.Vector3dVector(np.asarray(points, np.float64) * self._mirror)
+        return self.o3d.utility.Vector3dVector(np.asarray(points, np.float64))
 
 
 def show_window(scene: Scene, *, report: Callable[[str], None] | None = None) -> None:

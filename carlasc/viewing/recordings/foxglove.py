@@ -1,0 +1,285 @@
+"""A recording for Foxglove (.mcap): one topic for each kind of content, in Foxglove's own schemas.
+
+Topics, all in right-handed axes with z up; times are seconds since the first frame:
+
+    /tf                      FrameTransforms: `ego`, the sensor, in `world`, the frame of the first scan
+    /points                  PointCloud: colours and class ids
+    /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid; with a ground truth
+                             /prediction, /truth and /errors
+    /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the ways of the actors
+    /path                    SceneUpdate: the way of the vehicle through the whole recording
+    /picture                 CompressedImage: the bird's-eye camera picture
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, quaternions_of
+from carlasc.core.grids import Grid
+from carlasc.core.scans import Scan
+from carlasc.errors import import_extra
+from carlasc.viewing import colors as palette
+from carlasc.viewing.recordings.content import RecordedFrame, point_colors
+from carlasc.viewing.recordings.wedges import class_surfaces
+from carlasc.viewing.scene import GridPanel, SceneReader
+
+WORLD, EGO = "world", "ego"
+
+_POINT = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4), ("label", "<u2")])
+_CELL = np.dtype([("rgba", "u1", 4), ("label", "<u2")])
+_COLOR_FIELDS = ("red", "green", "blue", "alpha")
+_BOX_ALPHA, _LINE_M, _ARROW_M = 0.35, 0.15, 0.24
+
+
+class FoxgloveWriter:
+    """Writes an `.mcap` file.
+
+    Raises:
+        DependencyError: the Foxglove SDK is not installed.
+    """
+
+    def __init__(self, path: Path, reader: SceneReader) -> None:
+        foxglove: Any = import_extra("foxglove", "foxglove")
+        self._messages: Any = import_extra("foxglove.messages", "foxglove")
+        self._types: Any = import_extra("foxglove.channels", "foxglove")
+        self._reader, self._channels = reader, dict[str, Any]()
+        self._context = foxglove.Context()
+        self._output = _Output(path)
+        self._writer = foxglove.open_mcap(self._output, context=self._context)
+        self._writer.write_metadata("carlasc", {"sequence": reader.name, "classes": reader.table.name})
+        names = {str(entry.order): entry.name for entry in reader.colors.entries(reader.table.names)}
+        self._writer.write_metadata("classes", names)
+        self._path: NDArray[np.float64] | None = reader.path_of_ego()
+
+    def write(self, frame: RecordedFrame) -> None:
+        """Append a frame."""
+        m, nanoseconds = self._messages, round(frame.time_s * 1e9)
+        stamp = m.Timestamp(*divmod(nanoseconds, 10**9))
+
+        def log(topic: str, kind: str, **content: Any) -> None:
+            self._log(topic, kind, nanoseconds, getattr(m, kind)(**content))
+
+        def log_scene(topic: str, entities: list[Any]) -> None:
+            deletion = m.SceneEntityDeletion(timestamp=stamp, type=m.SceneEntityDeletionType.All)
+            log(topic, "SceneUpdate", deletions=[deletion], entities=entities)
+
+        def entity(name: str, frame_id: str, **content: Any) -> Any:
+            return m.SceneEntity(timestamp=stamp, frame_id=frame_id, id=name, **content)
+
+        pose = np.eye(4) if frame.pose is None else frame.pose
+        transform = m.FrameTransform(
+            timestamp=stamp,
+            parent_frame_id=WORLD,
+            child_frame_id=EGO,
+            translation=self._vector(pose[:3, 3]),
+            rotation=self._quaternion(pose),
+        )
+        log("/tf", "FrameTransforms", transforms=[transform])
+        for panel, grid in zip(self._reader.panels, frame.grids, strict=True):
+            if grid.spec.coordinates == "cylindrical":
+                log_scene(f"/{panel.name}", [entity(n, EGO, triangles=[t]) for n, t in self._wedges(panel, grid)])
+            else:
+                log(f"/{panel.name}", "VoxelGrid", timestamp=stamp, frame_id=EGO, **self._voxels(panel, grid))
+        if frame.scan is not None:
+            log("/points", "PointCloud", timestamp=stamp, frame_id=EGO, **self._points(frame.scan))
+        if self._reader.has("flow"):
+            arrows = [self._arrow(tail, vector) for tail, vector in zip(frame.tails, frame.vectors, strict=True)]
+            log_scene("/flow", [entity("flow", EGO, arrows=arrows)])
+        if self._reader.has("boxes"):
+            log_scene("/boxes", [] if frame.boxes is None else list(self._boxes(frame.boxes, entity)))
+        if frame.pose is not None:
+            lines = [self._line(trail.points, self._color(trail.label)) for trail in frame.trails]
+            log_scene("/tracks", [entity("tracks", WORLD, lines=lines)])
+        if self._path is not None and len(self._path) > 1:
+            line = self._line(self._path, self._rgba(palette.PATH))
+            log_scene("/path", [entity("path", WORLD, lines=[line])])
+        self._path = None  # once
+        if frame.picture is not None:
+            log("/picture", "CompressedImage", timestamp=stamp, frame_id=EGO, data=frame.picture, format="jpeg")
+        self._output.check()
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        self._writer.close()
+        self._output.close()
+
+    def _log(self, topic: str, kind: str, nanoseconds: int, message: Any) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = getattr(self._types, f"{kind}Channel")(topic, context=self._context)
+        self._channels[topic].log(message, log_time=nanoseconds)
+
+    def _voxels(self, panel: GridPanel, grid: Grid) -> dict[str, Any]:
+        """Return a grid as the content of a VoxelGrid: colours, transparent where free, and class ids, in the order z, y, x."""
+        m = self._messages
+        columns, rows, slices = grid.spec.size
+        labels = grid.labels.transpose(2, 1, 0)
+        cells = np.zeros((slices, rows, columns), _CELL)
+        cells["rgba"][..., :3], cells["rgba"][..., 3] = panel.colors.by_id[labels], np.where(labels, 255, 0)
+        cells["label"] = labels
+        cells["rgba"][labels == 0] = 0
+        corner = np.eye(4)
+        corner[:3, 3] = grid.spec.lower
+        return {
+            "pose": self._pose(corner),
+            "row_count": rows,
+            "column_count": columns,
+            "cell_size": self._vector(grid.spec.voxel_size),
+            "cell_stride": _CELL.itemsize,
+            "row_stride": _CELL.itemsize * columns,
+            "slice_stride": _CELL.itemsize * columns * rows,
+            "fields": [*self._color_fields(0), m.PackedElementField(name="label", offset=4, type=self._uint(2))],
+            "data": cells.tobytes(),
+        }
+
+    def _points(self, scan: Scan) -> dict[str, Any]:
+        """Return a scan as the content of a PointCloud."""
+        m = self._messages
+        points = np.zeros(len(scan), _POINT)
+        points["xyz"], points["rgba"] = scan.points, 255
+        points["rgba"][:, :3] = point_colors(scan, self._reader.colors.by_id)
+        points["label"] = 0 if scan.labels is None else scan.labels
+        float32 = m.PackedElementFieldNumericType.Float32
+        axes = [m.PackedElementField(name=name, offset=4 * i, type=float32) for i, name in enumerate("xyz")]
+        label = m.PackedElementField(name="label", offset=16, type=self._uint(2))
+        return {
+            "pose": self._pose(np.eye(4)),
+            "point_stride": _POINT.itemsize,
+            "fields": [*axes, *self._color_fields(12), label],
+            "data": points.tobytes(),
+        }
+
+    def _wedges(self, panel: GridPanel, grid: Grid) -> Iterator[tuple[str, Any]]:
+        """Yield each class of a cylindrical grid with the faces of its voxels."""
+        m = self._messages
+        for label, surface in class_surfaces(grid):
+            points = [m.Point3(x=x, y=y, z=z) for x, y, z in surface.corners.tolist()]
+            color = self._rgba(panel.colors.by_id[label].tolist())
+            name = panel.colors.table.names.get(label, f"class {label}")
+            yield (
+                name,
+                m.TriangleListPrimitive(
+                    pose=self._pose(np.eye(4)), points=points, color=color, indices=surface.indices.reshape(-1).tolist()
+                ),
+            )
+
+    def _boxes(self, boxes: Boxes, entity: Callable[..., Any]) -> Iterator[Any]:
+        """Yield each box as an entity that is named by its track."""
+        m = self._messages
+        for row, pose in enumerate(boxes.sensor_T_box):
+            label, track = int(boxes.labels[row]), str(boxes.tracks[row])
+            name = self._reader.table.names.get(label, f"class {label}")
+            cube = m.CubePrimitive(
+                pose=self._pose(pose), size=self._vector(boxes.sizes[row]), color=self._color(label, _BOX_ALPHA)
+            )
+            metadata = [m.KeyValuePair(key="class", value=name), m.KeyValuePair(key="track", value=track)]
+            yield entity(track, EGO, cubes=[cube], metadata=metadata)
+
+    def _arrow(self, tail: NDArray[np.float64], vector: NDArray[np.float64]) -> Any:
+        """Return an arrow: in Foxglove it points along the x axis of its pose."""
+        length = float(np.linalg.norm(vector))
+        ahead = vector / length
+        side = np.cross([0.0, 0.0, 1.0] if abs(ahead[2]) < 0.9 else [0.0, 1.0, 0.0], ahead)
+        side /= np.linalg.norm(side)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = np.column_stack([ahead, side, np.cross(ahead, side)]), tail
+        head = min(4.5 * _ARROW_M, 0.5 * length)
+        return self._messages.ArrowPrimitive(
+            pose=self._pose(pose),
+            shaft_length=length - head,
+            shaft_diameter=_ARROW_M,
+            head_length=head,
+            head_diameter=3 * _ARROW_M,
+            color=self._rgba(palette.ARROW),
+        )
+
+    def _line(self, points: NDArray[np.float64], color: Any) -> Any:
+        m = self._messages
+        return m.LinePrimitive(
+            type=m.LinePrimitiveLineType.LineStrip,
+            pose=self._pose(np.eye(4)),
+            thickness=_LINE_M,
+            points=[m.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
+            color=color,
+        )
+
+    def _pose(self, dst_T_src: Transform) -> Any:
+        return self._messages.Pose(position=self._vector(dst_T_src[:3, 3]), orientation=self._quaternion(dst_T_src))
+
+    def _quaternion(self, dst_T_src: Transform) -> Any:
+        w, x, y, z = quaternions_of(dst_T_src[None, :3, :3])[0].tolist()
+        return self._messages.Quaternion(x=x, y=y, z=z, w=w)
+
+    def _vector(self, values: NDArray[np.floating]) -> Any:
+        x, y, z = (float(value) for value in values)
+        return self._messages.Vector3(x=x, y=y, z=z)
+
+    def _color(self, label: int, alpha: float = 1.0) -> Any:
+        return self._rgba(self._reader.colors.by_id[label].tolist(), alpha)
+
+    def _rgba(self, color: Sequence[int], alpha: float = 1.0) -> Any:
+        red, green, blue = (value / 255 for value in color)
+        return self._messages.Color(r=red, g=green, b=blue, a=alpha)
+
+    def _color_fields(self, offset: int) -> list[Any]:
+        field, byte = self._messages.PackedElementField, self._uint(1)
+        return [field(name=name, offset=offset + i, type=byte) for i, name in enumerate(_COLOR_FIELDS)]
+
+    def _uint(self, size: int) -> Any:
+        types = self._messages.PackedElementFieldNumericType
+        return types.Uint8 if size == 1 else types.Uint16
+
+
+class _Output:
+    """The file, for the SDK, which does not say when one cannot be written: the first error is kept, and what follows is dropped."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb", buffering=0)
+        self._error: OSError | None = None
+        self._position = self._end = 0
+
+    def write(self, data: bytes | bytearray) -> int:
+        if self._error is None:
+            self._try(lambda: self._write_all(memoryview(data)))
+        self._position += len(data)
+        self._end = max(self._end, self._position)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._end}[whence]
+        if self._error is None:
+            self._try(lambda: self._file.seek(self._position))
+        return self._position
+
+    def flush(self) -> None:
+        """Do nothing: every write goes to the operating system at once."""
+
+    def check(self) -> None:
+        """Raise the error that was kept."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        self._try(self._file.close)
+        self.check()
+
+    def _write_all(self, data: memoryview) -> None:
+        while data:
+            data = data[self._file.write(data) :]
+
+    def _try(self, action: Callable[[], object]) -> None:
+        try:
+            action()
+        except OSError as error:
+            self._error = self._error or error

@@ -1,0 +1,482 @@
+"""Recordings for Rerun and Foxglove, read back with the readers of their makers: what is where, and in which colours."""
+
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.blocks import ROAD, write_blocks
+from helpers.pixels import BLUE, RED
+from helpers.recorded import POINT, read_mcap, read_metadata, read_rrd, verify_rrd, voxels_of
+
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import rotation_z, rotations_of, translation
+from carlasc.core.grids import GridSpec
+from carlasc.core.scans import Scan
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError, ConflictError, DependencyError, StorageError
+from carlasc.metrics import Outcome
+from carlasc.storage import FolderSink, layout
+from carlasc.viewing import RecordingResult, Scene, view
+from carlasc.viewing.colors import ERRORS, PATH, UNLABELLED
+from carlasc.viewing.recordings.content import record_frames, thin_scan
+from carlasc.viewing.recordings.run import RECORDINGS
+from carlasc.viewing.recordings.wedges import class_surfaces
+from carlasc.viewing.rendering.meshes import grid_mesh
+
+JPEG = b"\xff\xd8 a picture \xff\xd9"
+YAW, BOX_YAW = 0.1, 0.3  # the vehicle's turn to the right in each frame, and that of the box in the frame of the sensor
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """Left-handed: a red block ahead on the right, a box around it, a vehicle that turns to the right, pictures."""
+    folder = write_blocks(tmp_path_factory.mktemp("drive") / "Train" / "Town01_Light" / "cartesian")
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    poses = np.stack([translation((2.0 * i, 1.0 * i, 0.0)) @ rotation_z(YAW * i) for i in range(3)])
+    writer.write_document(layout.POSES, layout.encode_poses(poses))
+    for frame in range(3):
+        box = translation((10.0 + frame, 5.0, 0.0)) @ rotation_z(BOX_YAW)
+        boxes = Boxes.from_poses(np.array([7]), np.array([RED]), box[None], np.array([[4.0, 2.0, 1.5]]))
+        writer.write("boxes", frame, boxes.to_table())
+        writer.write("bev", frame, np.frombuffer(JPEG, np.uint8))
+    return folder
+
+
+def color_of(label, table=CARLA):
+    red, green, blue = table.colors[label]
+    return red << 24 | green << 16 | blue << 8 | 255  # as Rerun keeps it
+
+
+def test_a_rerun_recording_holds_every_voxel_by_class_where_it_is(drive, tmp_path):
+    view(drive, tmp_path / "scene.rrd")
+    verify_rrd(tmp_path / "scene.rrd", tmp_path)
+    entities, seconds = read_rrd(tmp_path / "scene.rrd")
+    assert seconds == pytest.approx({0: 0.0, 1: 0.1, 2: 0.2})
+    reader = Scene(drive).open()
+    for frame in range(3):
+        counts = np.bincount(reader.read(frame).grids[0].labels.reshape(-1))
+        for label in (ROAD, RED, BLUE):
+            seen = entities[f"/world/ego/grid/{CARLA.names[label]}"][frame]
+            cells, size = np.array(seen["VoxelGridMap:voxel_indices"]), np.array(seen["VoxelGridMap:voxel_size"][0])
+            assert len(cells) == counts[label] and len(np.unique(cells, axis=0)) == len(cells)
+            assert seen["VoxelGridMap:colors"] == [color_of(label)]
+            middle = (cells + 0.5).mean(0) * size + seen["VoxelGridMap:translation"][0]
+            if label == RED:  # y = +5 is on the right of left-handed data; right-handed, y points to the left
+                np.testing.assert_allclose(middle, (10 + frame, -5, 0), atol=0.5)
+            if label == BLUE:
+                np.testing.assert_allclose(middle, (-8, 6, 0), atol=0.5)
+    grids = {path for path in entities if path.startswith("/world/ego/grid/")}
+    assert grids == {f"/world/ego/grid/{CARLA.names[label]}" for label in (ROAD, RED, BLUE)}
+
+
+def test_a_rerun_recording_holds_points_flow_boxes_tracks_poses_and_pictures(drive, tmp_path):
+    view(drive, tmp_path / "scene.rrd")
+    entities, _ = read_rrd(tmp_path / "scene.rrd")
+    scan = Scene(drive).open().right_handed().read(1).scan
+    points = entities["/world/ego/points"][1]
+    np.testing.assert_array_equal(np.array(points["Points3D:positions"], np.float32), scan.points)
+    np.testing.assert_array_equal(points["Points3D:class_ids"], scan.labels)
+    flow = entities["/world/ego/flow"][1]
+    np.testing.assert_allclose(flow["Arrows3D:vectors"], [(10, 0, 0)], atol=1e-5)
+    np.testing.assert_allclose(flow["Arrows3D:origins"][0][:2], (11, -5), atol=0.1)
+    boxes = entities["/world/ego/boxes"][1]
+    np.testing.assert_allclose(boxes["Boxes3D:centers"], [(11, -5, 0)], atol=1e-6)
+    np.testing.assert_allclose(boxes["Boxes3D:half_sizes"], [(2, 1, 0.75)])
+    x, y, z, w = boxes["Boxes3D:quaternions"][0]
+    np.testing.assert_allclose(rotations_of(np.array([[w, x, y, z]]))[0], rotation_z(-BOX_YAW)[:3, :3], atol=1e-6)
+    assert (boxes["Boxes3D:class_ids"], boxes["Boxes3D:labels"]) == ([RED], ["Pedestrian 7"])
+    pose = entities["/world/ego"][2]
+    np.testing.assert_allclose(pose["Transform3D:translation"], [(4, -2, 0)])
+    x, y, z, w = pose["Transform3D:quaternion"][0]
+    np.testing.assert_allclose(rotations_of(np.array([[w, x, y, z]]))[0], rotation_z(-2 * YAW)[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(
+        entities["/world/path"][None]["LineStrips3D:strips"], [[(0, 0, 0), (2, -1, 0), (4, -2, 0)]]
+    )
+    (way,) = entities["/world/tracks"][2]["LineStrips3D:strips"]
+    expected = [translation((2 * i, -i, 0)) @ rotation_z(-YAW * i) @ (10 + i, -5, 0, 1) for i in range(3)]
+    np.testing.assert_allclose(way, np.array(expected)[:, :3], atol=1e-5)
+    assert entities["/world/tracks"][2]["LineStrips3D:class_ids"] == [RED]
+    assert entities["/world/tracks"][0]["LineStrips3D:strips"] == []
+    assert bytes(entities["/picture"][0]["EncodedImage:blob"][0]) == JPEG
+
+
+def test_a_rerun_recording_names_and_colours_the_classes_and_has_a_blueprint(drive, tmp_path):
+    view(drive, tmp_path / "scene.rrd")
+    entities, _ = read_rrd(tmp_path / "scene.rrd")
+    (listed,) = entities["/world"][None]["AnnotationContext:context"]
+    classes = {entry["class_id"]: entry["class_description"]["info"] for entry in listed}
+    assert {i: info["label"] for i, info in classes.items()} == {**CARLA.names, 0: "unlabelled"}
+    assert all(classes[i]["color"] == color_of(i) for i in CARLA.names if i)
+    assert classes[0]["color"] >> 8 == int.from_bytes(bytes(UNLABELLED))
+    assert entities["/world"][None]["ViewCoordinates:xyz"] == [[3, 5, 1]]  # right, forward, up: right-handed
+    (blueprint,) = pytest.importorskip("rerun.chunk").RrdReader(tmp_path / "scene.rrd").blueprints()
+    assert blueprint.application_id == "carlasc"
+
+
+def test_a_class_that_is_gone_is_removed(tmp_path):
+    folder = write_blocks(tmp_path / "cartesian", frames=2)
+    labels = np.fromfile(folder / "evaluation" / "000001.label", np.uint32)
+    labels[labels == BLUE] = 0
+    labels.tofile(folder / "evaluation" / "000001.label")
+    view(folder, tmp_path / "scene.rrd")
+    entities, _ = read_rrd(tmp_path / "scene.rrd")
+    vehicle = entities["/world/ego/grid/Vehicle"]
+    assert "VoxelGridMap:voxel_indices" in vehicle[0] and set(vehicle[1]) == {"Clear:is_recursive"}
+    (grid,) = [m.message for m in read_mcap(view(folder, tmp_path / "scene.mcap").out)["/grid"] if m.time_s > 0]
+    assert BLUE not in voxels_of(grid)[0]["label"]
+
+
+def test_a_foxglove_recording_holds_every_voxel_and_point_where_it_is(drive, tmp_path):
+    view(drive, tmp_path / "scene.mcap")
+    topics = read_mcap(tmp_path / "scene.mcap")
+    assert {topic: (len(messages), messages[0].schema) for topic, messages in topics.items()} == {
+        "/tf": (3, "foxglove.FrameTransforms"),
+        "/grid": (3, "foxglove.VoxelGrid"),
+        "/points": (3, "foxglove.PointCloud"),
+        "/flow": (3, "foxglove.SceneUpdate"),
+        "/boxes": (3, "foxglove.SceneUpdate"),
+        "/tracks": (3, "foxglove.SceneUpdate"),
+        "/path": (1, "foxglove.SceneUpdate"),
+        "/picture": (3, "foxglove.CompressedImage"),
+    }
+    reader = Scene(drive).open().right_handed()
+    for frame, (grid, cloud) in enumerate(zip(topics["/grid"], topics["/points"], strict=True)):
+        content = reader.read(frame)
+        assert grid.time_s == cloud.time_s == pytest.approx(0.1 * frame)
+        assert (grid.message.timestamp.seconds, grid.message.timestamp.nanos) == (0, round(1e8 * frame))
+        assert grid.message.frame_id == cloud.message.frame_id == "ego"
+        cells, corner, size = voxels_of(grid.message)
+        np.testing.assert_array_equal(cells["label"], content.grids[0].labels)
+        np.testing.assert_array_equal(cells["rgba"][..., 3], np.where(content.grids[0].labels, 255, 0))
+        red = np.argwhere(cells["label"] == RED)
+        np.testing.assert_allclose(corner + (red + 0.5).mean(0) * size, (10 + frame, -5, 0), atol=0.5)
+        assert (cells["rgba"][tuple(red.T)] == (*CARLA.colors[RED], 255)).all()
+        points = np.frombuffer(cloud.message.data, POINT)
+        assert cloud.message.point_stride == POINT.itemsize
+        assert [(f.name, f.offset, f.type) for f in cloud.message.fields] == [
+            ("x", 0, 7), ("y", 4, 7), ("z", 8, 7),
+            ("red", 12, 1), ("green", 13, 1), ("blue", 14, 1), ("alpha", 15, 1), ("label", 16, 3),
+        ]  # fmt: skip
+        np.testing.assert_array_equal(points["xyz"], content.scan.points)
+        np.testing.assert_array_equal(points["label"], content.scan.labels)
+        np.testing.assert_array_equal(points["rgba"][:, :3], CARLA.palette[content.scan.labels])
+
+
+def test_a_foxglove_recording_holds_flow_boxes_tracks_poses_and_pictures(drive, tmp_path):
+    view(drive, tmp_path / "scene.mcap")
+    topics = read_mcap(tmp_path / "scene.mcap")
+    ((transform,),) = [message.message.transforms for message in topics["/tf"][2:]]
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("world", "ego")
+    assert (transform.translation.x, transform.translation.y) == pytest.approx((4, -2))
+    np.testing.assert_allclose(turned(transform.rotation), rotation_z(-2 * YAW)[:3, :3], atol=1e-6)
+    (entity,) = topics["/flow"][1].message.entities
+    (arrow,) = entity.arrows
+    assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((11, -5), abs=0.1)
+    assert arrow.shaft_length + arrow.head_length == pytest.approx(10, abs=1e-4)
+    np.testing.assert_allclose(turned(arrow.pose.orientation)[:, 0], (1, 0, 0), atol=1e-5)
+    (entity,) = topics["/boxes"][1].message.entities
+    (cube,) = entity.cubes
+    assert (entity.id, entity.frame_id, {pair.key: pair.value for pair in entity.metadata}) == (
+        "7", "ego", {"class": "Pedestrian", "track": "7"},
+    )  # fmt: skip
+    assert (cube.size.x, cube.size.y, cube.size.z) == (4, 2, 1.5)
+    assert (cube.pose.position.x, cube.pose.position.y) == pytest.approx((11, -5))
+    np.testing.assert_allclose(turned(cube.pose.orientation), rotation_z(-BOX_YAW)[:3, :3], atol=1e-6)
+    np.testing.assert_allclose((cube.color.r, cube.color.g, cube.color.b), np.array(CARLA.colors[RED]) / 255)
+    (entity,) = topics["/tracks"][2].message.entities
+    assert entity.frame_id == "world" and [len(line.points) for line in entity.lines] == [3]
+    assert all(m.message.deletions[0].type == 1 for m in topics["/boxes"] + topics["/tracks"])  # the ones before go
+    (line,) = topics["/path"][0].message.entities[0].lines
+    assert [(p.x, p.y) for p in line.points] == [(0, 0), (2, -1), (4, -2)]
+    np.testing.assert_allclose((line.color.r, line.color.g, line.color.b), np.array(PATH) / 255)
+    assert topics["/picture"][0].message.data == JPEG and topics["/picture"][0].message.format == "jpeg"
+    metadata = read_metadata(tmp_path / "scene.mcap")
+    assert metadata["classes"] == {str(i): name for i, name in CARLA.names.items() if i}
+
+
+def turned(quaternion):
+    """Return the (3, 3) rotation of a Quaternion message."""
+    return rotations_of(np.array([[quaternion.w, quaternion.x, quaternion.y, quaternion.z]]))[0]
+
+
+def test_right_handed_data_are_recorded_as_they_are(tmp_path):
+    folder = write_blocks(tmp_path / "cartesian", frames=1, metadata={"axes": "right"})
+    cells, corner, size = voxels_of(read_mcap(view(folder, tmp_path / "a.mcap").out)["/grid"][0].message)
+    red = np.argwhere(cells["label"] == RED)
+    np.testing.assert_allclose(corner + (red + 0.5).mean(0) * size, (10, 5, 0), atol=0.5)
+    entities, _ = read_rrd(view(folder, tmp_path / "a.rrd").out)
+    np.testing.assert_allclose(entities["/world/ego/flow"][0]["Arrows3D:origins"][0][:2], (10, 5), atol=0.1)
+
+
+def test_a_prediction_is_beside_its_truth_and_its_errors(blocks, tmp_path):
+    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
+    scene = Scene(prediction, truth=blocks)
+    (content, *_), panels = record_frames(scene.open().right_handed(), None), ("prediction", "truth", "errors")
+    entities, _ = read_rrd(view(scene, tmp_path / "a.rrd").out)
+    topics = read_mcap(view(scene, tmp_path / "a.mcap").out)
+    for panel, grid, table in zip(panels, content.grids, (CARLA, CARLA, ERRORS), strict=True):
+        for label, count in enumerate(np.bincount(grid.labels.reshape(-1))[1:], 1):
+            entity = entities.get(
+                f"/world/ego/{panel}/{table.names[label].replace(' ', chr(92) + ' ').replace(':', chr(92) + ':')}", {}
+            )
+            assert len(entity.get(0, {}).get("VoxelGridMap:voxel_indices", ())) == count
+            if count:
+                assert entity[0]["VoxelGridMap:colors"] == [color_of(label, table)]
+        cells, _, _ = voxels_of(topics[f"/{panel}"][0].message)
+        np.testing.assert_array_equal(cells["label"], grid.labels)
+        shown = grid.labels > 0
+        np.testing.assert_array_equal(cells["rgba"][shown][:, :3], table.palette[grid.labels[shown]])
+    assert {Outcome.MISSED, Outcome.INVENTED} <= set(np.unique(content.grids[2].labels))
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory):
+    """The blocks in a cylindrical grid."""
+    spec = GridSpec.published("cylindrical").with_size((32, 48, 4))
+    return write_blocks(tmp_path_factory.mktemp("ring") / "Town01_Light" / "cylindrical", frames=1, spec=spec)
+
+
+def area(corners, indices):
+    """Return the area of triangles, square metres."""
+    one, two, three = (corners[indices[:, i]].astype(np.float64) for i in range(3))
+    return np.linalg.norm(np.cross(two - one, three - one), axis=1).sum() / 2
+
+
+def test_a_cylindrical_grid_is_a_surface_of_few_faces_that_look_outward(ring):
+    (grid,) = Scene(ring).open().right_handed().read(0).grids
+    ids = np.repeat(grid.labels[..., None], 3, axis=3).astype(np.uint8)
+    whole = grid_mesh(grid.spec, ids, grid.labels > 0)
+    low = (whole.normals[:, 2] < -0.5) & (whole.corners[..., 2].min(1) <= grid.spec.lower[2] + 1e-6)
+    surfaces = dict(class_surfaces(grid))
+    assert set(surfaces) == set(np.unique(grid.labels[grid.labels > 0]).tolist())
+    for label, surface in surfaces.items():
+        chosen = (whole.colors[:, 0] == label) & ~low
+        quads = whole.corners[chosen].reshape(-1, 3), np.arange(4 * chosen.sum()).reshape(-1, 4)
+        expected = area(quads[0], np.concatenate([quads[1][:, [0, 1, 2]], quads[1][:, [0, 2, 3]]]))
+        assert area(surface.corners, surface.indices) == pytest.approx(expected, rel=1e-5)
+        assert len(surface.indices) <= 2 * chosen.sum()
+        one, two, three = (surface.corners[surface.indices[:, i]] for i in range(3))
+        turn = np.cross(two - one, three - one)
+        assert ((turn * surface.normals[surface.indices[:, 0]]).sum(1) > 0).all()  # counter-clockwise from outside
+    road = surfaces[ROAD]
+    assert len(road.indices) < 0.5 * 2 * ((whole.colors[:, 0] == ROAD) & ~low).sum()
+    red = surfaces[RED]
+    middle = (red.corners.max(0) + red.corners.min(0)) / 2
+    np.testing.assert_allclose(middle[:2], (10, -5), atol=1.2)
+    outward = ((red.corners - middle) * red.normals).sum(1)
+    assert (outward > 0).mean() > 0.95
+
+
+def test_cylindrical_grids_are_meshes_in_the_colours_of_their_classes(ring, tmp_path):
+    (grid,) = Scene(ring).open().right_handed().read(0).grids
+    surfaces = dict(class_surfaces(grid))
+    entities, _ = read_rrd(view(ring, tmp_path / "a.rrd").out)
+    (message,) = read_mcap(view(ring, tmp_path / "a.mcap").out)["/grid"]
+    scene = {entity.id: entity for entity in message.message.entities}
+    assert set(scene) == {CARLA.names[label] for label in surfaces}
+    for label, surface in surfaces.items():
+        mesh = entities[f"/world/ego/grid/{CARLA.names[label]}"][0]
+        np.testing.assert_array_equal(np.array(mesh["Mesh3D:vertex_positions"], np.float32), surface.corners)
+        np.testing.assert_array_equal(mesh["Mesh3D:triangle_indices"], surface.indices)
+        assert mesh["Mesh3D:albedo_factor"] == [color_of(label)]
+        (triangles,) = scene[CARLA.names[label]].triangles
+        assert len(triangles.points) == len(surface.corners) and len(triangles.indices) == surface.indices.size
+        last = triangles.points[-1]
+        np.testing.assert_allclose((last.x, last.y, last.z), surface.corners[-1])
+        np.testing.assert_allclose((triangles.color.r, triangles.color.b), np.array(CARLA.colors[label])[[0, 2]] / 255)
+
+
+@pytest.mark.parametrize("count", [1, 29_999, 30_000, 30_001, 130_000])
+def test_thinning_keeps_an_even_share_and_always_the_same_points(count):
+    points = np.zeros((count, 3), np.float32)
+    points[:, 0] = np.arange(count)
+    kept = thin_scan(Scan(points), 30_000).points[:, 0]
+    assert len(kept) == min(count, 30_000)
+    np.testing.assert_array_equal(kept, thin_scan(Scan(points), 30_000).points[:, 0])
+    assert (np.diff(kept) > 0).all() and np.diff(kept).max(initial=0) <= 2 * np.ceil(count / 30_000)
+    shares = np.bincount(
+        (kept % 64).astype(int), minlength=64
+    )  # of the lasers of a sensor that fires one after the other
+    if count > 10_000:
+        assert shares.min() > 0.95 * shares.mean()
+
+
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_first(ending, tmp_path, monkeypatch):
+    folder = write_blocks(tmp_path / "cartesian", frames=6)
+    monkeypatch.setattr("carlasc.viewing.recordings.run.MAX_POINTS", 1000)
+    said = []
+    thin = view(folder, tmp_path / f"thin{ending}", report=said.append)
+    assert said == []
+    done = []
+    full = view(
+        folder,
+        tmp_path / f"full{ending}",
+        full_points=True,
+        report=lambda text: said.append((text, len(done))),
+        progress=lambda *counts: done.append(counts),
+    )
+    ((text, before),) = said
+    assert before == 0 and done == [(i, 6) for i in range(1, 7)]
+    assert re.fullmatch(rf"{re.escape(str(full.out))}: about \d+ MB: 6 frames with all of their points", text)
+    if ending == ".rrd":
+        lengths = [len(read_rrd(r.out)[0]["/world/ego/points"][5]["Points3D:positions"]) for r in (thin, full)]
+    else:
+        lengths = [len(read_mcap(r.out)["/points"][5].message.data) // POINT.itemsize for r in (thin, full)]
+    assert lengths == [1000, 3401]
+    assert isinstance(full, RecordingResult) and full.size_bytes == full.out.stat().st_size > thin.size_bytes
+
+
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_the_size_is_estimated_within_a_few_percent(ending, tmp_path):
+    from carlasc.viewing.recordings.run import estimate_size
+
+    folder = write_blocks(tmp_path / "cartesian", frames=12)
+    result = view(folder, tmp_path / f"a{ending}", full_points=True)
+    estimate = estimate_size(Scene(folder).open().right_handed(), ending, None)
+    assert estimate == pytest.approx(result.size_bytes, rel=0.25)
+
+
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_a_scene_without_a_range_shows_its_first_frames_and_says_so(ending, blocks, tmp_path, monkeypatch):
+    monkeypatch.setattr("carlasc.viewing.recordings.run.MAX_FRAMES", 2)
+    result = view(blocks, tmp_path / f"a{ending}")
+    assert result.frames == (0, 1) and result.notes == ("3 frames found, showing the first 2",)
+    assert view(Scene(blocks, frames=(0, None)), tmp_path / f"b{ending}").frames == (0, 1, 2)
+
+
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_what_exists_is_replaced_only_on_demand_and_a_failure_leaves_nothing(ending, blocks, tmp_path):
+    out = tmp_path / f"a{ending}"
+    out.write_text("mine")
+    with pytest.raises(ConflictError):
+        view(blocks, out)
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        view(blocks, out, overwrite=True, progress=stop)
+    assert out.read_text() == "mine" and list(tmp_path.iterdir()) == [out]
+    view(blocks, out, overwrite=True)
+    assert out.stat().st_size > 10_000 and list(tmp_path.iterdir()) == [out]
+
+
+FULL_DISK = """
+import resource, signal, sys
+from carlasc.viewing import view
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+view(sys.argv[1], sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_a_file_that_cannot_be_written_is_an_error_and_leaves_nothing(ending, blocks, tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, blocks, tmp_path / f"a{ending}"], capture_output=True, text=True, check=False
+    )
+    assert StorageError.__name__ in run.stderr.splitlines()[-1] and "cannot be written" in run.stderr, run.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("ending", "module"), [(".rrd", "rerun"), (".mcap", "foxglove")])
+def test_without_the_sdk_the_error_names_the_extra(ending, module, blocks, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DependencyError, match=rf"carlasc\[{module}\]"):
+        view(blocks, tmp_path / f"a{ending}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_recordings_keep_all_points(blocks, tmp_path):
+    for out in (tmp_path / "a.html", None):
+        with pytest.raises(ArgumentError, match=r"full_points: expected a recording"):
+            view(blocks, out, full_points=True)
+
+
+def test_actors_without_boxes_are_followed_by_their_instances(tmp_path):
+    folder = write_blocks(tmp_path / "cartesian", frames=3)
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    writer.write_document(layout.POSES, layout.encode_poses(np.stack([np.eye(4)] * 3)))
+    for frame in range(3):
+        labels = np.fromfile(folder / "labels" / f"{frame:06d}.label", np.uint32)
+        writer.write("instances", frame, np.where(labels == RED, 9, 0).astype(np.uint32))
+    frames = list(record_frames(Scene(folder).open().right_handed(), None))
+    assert [len(frame.trails) for frame in frames] == [0, 1, 1]  # it has to move by a metre first
+    (trail,) = frames[2].trails
+    assert (trail.actor, trail.label) == (9, RED)
+    np.testing.assert_allclose(trail.points, [(10 + i, -5, 0) for i in range(3)], atol=0.1)
+
+
+LONG = """
+import resource, sys
+from carlasc.viewing import Scene, view
+view(Scene(sys.argv[1], frames=(0, int(sys.argv[3]))), sys.argv[2], overwrite=True)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_memory_is_flat_over_a_thousand_frames(ending, tmp_path):
+    folder = write_blocks(tmp_path / "cartesian", frames=1)
+    for name in (
+        "velodyne/{}.bin",
+        "labels/{}.label",
+        "predictions/{}.bin",
+        "evaluation/{}.label",
+        "evaluation/{}.bin",
+    ):
+        first = folder / name.format("000000")
+        for frame in range(1, 1000):
+            (folder / name.format(f"{frame:06d}")).symlink_to(first)
+    (folder / layout.TIMES).write_bytes(layout.encode_times(np.arange(1000) * 0.1))
+    most = {}
+    for count in (100, 1000):
+        run = subprocess.run(
+            [sys.executable, "-c", LONG, folder, tmp_path / f"a{ending}", str(count)],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        most[count] = int(run.stdout) / 1024
+    assert most[1000] < most[100] + 15, most  # MB
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", RECORDINGS)
+def test_sixty_frames_take_less_than_40_megabytes_and_20_seconds(ending, tmp_path):
+    folder = write_blocks(tmp_path / "cartesian", frames=4, spec=GridSpec.published())
+    rng = np.random.default_rng(0)
+    for frame in range(4):
+        name = f"{frame:06d}"
+        cloud = np.column_stack([rng.normal(0, 15, (130_000, 2)), rng.uniform(-2, 3, 130_000), np.zeros(130_000)])
+        cloud.astype(np.float32).tofile(folder / "velodyne" / f"{name}.bin")
+        rng.integers(1, 23, 130_000, np.uint32).tofile(folder / "labels" / f"{name}.label")
+        moving = rng.random(130_000) < 0.01
+        (moving[:, None] * np.array([8.0, 0, 0])).astype(np.float32).tofile(folder / "predictions" / f"{name}.bin")
+        labels = np.fromfile(folder / "evaluation" / f"{name}.label", np.uint32)
+        above = rng.permutation(labels.size)[:8_000]  # beside the 16,384 voxels of the road
+        labels[above] = rng.integers(1, 23, 8_000)
+        labels.tofile(folder / "evaluation" / f"{name}.label")
+    for frame in range(4, 60):  # four different frames, so that none repeats where a compressor would notice
+        for first in folder.rglob(f"{frame % 4:06d}.*"):
+            (first.parent / f"{frame:06d}{first.suffix}").symlink_to(first)
+    (folder / layout.TIMES).write_bytes(layout.encode_times(np.arange(60) * 0.1))
+    started = time.process_time()
+    result = view(folder, tmp_path / f"a{ending}")
+    assert len(result.frames) == 60 and result.size_bytes < 40e6
+    assert time.process_time() - started < 20
+
+
+def test_only_the_scene_reads_sequences():
+    """Whatever shows data reads it through a `SceneReader`."""
+    viewing = Path(sys.modules["carlasc.viewing"].__file__).parent
+    allowed = {"scene.py", "choosing.py", "remapping.py", "finding.py"}
+    reading = re.compile(r"\.sequence\.(read|scan|grid|boxes|frames|fields|metadata|poses|times|params)")
+    found = [
+        path.name for path in viewing.rglob("*.py") if path.name not in allowed and reading.search(path.read_text())
+    ]
+    assert found == []
