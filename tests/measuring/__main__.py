@@ -37,6 +37,7 @@ GROUPS = {  # name -> module, function, and its first arguments
     "startup": ("measuring.benchmarks", "measure_file"),
     "metrics": ("measuring.benchmarks", "measure_file"),
     "simulation": ("measuring.simulating", "measure_simulation"),
+    "recordings": ("measuring.recording", "measure_recordings"),
     "networks": ("measuring.networks", "measure_networks"),
 }
 _LONGEST_S = {"tiny": 600, "quick": 900, "full": 7200}  # of one group; what takes longer failed
