@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import FramesOption, Json, echo, file_option, print_json, progress_bar
+from carlasc.cli.common import FramesOption, Json, echo, file_option, place_option, print_json, progress_bar
 from carlasc.cli.scene_options import (
     ClassesOption,
     EveryOption,
@@ -31,8 +31,8 @@ def view(
             "-o",
             "--out",
             "--to",
-            text="Write a file instead of opening a window: a self-contained .html page for any browser, an .rrd recording for Rerun, or an .mcap"
-            " recording for Foxglove.",
+            text="Write a file instead of opening a window: an .html page for any browser, an .rrd recording for Rerun, or an .mcap recording for"
+            " Foxglove. A name without an ending: the folder of a page for a web server.",
         ),
     ] = None,
     frames: FramesOption = None,
@@ -57,13 +57,21 @@ def view(
             help="Keep all points in a recording, and say first how large it becomes. Default: 30,000 a frame.",
         ),
     ] = False,
+    beside: Annotated[
+        str | None,
+        place_option("--beside", text="Another run of the sequence, shown in the page on the other side of a divider."),
+    ] = None,
+    beside_grid: Annotated[
+        str | None,
+        typer.Option("--beside-grid", help="Name of its grid. Without --beside: another grid of SOURCE, shown so."),
+    ] = None,
     overwrite: OverwriteOption = False,
     as_json: Json = False,
 ) -> None:
     """Show a sequence in a window (Open3D), or write it as a page for any browser or as a recording for Rerun or Foxglove (--out).
 
     All can be rotated and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes.
-    Without --frames, a window shows all frames and a file shows the first 60.
+    Without --frames, a file shows the first 60 frames; a window and the folder of a page show all.
     """
     from carlasc import viewing
 
@@ -82,6 +90,8 @@ def view(
     if out is None:
         if as_json:
             raise ArgumentError("--json", problem="a window has no figures to print", advice="write a page with `out`")
+        if beside is not None or beside_grid is not None:
+            raise ArgumentError("--beside", problem="a window shows one run", advice="write a page with `out`")
         viewing.view(scene, report=echo)
         return
     with progress_bar("Writing the file") as progress:
@@ -89,6 +99,8 @@ def view(
             scene,
             out,
             thin_m=thin_m,
+            beside=beside,
+            beside_grid=beside_grid,
             full_points=full_points,
             overwrite=overwrite,
             progress=progress,
@@ -100,5 +112,10 @@ def view(
     for note in result.notes:
         echo(note)
     size = f"{result.size_bytes / 1e6:.1f} MB"
-    opened = {".rrd": "with `rerun`", ".mcap": "in Foxglove"}.get(out.suffix.lower(), "in a browser")
-    echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: open it {opened}")
+    opened = {
+        ".rrd": "open it with `rerun`",
+        ".mcap": "open it in Foxglove",
+        "": "serve it with `python -m http.server`",
+    }
+    advice = opened.get(out.suffix.lower(), "open it in a browser")
+    echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: {advice}")

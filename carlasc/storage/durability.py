@@ -78,9 +78,11 @@ def rename(old: Path, new: Path) -> None:
 
 def remove_file(path: Path) -> None:
     """Remove a file, if it exists, and wait until its name is gone from the disk, where the file would mean something to the next run."""
-    if path.exists():
-        path.unlink(missing_ok=True)
-        sync_all([path.parent])
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return
+    sync_all([path.parent])
 
 
 def make_folder(folder: Path) -> None:

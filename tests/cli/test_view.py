@@ -35,6 +35,8 @@ def test_figures_are_json(golden_capture, tmp_path):
         (["-o", "a.html", "--classes", "mine"], 2, "--classes: expected"),
         (["-o", "a.html", "--frames", "x"], 2, "--frames: expected"),
         (["--json"], 2, "--out"),
+        (["--beside", "other"], 2, "--beside: a window shows one run"),
+        (["-o", "a.mcap", "--beside", "other"], 2, "--beside: expected a page"),
     ],
 )
 def test_a_mistake_is_one_line_and_the_right_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
@@ -52,6 +54,21 @@ def test_an_existing_page_is_replaced_only_with_overwrite(tmp_path):
     assert (tmp_path / "a.html").read_text() == "mine"
     assert call(data, "-o", tmp_path / "a.html", "--overwrite").exit_code == 0
     assert (tmp_path / "a.html").read_text() != "mine"
+
+
+def test_two_runs_and_a_folder(tmp_path):
+    first, second = (
+        write_blocks(tmp_path / name / "Town01" / "cartesian", shift=shift, points=False)
+        for name, shift in (("tube", 0.0), ("align", 2.0))
+    )
+    result = call(first, "--beside", second, "-o", tmp_path / "page", "--json")
+    figures = json.loads(result.stdout)
+    assert figures["panels"] == ["tube", "align"] and (tmp_path / "page/frames/000002.bin").is_file()
+    result = call(first, "-o", f"{tmp_path}/page/", "--overwrite")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.endswith("serve it with `python -m http.server`\n")
+    again = call(first, "-o", tmp_path / "page")
+    assert again.exit_code == 1 and "`--overwrite`" in again.stderr and again.stderr.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from helpers.pixels import BLUE, RED, grid_with
 
+from carlasc.core.evidence import VoxelFlag
+from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
@@ -51,3 +53,25 @@ def write_blocks(
     if points:
         writer.write_document(layout.TIMES, layout.encode_times(np.arange(frames) * 0.1))
     return folder
+
+
+def add_evidence(folder: Path, frames: int = 3) -> None:
+    """Write how certain each voxel of `write_blocks` is: the red block was inferred, the blue one is in an actor, the road was seen."""
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    for frame in range(frames):
+        labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32).reshape(64, 64, 4)
+        kinds = [labels == RED, labels == BLUE, labels == ROAD]
+        flags = np.select(kinds, [VoxelFlag.INFERRED, VoxelFlag.IN_ACTOR | VoxelFlag.SEEN_NOW, VoxelFlag.SEEN_NOW], 0)
+        writer.write("evaluation/flags", frame, flags.astype(np.uint8))
+        writer.write("evaluation/occupied", frame, np.select(kinds, [0.6, 0.8, 1.0], 0.0).astype(np.float16))
+        writer.write("evaluation/views", frame, np.select(kinds, [0, 3, 40], 0).astype(np.uint16))
+
+
+def add_poses(folder: Path, yaws_rad: list[float], step_m: float = 5.0) -> None:
+    """Write poses of a vehicle that drives `step_m` between two frames, in the direction that it has in the first of them."""
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    pose, place = [], np.zeros(3)
+    for yaw in yaws_rad:
+        pose.append(translation(place) @ rotation_z(yaw))
+        place = place + step_m * np.array([np.cos(yaw), np.sin(yaw), 0])
+    writer.write_document(layout.POSES, layout.encode_poses(np.stack(pose)))

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +40,31 @@ def start_chromium(profile: Path) -> Any:
     return browser
 
 
-class Page:
-    """A page that `carlasc view --out` wrote, opened."""
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        """Print nothing."""
 
-    def __init__(self, browser: Any, path: Path, size: tuple[int, int] = (1000, 640)) -> None:
+
+@contextmanager
+def serve_folder(folder: Path) -> Iterator[str]:
+    """Run a web server for a folder on a free port of this machine, as `python -m http.server` does; yields its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+class Page:
+    """A page that `carlasc view --out` wrote, opened from a file or from an address."""
+
+    def __init__(self, browser: Any, path: Path | str, size: tuple[int, int] = (1000, 640)) -> None:
         self.browser = browser
         browser.get_log("browser")  # of the page before
         browser.set_window_size(*size)
-        browser.get(path.absolute().as_uri())
+        browser.get(path if isinstance(path, str) else path.absolute().as_uri())
         self.run(
             "while (!document.documentElement.dataset.ready && !window.failed) {"
             " await new Promise((done) => setTimeout(done, 20));"

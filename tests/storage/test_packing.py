@@ -432,12 +432,13 @@ def test_the_limits_of_quantisation(millimetres: float) -> None:
     assert Options(lossy_mm=millimetres).scale_m == millimetres / 1000
 
 
-def test_leftovers_of_an_older_replacement_are_removed(data: Path, tmp_path: Path) -> None:
+def test_leftovers_of_an_older_replacement_are_removed_and_a_copy_of_the_user_stays(data: Path, tmp_path: Path) -> None:
     pack(data / "Val", tmp_path / "x.h5")
-    (tmp_path / "x.h5.old").mkdir()
-    (tmp_path / "x.h5.old" / "file").write_bytes(b"1")
+    for name in (".x.h5.replaced", "x.h5.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_bytes(b"1")
     pack(data / "Val", tmp_path / "x.h5", overwrite=True)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["x.h5"]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["x.h5", "x.h5.old"]
 
 
 def test_a_file_that_appears_meanwhile_is_not_overwritten(data: Path, tmp_path: Path) -> None:

@@ -239,12 +239,37 @@ def test_overwrite_keeps_the_old_store_until_the_new_one_is_finished(store: Path
     before = files_of(store)
     sink = ZarrSink(store, overwrite=True)
     sink.sequence(SCANS).close()
-    assert files_of(store.with_name("x.zarr.old")) == before
+    assert files_of(store.with_name(".x.zarr.replaced")) == before
     joined = ZarrSink(store, overwrite=True)  # a second process of the same run, or the run again
     assert not joined.is_finished
     joined.finish()
     assert list(carlasc.open(store).sequences()) == [SCANS]
     assert [entry.name for entry in tmp_path.iterdir()] == ["x.zarr"]
+
+
+def test_a_run_that_ends_between_the_old_store_and_the_new_one_leaves_nothing_in_the_end(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(*_: object, **__: object) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("carlasc.storage.targets.LocalTarget.put", end)
+        with pytest.raises(KeyboardInterrupt):
+            ZarrSink(store, overwrite=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == [".x.zarr.replaced"]
+    sink = ZarrSink(store, overwrite=True)
+    sink.sequence(SCANS).close()
+    sink.finish()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.zarr"]
+
+
+def test_a_folder_that_only_has_the_name_of_an_old_store_stays(store: Path, tmp_path: Path) -> None:
+    mine = store.rename(tmp_path / "x.zarr.old")
+    sink = ZarrSink(store)
+    sink.sequence(SCANS).close()
+    sink.finish()
+    assert list(carlasc.open(mine).sequences()) != []
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -15,6 +15,7 @@ from carlasc.captures import Lidar
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError
+from carlasc.groundtruth import FromScans, Voting
 from carlasc.viewing.window.libraries import import_open3d
 
 pytestmark = pytest.mark.slow
@@ -38,6 +39,42 @@ def test_the_page_of_a_street(browser, street, tmp_path):
     page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.setView('top')")
     above = page.canvas("docs_page_dark")
     assert np.median(above.reshape(-1, 3)[:, 0]) < 140
+    assert page.complaints() == []
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A street with two grids that were merged from scans in two ways, and the truth."""
+    folder = tmp_path_factory.mktemp("drive") / "Train" / "Demo_Heavy"
+    simulate(folder, count=16, sensors=4, traffic="heavy", lidar=Lidar(points=40_000), bev=False, workers=1)
+    regrid(folder, GridSpec.published(), workers=1)
+    for name in ("tube", "align"):
+        scans = FromScans(window=(-6, 6), dynamic=name)
+        regrid(
+            folder / "cartesian",
+            GridSpec.published(),
+            observe=scans,
+            voting=Voting(keep_evidence=True),
+            name=name,
+            workers=1,
+        )
+    return folder / "cartesian"
+
+
+@pytest.mark.slow
+def test_the_page_of_two_runs(browser, drive, tmp_path):
+    truth = drive / "evaluation"
+    result = write_page(drive, tmp_path / "scene.html", grid="tube", beside_grid="align", truth=truth)
+    page = Page(browser, result.out, (1280, 860))
+    page.run("carlasc.panels.setShadows(true)")
+    page.click("[data-panel='truth']")
+    page.click("[data-panel='errors']")
+    page.run("await carlasc.show(12); document.activeElement.blur()")
+    canvas = page.canvas("docs_runs")
+    for name in ("Road", "Sidewalk", "Vehicle"):
+        assert has_color(canvas, CARLA.colors[CARLA.id_of(name)])
+    scores = page.run("return carlasc.scene.scores.miou")
+    assert np.mean(scores[1]) > np.mean(scores[0])  # moving actors leave no traces
     assert page.complaints() == []
 
 

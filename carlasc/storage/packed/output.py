@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
-from carlasc.storage.durability import make_folder, rename
+from carlasc.storage.durability import make_folder, remove_file, rename, sync_all
 from carlasc.storage.files import storage_error
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
@@ -54,6 +54,11 @@ def unfinished(path: Path) -> Path:
     return path.with_name(f"{path.name}.part")
 
 
+def replaced(path: Path) -> Path:
+    """Return where an older store waits until the new one is whole: under a hidden name, which no user gives to a copy of their own."""
+    return path.with_name(f".{path.name}.replaced")
+
+
 def unfinished_error(where: str | os.PathLike[str]) -> FormatError:
     """Return the error of a store that is being written, or whose writing was interrupted: the same for every format."""
     return FormatError(
@@ -71,7 +76,7 @@ def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
         ConflictError: something exists there that may not be overwritten.
         StorageError: it cannot be renamed.
     """
-    old = path.with_name(f"{path.name}.old")
+    old = replaced(path)
     try:
         if path.exists():
             refuse_existing(path, overwrite)
@@ -191,8 +196,9 @@ class PatientFile(io.RawIOBase):
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if it exists."""
+    """Remove a file or a folder, if it exists, and wait until its name is gone from the disk."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
+        sync_all([path.parent])
     else:
-        path.unlink(missing_ok=True)
+        remove_file(path)

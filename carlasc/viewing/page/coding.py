@@ -40,6 +40,23 @@ def encode_grid(grid: Grid) -> Arrays:
     return arrays
 
 
+def encode_evidence(grid: Grid, fields: Mapping[str, NDArray[Any]]) -> Arrays:
+    """Encode what is known of the occupied voxels of a grid besides their classes (see `docs/format.md#evidence`).
+
+    Args:
+        grid: the grid.
+        fields: those of "occupied", "views" and "flags" that it has, each (X, Y, Z).
+
+    Returns:
+        For each of these fields an array with a value of each occupied voxel. `occupied` is in 1/255: 255 is the probability 1.
+    """
+    chosen = np.flatnonzero(grid.labels.reshape(-1))
+    arrays = {name: field.reshape(-1)[chosen] for name, field in fields.items()}
+    if "occupied" in arrays:
+        arrays["occupied"] = np.round(255 * np.clip(arrays["occupied"].astype(np.float32), 0, 1)).astype(np.uint8)
+    return {name: _narrow(values) for name, values in arrays.items()}
+
+
 def encode_scan(scan: Scan, cell_m: float) -> Arrays:
     """Encode a scan, thinned to one point per cell, and an arrow for each moving actor.
 

@@ -1,26 +1,24 @@
-"""A scene as one self-contained HTML file that any browser opens, without a network."""
+"""A scene as a page that any browser opens: one self-contained HTML file, or a folder of which a browser fetches the frames that it shows."""
 
 from __future__ import annotations
 
-import base64
-import html
-import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
 from carlasc.errors import ArgumentError
 from carlasc.storage.files import write_output
-from carlasc.viewing.colors import ClassColors
-from carlasc.viewing.page.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays
-from carlasc.viewing.scene import GridPanel, Scene, SceneReader
+from carlasc.viewing.finding import SceneSource
+from carlasc.viewing.page.assembly import compose
+from carlasc.viewing.page.coding import pack_arrays
+from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content
+from carlasc.viewing.page.folder import FRAMES, check_folder, writing_folder
+from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import check_target
 
-MAX_FRAMES = 60  # of a page, if the scene gives no range: a few megabytes
-_SCRIPTS = ("decode.js", "voxels.js", "points.js", "panels.js", "interface.js", "viewer.js")
+MAX_FRAMES = 60  # of a page in one file, if the scene gives no range: a few megabytes
 
 
 @dataclass(frozen=True)
@@ -28,11 +26,11 @@ class PageResult:
     """The page that was written.
 
     Attributes:
-        out: the file.
+        out: the file, or the folder.
         sequence: path of the sequence.
-        panels: titles of the grids that are shown side by side.
+        panels: titles of the grids.
         frames: the frames in the page.
-        size_bytes: size of the file.
+        size_bytes: size of the file, or of all files in the folder.
         elapsed_s: how long it took, seconds.
         notes: what was chosen where the scene left a choice.
     """
@@ -51,99 +49,72 @@ def write_page(
     out: Path,
     *,
     thin_m: float,
+    beside: SceneSource | None = None,
+    beside_grid: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> PageResult:
     """Write a scene as a page; see `carlasc.viewing.view` for the arguments and errors."""
     started = time.monotonic()
-    check_target(out, (".html", ".htm"), overwrite)
+    in_folder = out.suffix == ""
+    if in_folder:
+        check_folder(out, overwrite)
+    else:
+        check_target(out, (".html", ".htm"), overwrite)
     if not 0.01 <= thin_m <= 10:
         raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=str(thin_m))
-    reader = scene.open()
-    if scene.frames is None and len(reader.frames) > MAX_FRAMES:
-        note = f"{len(reader.frames)} frames found, showing the first {MAX_FRAMES}"
-        reader = replace(reader, frames=reader.frames[:MAX_FRAMES], notes=(*reader.notes, note))
-    blocks = []
-    for done, frame in enumerate(reader.frames, 1):
-        blocks.append(encode_frame(reader, frame, thin_m))
-        if progress is not None:
-            progress(done, len(reader.frames))
-    page = compose(describe(reader, thin_m), blocks).encode()
-    write_output(out, page)
-    titles = tuple(panel.title for panel in reader.panels)
-    return PageResult(
-        out, reader.path, titles, reader.frames, len(page), time.monotonic() - started, reader.notes
-    )  # fmt: skip
+    content = open_content(scene, thin_m, beside, beside_grid)
+    notes = content.reader.notes
+    if not in_folder and scene.frames is None and len(content.frames) > MAX_FRAMES:
+        notes = (*notes, f"{len(content.frames)} frames found, showing the first {MAX_FRAMES}")
+        content = replace(content, frames=content.frames[:MAX_FRAMES])
+    writer = _Writer(content, progress)
+    size = writer.write_folder(out) if in_folder else writer.write_file(out)
+    titles = tuple(panel.title for panel in content.panels)
+    elapsed = time.monotonic() - started
+    return PageResult(out, content.reader.path, titles, content.frames, size, elapsed, notes)
 
 
-def encode_frame(reader: SceneReader, frame: int, thin_m: float) -> bytes:
-    """Return a frame as one block of arrays named `panel0/index`, ... and `scan/index`, ... (see `coding`)."""
-    content = reader.read(frame)
-    arrays: dict[str, Any] = {}
-    for number, grid in enumerate(content.grids):
-        arrays |= {f"panel{number}/{name}": array for name, array in encode_grid(grid).items()}
-    if content.scan is not None:
-        arrays |= {f"scan/{name}": array for name, array in encode_scan(content.scan, thin_m).items()}
-    return pack_arrays(arrays)
+class _Writer:
+    """Writes the frames of a page one after the other, and then what describes them."""
 
+    def __init__(self, content: PageContent, progress: Callable[[int, int], None] | None) -> None:
+        self.content = content
+        self.progress = progress
+        self.scores: list[FrameScores | None] = []
 
-def describe(reader: SceneReader, thin_m: float) -> dict[str, Any]:
-    """Return what the scripts of the page need to know besides the blocks of the frames."""
-    tables = {colors.table.name: colors for colors in (reader.colors, *(panel.colors for panel in reader.panels))}
-    return {
-        "name": reader.name,
-        "leftHanded": reader.left_handed,
-        "tables": {name: _describe_classes(colors) for name, colors in tables.items()},
-        "pointTable": reader.table.name,
-        "panels": [_describe_panel(panel) for panel in reader.panels],
-        "frames": list(reader.frames),
-        "times": [reader.read_time(frame) for frame in reader.frames],
-        "hasPoints": reader.has("points"),
-        "hasFlow": reader.has("flow"),
-        "pointCell": thin_m,
-        "offsetSteps": OFFSET_STEPS,
-    }
+    def write_file(self, out: Path) -> int:
+        """Write one file that contains the frames; return its size in bytes."""
 
+        def write(file: BinaryIO) -> None:
+            file.writelines(compose(self.content.reader.name, self.describe, self.blocks()))
 
-def compose(scene: dict[str, Any], blocks: list[bytes]) -> str:
-    """Return the page: the template with the style, three.js, the scripts, the description of the scene and its frames."""
-    assets = files("carlasc.viewing.page").joinpath("assets")
-    scripts = "\n".join(assets.joinpath(name).read_text("utf-8") for name in _SCRIPTS)
-    licence = assets.joinpath("vendor/three.LICENSE").read_text("utf-8")
-    data = "\n".join(
-        f'<script type="application/octet-stream" id="frame{number}">{base64.b64encode(block).decode()}</script>'
-        for number, block in enumerate(blocks)
-    )
-    parts = {
-        "TITLE": html.escape(scene["name"]),
-        "STYLE": assets.joinpath("style.css").read_text("utf-8"),
-        "LICENCE": html.escape(licence).replace("--", "- -"),
-        "SCENE": json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c"),
-        "FRAMES": data,
-        "THREE": assets.joinpath("vendor/three.min.js").read_text("utf-8"),
-        "SCRIPTS": f'"use strict";\n{scripts}',
-    }
-    page = assets.joinpath("template.html").read_text("utf-8")
-    head, *rest = page.split("{{")
-    return head + "".join(parts[name] + text for name, text in (piece.split("}}", 1) for piece in rest))
+        write_output(out, write)
+        return out.stat().st_size
 
+    def write_folder(self, out: Path) -> int:
+        """Write index.html and a file for each frame; return their size in bytes."""
+        with writing_folder(out) as folder:
+            for number, block in enumerate(self.blocks()):
+                folder.write(f"{FRAMES}/{number:06d}.bin", block)
+            folder.write("index.html", b"".join(compose(self.content.reader.name, self.describe, None)))
+        return folder.size_bytes
 
-def _describe_panel(panel: GridPanel) -> dict[str, Any]:
-    spec = panel.spec
-    return {
-        "title": panel.title,
-        "table": panel.colors.table.name,
-        "coordinates": spec.coordinates,
-        "size": list(spec.size),
-        "lower": list(spec.lower),
-        "upper": list(spec.upper),
-        "voxel": spec.voxel_size.tolist(),
-    }
+    def blocks(self) -> Iterator[bytes]:
+        """Yield the frames, each as one block of arrays (see `coding`)."""
+        for done, frame in enumerate(self.content.frames, 1):
+            arrays, scores = self.content.read(frame)
+            self.scores.append(scores)
+            yield pack_arrays(arrays)
+            if self.progress is not None:
+                self.progress(done, len(self.content.frames))
 
-
-def _describe_classes(colors: ClassColors) -> list[list[Any]]:
-    """Return [name, "#rrggbb"] by class id."""
-    return [
-        [colors.table.names.get(number, f"class {number}"), "#" + bytes(color.tolist()).hex()]
-        for number, color in enumerate(colors.by_id)
-    ]
+    def describe(self) -> dict[str, object]:
+        """Return the description of the scene, with the scores of the frames that were written."""
+        scored = [scores for scores in self.scores if scores is not None]
+        runs = range(len(self.content.runs))
+        found = {
+            name: [[json_number(getattr(scores, name)[run]) for scores in scored] for run in runs]
+            for name in ("miou", "iou")
+        }
+        return self.content.describe() | {"scores": found if scored else None}

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
+from carlasc.storage.durability import rename
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.packed.arrays.fields import VERSION
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
-from carlasc.storage.packed.output import remove
+from carlasc.storage.packed.output import remove, replaced
 from carlasc.storage.packed.protocol import STORE, Options
 from carlasc.storage.targets import LocalTarget, Target
 
 _TRIES = 5  # other processes may begin, finish and replace the same store meanwhile
 _OPTIONS = ("block", "lossy_mm", "small")
-_REPLACES = "replaces"  # attribute of an unfinished store: whether an older one waits as `<name>.old`
 
 
 class Root:
@@ -51,18 +50,15 @@ class Root:
         """
         if self._begun:
             return
-        replaced = False
         for _ in range(_TRIES):
             root = read_root(self._target)
             if root is None:
                 _refuse_other(self._target)
-                about = self._wanted | ({_REPLACES: True} if replaced else {})
-                self._begun = self._target.put(METADATA, to_json(group_metadata(about)), create=True)
+                self._begun = self._target.put(METADATA, to_json(group_metadata(self._wanted)), create=True)
             elif self._joins(root):
                 self._begun = True
             else:
-                finished = root.get("complete") is True
-                replaced = _move_away(self._target, finished=finished) or root.get(_REPLACES) is True
+                _move_away(self._target, finished=root.get("complete") is True)
             if self._begun:
                 return
         raise ConflictError(self._target.location, problem="other processes keep replacing it", advice="wait for them")
@@ -123,16 +119,10 @@ def read_root(target: Target) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else {}
 
 
-def root_of(attributes: dict[str, Any]) -> tuple[dict[str, Any], bool]:
-    """Return the attributes of the root of a finished store, and whether it replaces an older one."""
-    kept = {name: value for name, value in attributes.items() if name != _REPLACES}
-    return kept | {"complete": True}, attributes.get(_REPLACES) is True
-
-
 def remove_replaced(target: Target) -> None:
-    """Remove the older store that a finished one replaces."""
+    """Remove the older store that a finished one replaces, if there is one: also one that was moved away by a run that ended right after that."""
     if isinstance(target, LocalTarget):
-        remove(_old(target.folder))
+        remove(replaced(target.folder))
 
 
 def _refuse_other(target: Target) -> None:
@@ -147,20 +137,15 @@ def _refuse_other(target: Target) -> None:
         )
 
 
-def _move_away(target: Target, *, finished: bool) -> bool:
-    """Move a finished local store to `<name>.old`; remove any other one, root first. Return whether it was moved."""
+def _move_away(target: Target, *, finished: bool) -> None:
+    """Move a finished local store away until the new one is finished; remove any other one, root first."""
     if not (isinstance(target, LocalTarget) and finished):
         target.remove(METADATA)
         target.remove("")
-        return False
-    old = _old(target.folder)
+        return
+    old = replaced(target.folder)
     try:
         remove(old)
-        target.folder.rename(old)
+        rename(target.folder, old)
     except OSError as error:
         raise StorageError(target.location, problem=f"cannot be replaced: {error.strerror or error}") from error
-    return True
-
-
-def _old(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.old")

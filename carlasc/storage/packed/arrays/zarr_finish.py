@@ -21,7 +21,7 @@ from carlasc.storage.packed.arrays.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.arrays.fields import VERSION, FieldLayout
 from carlasc.storage.packed.arrays.reading import FIELD, SEQUENCE, document_node, field_node
 from carlasc.storage.packed.arrays.shards import encode_chunk
-from carlasc.storage.packed.arrays.zarr_begin import read_root, remove_replaced, root_of
+from carlasc.storage.packed.arrays.zarr_begin import read_root, remove_replaced
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA, array_metadata, group_metadata
 from carlasc.storage.packed.protocol import STORE, check_names
 from carlasc.storage.targets import LocalTarget, Target
@@ -126,7 +126,7 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
     check_names([*sequences, *sequences.values()], target.location)
     if result.missing and not incomplete:
         raise _missing(result)
-    about, replaces = root_of(root)
+    about = root | {"complete": True}
     sequences = dict(sorted(sequences.items()))
     if (
         root.get("complete") is True
@@ -135,8 +135,7 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
     target.put_many(nodes.files | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()})
     all_nodes = dict(sorted(nodes.metadata.items()))
     target.put(METADATA, to_json(group_metadata(about | {"sequences": sequences}, all_nodes)))
-    if replaces:
-        remove_replaced(target)
+    remove_replaced(target)
     return result
 
 

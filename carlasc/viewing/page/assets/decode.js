@@ -1,7 +1,6 @@
-// Decoding the text of the page to typed arrays: the inverse of carlasc/viewing/page/coding.py.
+// Decoding the bytes of a frame to typed arrays: the inverse of carlasc/viewing/page/coding.py.
 
-async function inflate(base64) {
-  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+async function inflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));
   return new Response(stream).arrayBuffer();
 }
@@ -36,7 +35,7 @@ function sumUp(gaps) {
   return values;
 }
 
-/** Returns the voxels of a panel: C-order index, label and votes of each occupied cell, the labels of all cells, the unknown cells. */
+/** Returns the voxels of a panel: C-order index, label, votes and evidence of each occupied cell, the labels of all cells, the unknown cells. */
 function decodeGrid(arrays, prefix, panel) {
   const index = sumUp(arrays[`${prefix}/index`]);
   const label = arrays[`${prefix}/label`];
@@ -49,7 +48,8 @@ function decodeGrid(arrays, prefix, panel) {
     unknown = new Uint8Array(volume.length);
     for (let i = 0; i < turns.length; i += 2) unknown.fill(1, turns[i], i + 1 < turns.length ? turns[i + 1] : volume.length);
   }
-  return { index, label, votes: arrays[`${prefix}/votes`] ?? null, volume, unknown };
+  const [votes, occupied, views, flags] = ['votes', 'occupied', 'views', 'flags'].map((name) => arrays[`${prefix}/${name}`] ?? null);
+  return { index, label, votes, occupied, views, flags, volume, unknown };
 }
 
 /** Returns the points of a scan (x, y, z of each, metres), their labels, and the arrows. */
@@ -68,26 +68,4 @@ function decodeScan(arrays, scene) {
     for (let a = 0; a < 3; a++) points[3 * i + a] = (cell[a] + (offset[a * count + i] + 0.5) / scene.offsetSteps) * scene.pointCell;
   }
   return { points, label: arrays['scan/label'] ?? new Uint8Array(count), arrows: arrays['scan/arrows'] ?? new Float32Array(0) };
-}
-
-/** Decodes frames when they are needed, and keeps the last eight. */
-class FrameStore {
-  constructor(scene) {
-    this.scene = scene;
-    this.kept = new Map();
-  }
-
-  get(position) {
-    if (!this.kept.has(position)) {
-      if (this.kept.size >= 8) this.kept.delete(this.kept.keys().next().value);
-      this.kept.set(position, this.decode(position));
-    }
-    return this.kept.get(position);
-  }
-
-  async decode(position) {
-    const arrays = unpackArrays(await inflate(document.getElementById(`frame${position}`).textContent));
-    const grids = this.scene.panels.map((panel, number) => decodeGrid(arrays, `panel${number}`, panel));
-    return { grids, scan: decodeScan(arrays, this.scene) };
-  }
 }

@@ -23,7 +23,7 @@ function toggleButton(label, on, change, attributes = {}) {
 }
 
 function swatch(color) {
-  const element = make('span', { class: 'swatch' });
+  const element = make('span', { class: 'swatch', 'aria-hidden': 'true' });
   element.style.background = color;
   return element;
 }
@@ -36,14 +36,14 @@ class Legend {
     this.change = change;
     this.hidden = new Set();
     this.rows = new Map();
-    const all = make('button', { title: 'Show all classes' }, 'all');
-    const none = make('button', { title: 'Hide all classes' }, 'none');
+    const all = make('button', { title: `Show all ${title.toLowerCase()}`, 'aria-label': `Show all ${title.toLowerCase()}` }, 'all');
+    const none = make('button', { title: `Hide all ${title.toLowerCase()}`, 'aria-label': `Hide all ${title.toLowerCase()}` }, 'none');
     all.addEventListener('click', () => this.setAll(true));
     none.addEventListener('click', () => this.setAll(false));
     this.body = make('tbody');
-    const heads = columns.map((name) => make('th', {}, name));
-    const rows = make('table', {}, make('thead', {}, make('tr', {}, make('th'), ...heads)), this.body);
-    this.element = make('section', { 'data-table': table }, make('div', { class: 'legend-head' }, make('h2', {}, title), all, none), rows);
+    const heads = columns.map((name) => make('th', { scope: 'col', title: name }, make('span', {}, name)));
+    const rows = make('table', { 'aria-label': `${title} of this frame` }, make('thead', {}, make('tr', {}, make('td'), ...heads)), this.body);
+    this.element = make('section', { 'data-table': table, 'aria-label': title }, make('div', { class: 'legend-head' }, make('h2', {}, title), all, none), rows);
   }
 
   /** Shows the counts of a frame: for each column, an array indexed by class id. */
@@ -110,11 +110,15 @@ function fillCard(card, scene, contents, picked) {
   const own = contents.grids[number];
   const label = own.volume[index];
   const lines = [];
-  scene.panels.forEach((other, i) => { if (i !== number) lines.push([other.title, nameOf(i)]); });
+  scene.panels.forEach((other, i) => { if (i !== number && sameCells(other, spec)) lines.push([other.title, nameOf(i)]); });
+  const place = own.index.indexOf(index);
   if (own.votes) {
-    const votes = own.votes[own.index.indexOf(index)];
+    const votes = own.votes[place];
     lines.push(['votes', Number.isInteger(votes) ? grouped(votes) : votes.toFixed(2)]);
   }
+  if (own.occupied) lines.push(['occupied with probability', (own.occupied[place] / 255).toFixed(2)]);
+  if (own.views) lines.push(['views', grouped(own.views[place])]);
+  if (own.flags) for (const { flag, name } of KNOWLEDGE) if (own.flags[place] & flag) lines.push(['evidence', name]);
   lines.push(['voxel', cell.join(', ')]);
   lines.push(['x, y, z', `${center.map((value) => value.toFixed(2)).join(', ')} m`]);
   if (polar) lines.push(['radius, azimuth', `${axes[0].toFixed(2)} m, ${((axes[1] * 180) / Math.PI).toFixed(1)}°`]);
@@ -122,5 +126,12 @@ function fillCard(card, scene, contents, picked) {
   const list = make('dl', {}, ...lines.flatMap(([term, text]) => [make('dt', {}, term), make('dd', {}, text)]));
   card.replaceChildren(make('header', {}, swatch(color), make('span', {}, `${name} (${label})`)), list);
   card.hidden = false;
-  return { class: name, label, cell, center, lines: Object.fromEntries(lines) };
+  return { class: name, label, panel: spec, cell, center, lines: Object.fromEntries(lines) };
+}
+
+/** Returns how many values are 0, 1, ... of a number of classes. */
+function countBy(labels, classes) {
+  const counts = new Uint32Array(classes);
+  for (const label of labels) counts[label]++;
+  return counts;
 }

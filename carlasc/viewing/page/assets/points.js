@@ -36,7 +36,7 @@ class ScanLayer {
     const voxel = panel ? 1.2 * Math.max(panel.voxel[0], panel.voxel[2]) : 0;
     this.uniforms = {
       palette: { value: palette },
-      ramp: { value: colorTexture(RAMP, THREE.LinearFilter) },
+      ramp: { value: rampOf(MODES.height) },
       byHeight: { value: false },
       heights: { value: new THREE.Vector2(...heights) },
       scale: { value: 80 },

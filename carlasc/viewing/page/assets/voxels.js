@@ -3,7 +3,6 @@
 // The axes of the scene are right-handed: x to the right, y up, z backwards. CarlaSC's axes are left-handed (x forward, y right, z up), so
 // axes only change their names (`side` is +1); in right-handed data (y left) y changes its sign too (`side` is -1).
 
-const RAMP = ['#440154', '#3b528b', '#21918c', '#5ec962', '#fde725']; // viridis: lightness increases from the first to the last
 const WIDEST_ARC = (4 * Math.PI) / 180; // wider cells are drawn in several flat pieces
 
 const GRID_GLSL = /* glsl */ `
@@ -132,8 +131,10 @@ function colorTexture(colors, filter) {
 
 /** Draws the voxels of one panel. Classes can be hidden, and a voxel can be marked. */
 class VoxelLayer {
-  constructor(panel, side, palette) {
+  constructor(panel, side, palette, sun) {
     this.panel = panel;
+    this.mode = MODES.class;
+    this.most = 0;
     const [nx, ny, nz] = panel.size;
     const cylindrical = panel.coordinates === 'cylindrical';
     this.closed = cylindrical && panel.upper[1] - panel.lower[1] > 2 * Math.PI - 1e-3;
@@ -153,10 +154,10 @@ class VoxelLayer {
       closed: { value: this.closed },
       side: { value: side },
       palette: { value: palette },
-      ramp: { value: colorTexture(RAMP, THREE.LinearFilter) },
+      ramp: { value: rampOf(MODES.height) },
       byRamp: { value: false },
       occupancy: { value: this.occupancy },
-      sun: { value: new THREE.Vector3(-0.5, 0.78, 0.38).normalize() },
+      sun: { value: sun },
       shadows: { value: true },
       picked: { value: -1 },
     };
@@ -171,7 +172,8 @@ class VoxelLayer {
   }
 
   /** Sets the voxels of a frame. */
-  set(grid) {
+  set(grid, most) {
+    this.most = most;
     if (this.grid !== grid) {
       this.grid = grid;
       this.drawn = this.visible(grid);
@@ -219,35 +221,22 @@ class VoxelLayer {
     geometry.setAttribute('normal', this.box.getAttribute('normal'));
     geometry.setAttribute('cell', new THREE.InstancedBufferAttribute(cells, 3));
     geometry.setAttribute('label', new THREE.InstancedBufferAttribute(labels, 1));
-    geometry.setAttribute('value', new THREE.InstancedBufferAttribute(this.rampValues(cells), 1, true));
+    const values = this.mode.values(this.grid, this.drawn, this.panel, this.most);
+    const uniforms = this.material.uniforms;
+    uniforms.byRamp.value = values !== null;
+    if (values) uniforms.ramp.value = rampOf(this.mode);
+    geometry.setAttribute('value', new THREE.InstancedBufferAttribute(values ?? new Uint8Array(count), 1, true));
     geometry.instanceCount = count;
     this.mesh.geometry.dispose();
     this.mesh.geometry = geometry;
-    this.material.uniforms.picked.value = -1;
+    uniforms.picked.value = -1;
     this.shade();
   }
 
-  /** Returns the position of each drawn voxel on the ramp, 0 to 255: its height, or the logarithm of its votes. */
-  rampValues(cells) {
-    const values = new Uint8Array(this.drawn.length);
-    const { votes } = this.grid;
-    const most = Math.log1p(this.mostVotes());
-    for (let k = 0; k < values.length; k++) {
-      if (this.colorBy === 'height') values[k] = (255 * cells[3 * k + 2]) / Math.max(this.panel.size[2] - 1, 1);
-      else if (this.colorBy === 'votes' && votes) values[k] = (255 * Math.log1p(votes[this.drawn[k]])) / Math.max(most, 1e-6);
-    }
-    return values;
-  }
-
-  mostVotes() {
-    let most = 0;
-    for (const vote of this.grid?.votes ?? []) if (vote > most) most = vote;
-    return most;
-  }
-
-  colorAs(mode) {
-    this.colorBy = mode;
-    this.material.uniforms.byRamp.value = mode === 'height' || (mode === 'votes' && Boolean(this.grid?.votes));
+  /** Colours the voxels in one of the MODES; `most` is the largest value of the mode in any panel. */
+  colorAs(mode, most) {
+    this.mode = mode;
+    this.most = most;
     if (this.grid) this.build();
   }
 
