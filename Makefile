@@ -8,7 +8,7 @@ SIDE_BY_SIDE := -q -n auto --dist worksteal
 COVERAGE := 90 # percent; below it, `make coverage` fails
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage faults lint types unit benchmark benchmark-ssc docs notebooks page clean
+.PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage faults lint types unit benchmark figures benchmark-ssc docs notebooks page clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -53,6 +53,10 @@ faults: $(VENV)/ready ## kill, damage and deceive every command, and publish the
 	@$(RUN)/python -c "import atheris" 2>/dev/null || $(RUN)/pip install --quiet --constraint constraints.txt "atheris>=3.0" \
 		|| echo "atheris cannot be installed here: mutations that are guided by coverage are left out"
 	PYTHONPATH=tests:examples $(RUN)/python -m faults --size $(or $(SIZE),quick) $(if $(COUNT),--count $(COUNT))
+
+figures: $(VENV)/ready ## measure every figure of the documentation, on an idle machine, 20 minutes (SIZE=full: an hour or more; SIZE=tiny: try all, into build/; ONLY=GROUP)
+	@mkdir -p build
+	PYTHONPATH=tests $(RUN)/python -m measuring --size $(or $(SIZE),quick) $(if $(ONLY),--only $(ONLY)) $(if $(filter tiny,$(SIZE)),--out build/figures.json)
 
 benchmark-ssc: $(VENV)/ready ## train networks on simulated drives and print the tables, 20 minutes (SIZE=medium: hours, SIZE=full: on a GPU)
 	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small)

@@ -45,6 +45,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.groundtruth import Voting as Voting
     from carlasc.groundtruth import regrid as regrid
     from carlasc.inspection import card as card
+    from carlasc.inspection import doctor as doctor
     from carlasc.inspection import info as info
     from carlasc.inspection import report as report
     from carlasc.inspection import stats as stats
@@ -128,6 +129,7 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
     "metrics": ("evaluate", "scores"),
     "inspection": (
         "card",
+        "doctor",
         "info",
         "report",
         "stats",

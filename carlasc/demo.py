@@ -36,6 +36,7 @@ class DemoResult:
         sequence: folder of the simulated sequence, with its raw capture and its ground truth.
         grids: folders of the grids.
         pictures: files of the pictures.
+        page: file of the page, which opens in any browser.
         validation: result of validating everything.
         statistics: class statistics.
         elapsed_s: duration, seconds.
@@ -44,6 +45,7 @@ class DemoResult:
     sequence: Path
     grids: tuple[Path, ...]
     pictures: tuple[Path, ...]
+    page: Path
     validation: ValidationResult
     statistics: Statistics
     elapsed_s: float
@@ -60,7 +62,7 @@ def demonstrate(
 ) -> DemoResult:
     """Simulate a short drive, make its ground truth in three grids, validate it, count its classes, and draw it.
 
-    A second run with the same arguments makes only what is missing, and draws the pictures again.
+    A second run with the same arguments makes only what is missing, and draws the pictures and the page again.
 
     Args:
         out: folder to write to.
@@ -82,7 +84,7 @@ def demonstrate(
     from carlasc.groundtruth import regrid
     from carlasc.inspection.statistics import stats
     from carlasc.inspection.validation import validate
-    from carlasc.viewing import render
+    from carlasc.viewing import Scene, render, view
 
     start, out, step = time.perf_counter(), Path(out), step or _without_progress
     sequence = out / SEQUENCE
@@ -100,18 +102,22 @@ def demonstrate(
             if made.failures:
                 raise ConflictError(made.failures[0].message)
             grids += [Path(folder) for folder in made.grids]
-    with step("read it back") as progress:
+    with step("check every file") as progress:
         validation = validate(out, every=1, progress=progress)
     with step("count classes") as progress:
         statistics = stats(out, progress=progress)
     pictures = []
     with step("draw") as progress:
         jobs = _list_pictures(out, grids, count - 1)
-        for number, (path, scene, what, view) in enumerate(jobs, 1):
-            render(scene, path, what=what, view=view, overwrite=True)
+        for number, (path, scene, what, side) in enumerate(jobs, 1):
+            render(scene, path, what=what, view=side, overwrite=True)
             pictures.append(path)
             progress(number, len(jobs))
-    return DemoResult(sequence, tuple(grids), tuple(pictures), validation, statistics, time.perf_counter() - start)
+    page = out / "page.html"
+    with step("write a page for a browser") as progress:
+        view(Scene(grids[0]), page, overwrite=True, progress=progress)
+    elapsed_s = time.perf_counter() - start
+    return DemoResult(sequence, tuple(grids), tuple(pictures), page, validation, statistics, elapsed_s)
 
 
 def _demo_grids() -> dict[str, GridSpec]:

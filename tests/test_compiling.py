@@ -4,6 +4,10 @@ import os
 import subprocess
 import sys
 
+import pytest
+
+from carlasc import first_use
+
 PROGRAM = """
 import numpy as np
 from numba.core import event
@@ -37,3 +41,64 @@ def test_loops_compile_without_the_messages_of_numpy(tmp_path):
     compiled = [line.split() for line in ran.stdout.splitlines()]
     assert {"_count_pairs", "_fill", "hits", "_rays"} <= {name for _, name in compiled}
     assert not [name for module, name in compiled if "unicode" in module]
+
+
+NOTED = """
+import sys
+from carlasc.first_use import note_compiling
+note_compiling(lambda: print("told"), after_s=float(sys.argv[1]))
+assert "numba" not in sys.modules
+import numpy as np
+from carlasc.metrics.counting import count_arrays
+labels = np.zeros(9, np.uint8)
+count_arrays(labels, labels, None, 3)
+"""
+
+
+def told(cache, after_s):
+    """Return how often a process that counts pairs of labels is told that it compiles."""
+    ran = subprocess.run(
+        [sys.executable, "-c", NOTED, str(after_s)],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return ran.stdout.split().count("told")
+
+
+def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_done_before(tmp_path):
+    assert told(tmp_path / "long", 0.01) == 1
+    assert told(tmp_path / "long", 0.01) == 0
+    assert told(tmp_path / "short", 60) == 0
+
+
+def test_the_time_of_several_loops_is_added_up(monkeypatch):
+    times, notes, timers = iter([0.0, 0.7, 5.0, 5.2]), [], []
+
+    class Timer:
+        def __init__(self, wait_s, call):
+            self.wait_s, self.call, self.daemon, self.cancelled = wait_s, call, False, False
+            timers.append(self)
+
+        def start(self):
+            pass
+
+        def cancel(self):
+            self.cancelled = True
+
+    monkeypatch.setattr(first_use, "Timer", Timer)
+    monkeypatch.setattr(first_use.time, "perf_counter", lambda: next(times))
+    note = first_use.CompilingNote(lambda: notes.append("told"), 1.0)
+    note.start()
+    note.start()  # a loop that the first one calls
+    note.end()
+    note.end()
+    assert timers[0].cancelled and not notes
+    note.start()
+    assert timers[1].wait_s == pytest.approx(0.3)
+    timers[1].call()
+    note.end()
+    note.start()
+    assert notes == ["told"] and len(timers) == 2

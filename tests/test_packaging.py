@@ -1,5 +1,7 @@
 """What is installed: the contents of the wheel, the version, and the packages that it needs."""
 
+import json
+import os
 import re
 import subprocess
 import sys
@@ -127,3 +129,46 @@ def test_the_types_are_right_on_macos_too(tmp_path):
     command = [sys.executable, "-m", "mypy", "--platform", "darwin", "--cache-dir", str(tmp_path)]
     ran = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout  # names that only Linux has, such as os.sched_getaffinity
+
+
+@pytest.fixture(scope="module")
+def from_wheel(tmp_path_factory):
+    """Runs `carlasc` from the built wheel in an environment that is made for it, as `uvx` and `pipx run` do."""
+    pytest.importorskip("hatchling")
+    pytest.importorskip("uv")
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    tool = [sys.executable, "-m", "uv", "tool", "run", "--no-config", "--python", sys.executable]
+
+    def run(*arguments, extras=""):
+        command = [*tool, "--from", f"carlasc{extras} @ {wheel.as_uri()}", "carlasc", *arguments]
+        return subprocess.run(command, cwd=folder, env=clean, check=False, capture_output=True, text=True)
+
+    ran = run("--version")
+    if ran.returncode and re.search(r"error sending request|No solution found|dns error|not found in the", ran.stderr):
+        pytest.skip(f"no package index within reach: {ran.stderr.strip().splitlines()[0]}")
+    assert (ran.returncode, ran.stdout.strip()) == (0, carlasc.__version__), ran.stderr
+    return run
+
+
+@pytest.mark.slow
+def test_the_wheel_runs_without_extras_and_says_which_are_missing(from_wheel):
+    ran = from_wheel("doctor", "--json")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    found = json.loads(ran.stdout)
+    assert found["problems"] == [] and "uv" in found["folder"]
+    missing = {extra["name"] for extra in found["extras"] if None in [one["version"] for one in extra["packages"]]}
+    assert {"render", "simulate", "zarr"} <= missing
+
+
+@pytest.mark.slow
+def test_the_demo_runs_from_the_wheel_and_ends_with_the_page(from_wheel, tmp_path):
+    ran = from_wheel("demo", str(tmp_path / "town"), "--count", "1", "--sensors", "2", extras="[simulate,render]")
+    assert ran.returncode == 0, ran.stderr
+    lines = ran.stdout.splitlines()
+    assert re.fullmatch(r"simulate a town \.\.\. \d+\.\d s", lines[0])
+    page = re.fullmatch(r"page +(\S+) +\(open it in a browser\)", lines[-1])
+    assert Path(page[1]).read_text().startswith("<!doctype html>")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import sys
 from collections.abc import Callable, Iterator, MutableMapping
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ from typer.core import TyperCommand
 
 from carlasc.cli.common import CommandGroup, echo
 from carlasc.cli.late_help import load_help
+from carlasc.first_use import note_compiling
 
 _COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
     "demo",
@@ -33,6 +35,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "view",
     "download",
     "capture",
+    "doctor",
 )
 
 _SETTINGS: dict[str, Any] = {
@@ -149,4 +152,6 @@ def _root(
 
 def main() -> None:
     """Run the command line: the entry point `carlasc`."""
+    if sys.stderr is not None and sys.stderr.isatty():  # as progress: logs and programs that read stderr are not told
+        note_compiling(lambda: echo("compiling (once per machine) ...", err=True))
     app()

@@ -241,8 +241,15 @@ def engine(cluster: str | None, workers: int | None) -> Iterator[Engine | None]:
 
 
 @contextmanager
-def progress_bar(description: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
+def progress_bar(
+    description: str, unit: str = "frames", *, transient: bool = False
+) -> Iterator[Callable[[int, int], None]]:
     """Show a progress bar on stderr while the block runs, if stderr is a terminal.
+
+    Args:
+        description: what is being done.
+        unit: what is counted.
+        transient: whether the bar is removed at the end of the block.
 
     Yields:
         A callback of (done, total) for the library's `progress` arguments.
@@ -266,7 +273,7 @@ def progress_bar(description: str, unit: str = "frames") -> Iterator[Callable[[i
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as progress:
         task = progress.add_task(description, total=None)
         yield lambda done, total: progress.update(task, completed=done, total=total)
 

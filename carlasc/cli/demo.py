@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +23,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
     workers: Workers = None,
 ) -> None:
-    """Simulate a drive, make its ground truth in three grids, check it and draw it. This takes a minute or two."""
+    """Simulate a drive, make its ground truth in three grids, check it, and draw it in pictures and a page. This takes a minute or two."""
     from carlasc.demo import demonstrate
 
     result = demonstrate(out, count=count, sensors=sensors, seed=seed, workers=workers, step=_show_step)
@@ -36,13 +38,24 @@ def demo(
     echo(
         f"next     carlasc regrid {result.sequence} --res 0.4    or    carlasc render {result.sequence} --frames 0:{count} -o drive.mp4"
     )
+    echo(f"page     {result.page}    (open it in a browser)")
     if not result.validation.ok:
         raise typer.Exit(FAILED)
 
 
 @contextmanager
 def _show_step(name: str) -> Iterator[Callable[[int, int], None]]:
-    """Print the name of a step, and show its progress where there is a terminal."""
-    echo(f"{name} ...")
-    with progress_bar(name, unit="steps") as progress:
-        yield progress
+    """Print the name of a step, and its time when it is done; in between, show its progress where there is a terminal."""
+    start, has_bar = time.perf_counter(), sys.stderr.isatty()
+    if not has_bar:  # a bar would be drawn over an unfinished line
+        echo(f"{name} ...", nl=False)
+        sys.stdout.flush()
+    try:
+        with progress_bar(name, unit="steps", transient=True) as progress:
+            yield progress
+    except BaseException:
+        if not has_bar:
+            echo("")
+        raise
+    elapsed = f"{time.perf_counter() - start:.1f} s"
+    echo(f"{name} ... {elapsed}" if has_bar else f" {elapsed}")

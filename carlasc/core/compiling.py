@@ -25,6 +25,10 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 from numba.core.dispatcher import Dispatcher
 from numba.misc.appdirs import AppDirs
 
+from carlasc import first_use
+
+first_use.connect()
+
 jit = numba.njit(nogil=True, error_model="numpy")
 inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
 # Where margins cover the rounding, a product and a sum may become one operation.

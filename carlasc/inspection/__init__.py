@@ -1,4 +1,4 @@
-"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`), and all of that to publish (`card`)."""
+"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`), and all of that to publish (`card`); and what is installed (`doctor`)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from carlasc.inspection.findings import Finding, ValidationResult
     from carlasc.inspection.heldout import HoldoutResult, holdout
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
+    from carlasc.inspection.installation import Installation, doctor
     from carlasc.inspection.overview import Overview, info
     from carlasc.inspection.report_page import write_report_page
     from carlasc.inspection.reports import ReportResult, report
@@ -24,6 +25,7 @@ else:
             "findings": ("Finding", "ValidationResult"),
             "heldout": ("HoldoutResult", "holdout"),
             "heldout_scores": ("HeldOutScores", "RayShares"),
+            "installation": ("Installation", "doctor"),
             "overview": ("Overview", "info"),
             "report_page": ("write_report_page",),
             "reports": ("ReportResult", "report"),
@@ -37,12 +39,14 @@ __all__ = [
     "Finding",
     "HeldOutScores",
     "HoldoutResult",
+    "Installation",
     "Overview",
     "RayShares",
     "ReportResult",
     "Statistics",
     "ValidationResult",
     "card",
+    "doctor",
     "holdout",
     "info",
     "report",

@@ -1,6 +1,8 @@
-"""One frame's metrics, compiled and in plain NumPy."""
+"""One frame's metrics, compiled and in plain NumPy: processor times of one thread."""
 
 from __future__ import annotations
+
+import time
 
 import numpy as np
 import pytest
@@ -38,14 +40,14 @@ def per_class_loop(pred, target, counts):
     ]
 
 
-@pytest.mark.benchmark(group="metrics")
+@pytest.mark.benchmark(group="metrics", timer=time.process_time)
 def test_bench_confusion_matrix(benchmark, frame):
     pred, target, counts = frame
     matrix = benchmark(lambda: ConfusionMatrix(K).update(pred, target, known(counts)))
     assert matrix.total == (counts > 0).sum()
 
 
-@pytest.mark.benchmark(group="metrics")
+@pytest.mark.benchmark(group="metrics", timer=time.process_time)
 def test_bench_per_class_loop(benchmark, frame):
     figures = benchmark(per_class_loop, *frame)
     matrix = ConfusionMatrix(K).update(frame[0], frame[1], known(frame[2]))
@@ -72,27 +74,27 @@ def street():
     return spec, (pred, pred_ids), (truth, ids), origins
 
 
-@pytest.mark.benchmark(group="rays")
+@pytest.mark.benchmark(group="rays", timer=time.process_time)
 def test_bench_rayiou(benchmark, street):
     spec, (pred, _), (truth, _), origins = street
     score = benchmark(lambda: RayIoU(K).update(pred, truth, spec, origins).compute().rayiou)
     assert 0 < score < 1
 
 
-@pytest.mark.benchmark(group="rays")
+@pytest.mark.benchmark(group="rays", timer=time.process_time)
 def test_bench_rayiou_in_numpy(benchmark, street):
     spec, (pred, _), (truth, _), origins = street
     score = benchmark.pedantic(rayiou, (pred, truth, spec, origins, rayiou_directions(), K), rounds=2)
     assert score == pytest.approx(RayIoU(K).update(pred, truth, spec, origins).compute().rayiou, abs=1e-9)
 
 
-@pytest.mark.benchmark(group="segments")
+@pytest.mark.benchmark(group="segments", timer=time.process_time)
 def test_bench_panoptic_quality(benchmark, street):
     _, pred, truth, _ = street
     assert 0 < benchmark(lambda: PanopticQuality(K, THINGS).update(pred, truth).compute().mean()) < 1
 
 
-@pytest.mark.benchmark(group="segments")
+@pytest.mark.benchmark(group="segments", timer=time.process_time)
 def test_bench_panoptic_quality_in_numpy(benchmark, street):
     _, pred, truth, _ = street
     found = benchmark(panoptic_quality, pred, truth, K, THINGS)

@@ -14,7 +14,9 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from faults.figures import KINDS, keep, publish
+from measuring.figures import Figures, publish
+
+from faults.figures import KINDS, keep
 
 
 def main() -> int:
@@ -45,7 +47,7 @@ def main() -> int:
             shutil.rmtree(folder)
         if not given.keep_figures:
             keep(outcome, datetime.datetime.now(datetime.UTC).date())
-            publish()
+            publish(Figures.read())
     return int(bool(found))
 
 

@@ -1,4 +1,4 @@
-"""The kinds of faults, and what was found, as the documentation shows it."""
+"""The kinds of faults, and what was found, as the documentation shows it: `measuring` puts it into the pages."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from faults.outcome import Outcome
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "docs" / "studies" / "faults.json"
-PAGES = {"docs/reliability.md": "table", "README.md": "line"}
-BEGIN, END = "<!-- faults begins -->", "<!-- faults ends -->"
 
 
 @dataclass(frozen=True)
@@ -119,21 +117,3 @@ def line(rows: dict[str, dict[str, Any]]) -> str:
     found = sum(len(row["found"]) for row in rows.values())
     result = f"{found} faults found" if found else "no torn file, no lost frame"
     return f"**Reliability:** {listed}, {result} ([figures and promises](docs/reliability.md))."
-
-
-def pages() -> dict[Path, str]:
-    """Return the pages as they should be, with the figures between their markers."""
-    rows, made = read(), {"table": table, "line": line}
-    result = {}
-    for name, form in PAGES.items():
-        text = (ROOT / name).read_text()
-        before, _, rest = text.partition(BEGIN)
-        _, _, after = rest.partition(END)
-        result[ROOT / name] = f"{before}{BEGIN}\n{made[form](rows)}\n{END}{after}"
-    return result
-
-
-def publish() -> None:
-    """Write the figures into the pages."""
-    for path, text in pages().items():
-        path.write_text(text)

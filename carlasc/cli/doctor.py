@@ -1,0 +1,81 @@
+"""`carlasc doctor`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from carlasc.cli.common import FAILED, Json, echo, file_argument, print_json
+
+if TYPE_CHECKING:
+    from carlasc.inspection.installation import Extra, Installation
+
+
+def doctor(
+    folder: Annotated[
+        Path | None,
+        file_argument("Where the speed of the disk is measured; if not given, where temporary files go.", "FOLDER"),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Print what is installed and what the machine offers, as text to paste into an issue. It names no user."""
+    from carlasc.inspection.installation import doctor as look
+
+    found = look(folder)
+    if as_json:
+        print_json(found)
+    else:
+        echo("\n".join(_lines(found)))
+    if not found.ok:
+        raise typer.Exit(FAILED)
+
+
+def _lines(found: Installation) -> Iterator[str]:
+    width = max(
+        map(len, [extra.name for extra in found.extras] + [package.name for package in found.packages]), default=0
+    )
+    yield f"carlasc {found.version}, in {found.folder}"
+    yield f"Python {found.python}"
+    yield found.system
+    yield "\npackages"
+    for package in found.packages:
+        yield f"  {package.name:{width}}  {package.version or 'missing'}"
+    yield "\nextras"
+    for extra in found.extras:
+        yield f"  {extra.name:{width}}  {_describe_extra(extra)}"
+    cpu = found.processor
+    yield "\nprocessor"
+    yield f"  {cpu.model}, {cpu.cores} cores, {cpu.usable} usable"
+    yield f"  Numba compiles for {cpu.target or 'nothing'}: {' '.join(cpu.features) or 'no instructions that it could name'}"
+    yield f"  threads: {', '.join(f'{name} {value}' for name, value in found.threads.items()) or 'no settings'}"
+    if (code := found.compiled) is not None:
+        state = (
+            "writable"
+            if code.writable
+            else "NOT WRITABLE: every process compiles anew; NUMBA_CACHE_DIR=FOLDER names another"
+        )
+        yield "\ncompiled code"
+        yield f"  {code.folder} ({state}): {code.files} files, {code.bytes / 1e6:.1f} MB"
+        yield f"  a loop of one line compiles in {code.compile_s:.2f} s"
+    disk = found.disk
+    yield "\ndisk"
+    yield f"  {disk.folder}: {disk.free_bytes / 1e9:.1f} GB free; files are {'synced' if found.durable else 'not synced'} before they get their names"
+    yield f"  32 MB: written and synced at {disk.write_mb_s:.0f} MB/s, read at {disk.read_mb_s:.0f} MB/s; 4 kB: synced in {disk.sync_ms:.1f} ms"
+    yield "\nmissing"
+    missing = [extra for extra in found.extras if extra.problems]
+    for extra in missing:
+        yield f"  {extra.command}"
+    if not missing:
+        yield "  nothing"
+    yield "\nproblems"
+    yield from (f"  {problem}" for problem in found.problems or ["none"])
+
+
+def _describe_extra(extra: Extra) -> str:
+    """Return the versions of what it installs, or what is wrong with it."""
+    if extra.problems:
+        return ", ".join(extra.problems)
+    return "complete: " + ", ".join(f"{package.name} {package.version}" for package in extra.packages)

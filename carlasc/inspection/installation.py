@@ -1,0 +1,380 @@
+"""`doctor`: what is installed, and what the machine offers, as a report that can be pasted into an issue."""
+
+from __future__ import annotations
+
+import getpass
+import importlib
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import carlasc
+from carlasc.errors import ArgumentError, DependencyError, StorageError, describe, import_extra
+from carlasc.running import count_workers
+from carlasc.running.pools import ONE_THREAD
+from carlasc.storage.durability import is_durable
+
+FOR_DEVELOPERS = ("all", "dev", "docs", "faults", "study")
+"""Extras that are not listed: `all` is the others, and the rest is for those who work on the package."""
+
+_FEATURES = "sse4.2 avx avx2 fma bmi2 avx512f avx512bw avx512vl neon asimd sve sve2".split()
+_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[\w,-]*\])?(?:>=([\w.]+))?(?:\s*;\s*extra == ['\"]([\w-]+)['\"])?")
+_VARIABLES = re.compile("|".join([*ONE_THREAD, "NUMBA_.*", "CARLASC_.*"]))
+_MEGABYTE, _MEGABYTES, _SMALL_FILES = 1 << 20, 32, 8
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package that carlasc needs, always or for an extra.
+
+    Attributes:
+        name: its name on the package index.
+        version: the installed version; None if it is not installed.
+        lowest: the lowest version that carlasc works with.
+    """
+
+    name: str
+    version: str | None
+    lowest: str
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with it; empty if nothing is."""
+        if self.version is None:
+            return f"{self.name} is not installed"
+        if _numbers(self.version) < _numbers(self.lowest):
+            return f"{self.name} {self.version} is older than {self.lowest}"
+        return ""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra, as in `pip install 'carlasc[zarr]'`.
+
+    Attributes:
+        name: its name.
+        packages: what it installs.
+    """
+
+    name: str
+    packages: tuple[Package, ...]
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is missing or too old."""
+        return tuple(package.problem for package in self.packages if package.problem)
+
+    @property
+    def command(self) -> str:
+        """The command that installs it."""
+        return f"pip install 'carlasc[{self.name}]'"
+
+
+@dataclass(frozen=True)
+class Processor:
+    """The processor.
+
+    Attributes:
+        model: its name.
+        cores: number of its cores, as the system counts them.
+        usable: number of cores that this process may use, which is the number of workers that commands start.
+        target: the processor that Numba compiles for; empty if Numba does not load.
+        features: instructions that matter for speed, of those that Numba uses.
+    """
+
+    model: str
+    cores: int
+    usable: int
+    target: str
+    features: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CompiledCode:
+    """Where compiled code is kept.
+
+    Attributes:
+        folder: the folder.
+        writable: whether this process may write there; otherwise each process compiles anew.
+        files: number of files of compiled code in it.
+        bytes: their size.
+        compile_s: time for compiling a loop of one line, seconds.
+    """
+
+    folder: str
+    writable: bool
+    files: int
+    bytes: int
+    compile_s: float
+
+
+@dataclass(frozen=True)
+class Disk:
+    """How fast a folder is.
+
+    Attributes:
+        folder: the folder.
+        free_bytes: free space, bytes.
+        write_mb_s: speed of writing a file of 32 MB and syncing it, MB/s.
+        read_mb_s: speed of reading it again, MB/s; where the system allows it, from the disk and not from memory.
+        sync_ms: time for writing a file of 4 kB and syncing it, milliseconds.
+    """
+
+    folder: str
+    free_bytes: int
+    write_mb_s: float
+    read_mb_s: float
+    sync_ms: float
+
+
+@dataclass(frozen=True)
+class Installation:
+    """What `doctor` found. Paths begin with `~` for the folder of the user, and hold no name of a user.
+
+    Attributes:
+        version: version of carlasc.
+        python: version of Python.
+        system: the operating system.
+        folder: where carlasc is installed.
+        packages: the packages that it always needs.
+        extras: the optional packages.
+        processor: the processor.
+        compiled: where compiled code is kept; None if Numba does not work.
+        threads: the number of threads of Numba, and the variables of the environment that set threads, Numba and carlasc.
+        durable: whether files are synced before they get their names.
+        disk: how fast the folder is where it was measured.
+        problems: what is broken and needed; empty if carlasc works.
+    """
+
+    version: str
+    python: str
+    system: str
+    folder: str
+    packages: tuple[Package, ...]
+    extras: tuple[Extra, ...]
+    processor: Processor
+    compiled: CompiledCode | None
+    threads: dict[str, str]
+    durable: bool
+    disk: Disk
+    problems: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing that is needed is broken. Missing extras do not count."""
+        return not self.problems
+
+
+def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
+    """Look at what is installed and at the machine. Takes a few seconds; nothing is sent anywhere.
+
+    Args:
+        folder: where the speed of the disk is measured, in a temporary folder that is removed again; None: where temporary files go.
+
+    Returns:
+        What was found.
+
+    Raises:
+        ArgumentError: `folder` is not a folder.
+        StorageError: it cannot be written to.
+    """
+    needed, extras = _read_requirements()
+    problems = [package.problem for package in needed if package.problem]
+    if not needed:
+        problems.append("carlasc is not installed, only found on the path: which packages it needs is not known")
+    for package in needed:
+        if package.version is not None:
+            problems += _problems_of_import(package.name)
+    numba_loads, compiled = not any("numba" in problem or "numpy" in problem for problem in problems), None
+    if numba_loads:
+        try:
+            compiled = _look_at_compiled_code()
+        except (RuntimeError, OSError) as error:
+            problems.append(
+                f"Numba cannot compile or keep compiled code ({describe(error)}); NUMBA_CACHE_DIR=FOLDER says where"
+            )
+    return Installation(
+        version=carlasc.__version__,
+        python=f"{platform.python_version()} ({platform.python_implementation()})",
+        system=platform.platform(),
+        folder=without_names(str(Path(carlasc.__file__).parent)),
+        packages=needed,
+        extras=extras,
+        processor=_look_at_processor(numba_loads),
+        compiled=compiled,
+        threads=_read_threads(numba_loads),
+        durable=is_durable(),
+        disk=measure_disk(folder),
+        problems=tuple(map(without_names, problems)),
+    )
+
+
+def without_names(text: str) -> str:
+    """Return a text with `~` for the folder of the user, and USER where the user's name stands as a word."""
+    home = str(Path.home())
+    if len(home) > 1:
+        text = re.sub(rf"{re.escape(home)}(?![\w-])", "~", text)
+    with suppress(OSError, KeyError, ImportError):  # what getpass raises for a user without a name
+        text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(getpass.getuser())}(?![A-Za-z0-9])", "USER", text)
+    return text
+
+
+def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
+    """Measure how fast files are written, synced and read in a temporary folder, which is removed again.
+
+    Args:
+        folder: where to make it; None: where temporary files go.
+
+    Raises:
+        ArgumentError: `folder` is not a folder.
+        StorageError: it cannot be written to.
+    """
+    place = Path(tempfile.gettempdir() if folder is None else folder)
+    if not place.is_dir():
+        raise ArgumentError("folder", expected="a folder", found=str(place))
+    try:
+        with tempfile.TemporaryDirectory(dir=place, prefix="carlasc-doctor-") as scratch:
+            large, noise = Path(scratch, "large"), os.urandom(_MEGABYTE)  # noise: some file systems compress
+            write_s = _time_writing(large, noise, _MEGABYTES)
+            read_s = _time_reading(large)
+            syncs_s = sorted(_time_writing(Path(scratch, str(n)), noise[:4096], 1) for n in range(_SMALL_FILES))
+            status = os.statvfs(scratch)
+    except OSError as error:
+        raise StorageError(place, problem=f"files cannot be written: {error.strerror or error}") from error
+    megabytes = _MEGABYTES * _MEGABYTE / 1e6
+    return Disk(
+        without_names(str(place.resolve())),
+        status.f_bavail * status.f_frsize,
+        megabytes / write_s,
+        megabytes / read_s,
+        1e3 * syncs_s[len(syncs_s) // 2],
+    )
+
+
+def _time_writing(path: Path, block: bytes, count: int) -> float:
+    start = time.perf_counter()
+    with path.open("wb") as file:
+        for _ in range(count):
+            file.write(block)
+        file.flush()
+        os.fsync(file.fileno())
+    return time.perf_counter() - start
+
+
+def _time_reading(path: Path) -> float:
+    with path.open("rb") as file:
+        if sys.platform == "linux":
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # forget what is in memory
+        start = time.perf_counter()
+        while file.read(_MEGABYTE):
+            pass
+    return time.perf_counter() - start
+
+
+def _read_requirements() -> tuple[tuple[Package, ...], tuple[Extra, ...]]:
+    """Return the packages that are always needed, and the extras, as the metadata of the installed package list them."""
+    try:
+        lines = metadata.requires("carlasc") or []
+    except metadata.PackageNotFoundError:
+        return (), ()
+    needed: list[Package] = []
+    extras: dict[str, list[Package]] = {}
+    for line in lines:
+        if (found := _REQUIREMENT.fullmatch(line)) and found[3] not in FOR_DEVELOPERS:
+            (needed if found[3] is None else extras.setdefault(found[3], [])).append(
+                Package(found[1], _version(found[1]), found[2] or "0")
+            )
+    return tuple(needed), tuple(Extra(name, tuple(packages)) for name, packages in extras.items())
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the numbers of a version up to the first part that is none, without zeros at their end: 2.0 is 2."""
+    numbers = [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
+    while numbers and not numbers[-1]:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def _problems_of_import(name: str) -> Iterator[str]:
+    """Yield why a package that is always needed does not load; its module has the name of the package."""
+    try:
+        import_extra(name, "")
+    except DependencyError as error:
+        yield f"{name} does not load ({describe(error.__cause__ or error)})"
+
+
+def _look_at_processor(numba_loads: bool) -> Processor:
+    target, features = "", tuple[str, ...]()
+    if numba_loads:
+        binding: Any = importlib.import_module("llvmlite.binding")
+        config: Any = importlib.import_module("numba").config
+        found = binding.get_host_cpu_features()
+        target = config.CPU_NAME or binding.get_host_cpu_name()
+        features = tuple(
+            name for name in _FEATURES if found.get(name) and f"-{name}" not in (config.CPU_FEATURES or "")
+        )
+    return Processor(_model(), os.cpu_count() or 1, count_workers(None), target, features)
+
+
+def _model() -> str:
+    """Return the name of the processor."""
+    with suppress(OSError):
+        if found := re.search(r"^(?:model name|Model)\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return found[1]
+    if sys.platform == "darwin":
+        with suppress(OSError, subprocess.SubprocessError):
+            asked = ["sysctl", "-n", "machdep.cpu.brand_string"]
+            return subprocess.run(asked, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+    return platform.processor() or platform.machine()
+
+
+def _look_at_compiled_code() -> CompiledCode:
+    """Compile a loop of one line.
+
+    Raises:
+        RuntimeError: Numba finds no folder for compiled code; then no module with a compiled loop can be imported.
+        OSError: the same, or the compiler does not work.
+    """
+    import numba
+
+    from carlasc.core.compiling import cached
+
+    loop: Any = cached(_next)
+    start = time.perf_counter()
+    numba.njit(_next)(1)  # type: ignore[type-var]
+    compile_s = time.perf_counter() - start
+    folder = Path(loop.stats.cache_path)
+    root = Path(carlasc.__file__).parent if folder.name == "__pycache__" else folder.parent
+    sizes = [path.stat().st_size for path in root.rglob("*.nb[ic]")]
+    nearest = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    return CompiledCode(without_names(str(root)), os.access(nearest, os.W_OK), len(sizes), sum(sizes), compile_s)
+
+
+def _next(number: int) -> int:
+    return number + 1
+
+
+def _read_threads(numba_loads: bool) -> dict[str, str]:
+    found = {}
+    if numba_loads:
+        found["numba"] = str(importlib.import_module("numba").config.NUMBA_NUM_THREADS)
+    return found | {
+        name: without_names(value) for name, value in sorted(os.environ.items()) if _VARIABLES.fullmatch(name)
+    }
