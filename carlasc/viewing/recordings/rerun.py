@@ -35,11 +35,11 @@ from carlasc.viewing.rendering.drawings import ego_vehicle
 from carlasc.viewing.scene import GridPanel, SceneReader
 
 _FOOTER = b"RRF2FOOT"  # near the end of a file that Rerun finished
-_POINT_RADIUS_M = 0.06
+_POINT_RADIUS_M = 0.1
 _BATCH = 20  # frames that are written together: each batch costs a kilobyte for each entity
 _TRAIL_RADIUS_M = 0.08
 _BACKGROUND = (246, 247, 249)
-_EYE, _TARGET = (-40.0, 0.0, 28.0), (2.0, 0.0, -3.0)  # behind and above the vehicle, as on a page
+_EYE, _TARGET = (-49.0, 0.0, 35.0), (-3.0, 0.0, -3.0)  # behind and above: a published grid fits in a square view
 
 
 class RerunWriter:
