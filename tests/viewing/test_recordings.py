@@ -401,9 +401,10 @@ view(sys.argv[1], sys.argv[2])
 """
 
 
-def test_a_foxglove_file_that_cannot_be_written_is_an_error_and_leaves_nothing(blocks, tmp_path):
+@pytest.mark.parametrize("ending", [".rrd", ".mcap"])
+def test_a_file_that_cannot_be_written_is_an_error_and_leaves_nothing(ending, blocks, tmp_path):
     run = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, blocks, tmp_path / "a.mcap"],
+        [sys.executable, "-c", FULL_DISK, blocks, tmp_path / f"a{ending}"],
         capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
     assert StorageError.__name__ in run.stderr.splitlines()[-1] and "cannot be written" in run.stderr, run.stderr
