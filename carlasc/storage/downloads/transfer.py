@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 from carlasc.errors import ArgumentError, CarlascError, FormatError
+from carlasc.running.interrupts import postponed_interrupts
 from carlasc.storage.downloads.http import (
     ChangedError,
     InterruptionError,
@@ -170,7 +171,8 @@ def _fetch_blocks(state: _State, path: Path, settings: TransferSettings, advance
             with lock:
                 _save(state, path, descriptor)
 
-        futures = [executor.submit(fetch, index) for index in state.open_blocks]
+        with postponed_interrupts():
+            futures = [executor.submit(fetch, index) for index in state.open_blocks]
         done, _ = wait(futures, return_when=FIRST_EXCEPTION)
         for future in done:
             future.result()

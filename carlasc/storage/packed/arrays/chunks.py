@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import CarlascError, FormatError, describe, import_extra
 from carlasc.running import count_workers
+from carlasc.running.interrupts import postponed_interrupts
 from carlasc.storage.arrays import check_size
 from carlasc.storage.folders.trees import Tree
 
@@ -178,7 +179,7 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     items = list(items)
     if len(items) < 2 or multiprocessing.parent_process() is not None:
         return [function(item) for item in items]
-    return list(_pool(os.getpid()).map(function, items))
+    return in_threads(function, items)
 
 
 def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
@@ -187,7 +188,9 @@ def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     In the main thread, Blosc compresses the blocks of a large chunk in threads of its own, and writes them in the order in which they are
     done: the bytes would differ from run to run.
     """
-    return list(_pool(os.getpid()).map(function, items))
+    with postponed_interrupts():
+        results = _pool(os.getpid()).map(function, items)
+    return list(results)
 
 
 def crc32c(data: bytes | memoryview, extra: str) -> int:
