@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import to_table
-from carlasc.storage import Sequence
+from carlasc.errors import MissingDataError
+from carlasc.storage import Sequence, layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +83,35 @@ class RemappedSequence:
         """
         boxes = self.sequence.boxes(frame)
         return None if boxes is None else self._remap_boxes(boxes, frame)
+
+    def read_pose(self, frame: int) -> Transform | None:
+        """Read (4, 4) first_T_sensor of a frame; None if the sequence has no poses.
+
+        Raises:
+            FormatError: the frame has no line in the file of poses, or its line is no rigid transform.
+        """
+        try:
+            pose = self.sequence.read_pose(frame)
+        except MissingDataError:
+            return None
+        return check_rigid(pose, f"{self.sequence.location}/{layout.POSES}: frame {frame}")
+
+    def has(self, *fields: str) -> bool:
+        """Whether the sequence has all of these fields."""
+        return set(fields) <= set(self.sequence.fields())
+
+    def frames_with(self, *fields: str) -> set[int]:
+        """Return the frames that have all of these fields."""
+        return set.intersection(*(set(self.sequence.frames(field).tolist()) for field in fields))
+
+    def read_part(self, part: str, frame: int) -> NDArray[Any]:
+        """Read a part of the grid of a frame, such as "posterior", in the shape of the grid.
+
+        Raises:
+            MissingDataError: the frame lacks it.
+            FormatError: it does not have the format.
+        """
+        return self.sequence.read(f"{self.grid}/{part}", frame).reshape(self.spec.size)
 
     def _remap_boxes(self, boxes: Boxes, frame: int) -> Boxes:
         where = f"{self.sequence.location}: boxes, frame {frame}"

@@ -16,13 +16,12 @@ from carlasc.core.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_sp
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.geometry import Transform, check_rigid
+from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.comparison import check_same_geometry, compare_grids
-from carlasc.storage import layout
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.choosing import choose_grid, common_table, describe_frames, frames_with, list_fields, table_of
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
@@ -286,17 +285,14 @@ class SceneReader:
             return None
 
     def read_pose(self, frame: int) -> Transform | None:
-        """Return (4, 4) first_T_sensor of a frame, or None if the sequence has no poses.
+        """Return (4, 4) first_T_sensor of a frame, or None if neither the sequence nor its ground truth has poses.
 
         Raises:
             FormatError: the frame has no line in the file of poses, or its line is no rigid transform.
         """
-        sequence = self.data.sequence
-        try:
-            pose = check_rigid(sequence.read_pose(frame), f"{sequence.location}/{layout.POSES}: frame {frame}")
-        except MissingDataError:
-            return None
-        return mirror_poses(pose) if self.mirrored else pose
+        found = (data.read_pose(frame) for data in (self.data, self.truth) if data is not None)
+        pose = next((pose for pose in found if pose is not None), None)
+        return mirror_poses(pose) if self.mirrored and pose is not None else pose
 
     def path_of_ego(self) -> NDArray[np.float64]:
         """Return the (F, 3) positions of the sensor in all frames, metres in the frame of the first scan; none without poses."""

@@ -25,6 +25,19 @@ def test_figures_are_json(golden_capture, tmp_path):
     assert figures["frames"] == [1] and figures["size_bytes"] == (tmp_path / "a.html").stat().st_size
 
 
+@pytest.mark.needs("rerun", "foxglove")
+@pytest.mark.parametrize(("ending", "word"), [("rrd", "with `rerun`"), ("mcap", "in Foxglove")])
+def test_a_recording_is_written_and_its_size_said_before_all_points_are_kept(golden_capture, tmp_path, ending, word):
+    out = tmp_path / f"scene.{ending}"
+    result = call(golden_capture / "cartesian", "--to", out, "--frames", "0:2", "--full-points")
+    assert result.exit_code == 0, result.stderr
+    before, after = result.stdout.splitlines()
+    assert before.startswith(f"{out}: about ") and before.endswith(" MB: 2 frames with all of their points")
+    assert after.startswith(f"{out}: ") and "2 frames" in after and after.endswith(f"open it {word}")
+    figures = json.loads(call(golden_capture / "cartesian", "-o", out, "--overwrite", "--json").stdout)
+    assert figures["frames"] == [0, 1, 2] and figures["size_bytes"] == out.stat().st_size
+
+
 @pytest.mark.parametrize(
     ("options", "code", "word"),
     [
@@ -37,6 +50,8 @@ def test_figures_are_json(golden_capture, tmp_path):
         (["--json"], 2, "--out"),
         (["--beside", "other"], 2, "--beside: a window shows one run"),
         (["-o", "a.mcap", "--beside", "other"], 2, "--beside: expected a page"),
+        (["-o", "a.html", "--full-points"], 2, "--full-points: expected a recording"),
+        (["--to", "a.rrd", "--grid", "fine"], 1, "fine"),
     ],
 )
 def test_a_mistake_is_one_line_and_the_right_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):

@@ -12,8 +12,11 @@ from helpers.browser import OUTPUT
 from helpers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.screens import virtual_screen
 
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, DependencyError
+from carlasc.storage import FolderSink
 from carlasc.viewing import Scene, Window
 from carlasc.viewing.window.libraries import import_open3d
 from carlasc.viewing.window.window import KEYS, help_lines
@@ -237,3 +240,22 @@ def test_arrows_point_along_the_flow(blocks, open_window):
     press("P")
     vertices = drawn_arrays(window)[-2]
     assert vertices[:, 0].min() > 9 and vertices[:, 0].max() == pytest.approx(20, abs=0.5)  # 10 m/s ahead, from x = 10
+
+
+def test_boxes_are_drawn_where_they_are_in_the_colours_of_their_classes(tmp_path, open_window):
+    folder = write_blocks(tmp_path / "cartesian", frames=1)
+    pose = translation((10.0, 5.0, 0.0)) @ rotation_z(np.pi / 2)
+    boxes = Boxes.from_poses(np.array([7]), np.array([4]), pose[None], np.array([[4.0, 2.0, 1.5]]))
+    FolderSink(folder.parent).sequence(folder.name).write("boxes", 0, boxes.to_table())
+    window, press, _ = open_window(folder)
+    for key in "GFVB":
+        press(key)
+    drawn_arrays(window)
+    press("B")
+    corners, colors = drawn_arrays(window)
+    np.testing.assert_allclose(corners.min(0), (9, -7, -0.75), atol=1e-6)  # right-handed: y points to the left
+    np.testing.assert_allclose(corners.max(0), (11, -3, 0.75), atol=1e-6)
+    assert len(colors) == 12 and np.allclose(colors, np.array(CARLA.colors[4]) / 255)
+    ends = window.o3d.utility.Vector2iVector.call_args.args[0]
+    lengths = np.linalg.norm(corners[ends[:, 0]] - corners[ends[:, 1]], axis=1)
+    assert sorted(np.round(lengths, 6).tolist()) == [1.5] * 4 + [2.0] * 4 + [4.0] * 4

@@ -15,7 +15,6 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.comparison import check_same_geometry, compare_grids
 from carlasc.metrics.confusion import ConfusionMatrix
-from carlasc.storage import layout
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.finding import SceneSource, find_truth
 from carlasc.viewing.page.coding import OFFSET_STEPS, Arrays, encode_evidence, encode_grid, encode_scan
@@ -179,11 +178,8 @@ class PageContent:
 
     def _read_poses(self) -> list[list[float]] | None:
         """Return the first three rows of the pose of each frame, in the frame of the first scan; None if there are none."""
-        for data in (self.reader.data, self.reader.truth):
-            if data is not None and layout.POSES in data.sequence.documents():
-                poses = [data.sequence.read_pose(frame)[:3] for frame in self.frames]
-                return [np.round(pose.reshape(-1), 5).tolist() for pose in poses]
-        return None
+        poses = [pose for pose in map(self.reader.read_pose, self.frames) if pose is not None]
+        return [np.round(pose[:3].reshape(-1), 5).tolist() for pose in poses] or None
 
 
 def open_content(

@@ -55,8 +55,10 @@ class FoxgloveWriter:
         self._output = _Output(path)
         self._writer = foxglove.open_mcap(self._output, context=self._context)
         self._writer.write_metadata("carlasc", {"sequence": reader.name, "classes": reader.table.name})
-        names = {str(entry.order): entry.name for entry in reader.colors.entries(reader.table.names)}
-        self._writer.write_metadata("classes", names)
+        tables = {panel.colors.table.name: panel.colors for panel in reader.panels if panel.name == "errors"}
+        for name, colors in {"classes": reader.colors, **tables}.items():
+            names = {str(entry.order): entry.name for entry in colors.entries(colors.table.names)}
+            self._writer.write_metadata(name, names)
         self._path: NDArray[np.float64] | None = reader.path_of_ego()
 
     def write(self, frame: RecordedFrame) -> None:

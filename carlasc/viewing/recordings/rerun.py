@@ -14,8 +14,8 @@ Entities, all in right-handed axes with z up:
 
 from __future__ import annotations
 
-import errno
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -30,16 +30,16 @@ from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.recordings.content import RecordedFrame, class_cells
+from carlasc.viewing.recordings.piping import PipedFile
 from carlasc.viewing.recordings.wedges import Triangles, class_surfaces
 from carlasc.viewing.rendering.drawings import ego_vehicle
 from carlasc.viewing.scene import GridPanel, SceneReader
 
-_FOOTER = b"RRF2FOOT"  # near the end of a file that Rerun finished
-_POINT_RADIUS_M = 0.06
+_POINT_RADIUS_M = 0.1
 _BATCH = 20  # frames that are written together: each batch costs a kilobyte for each entity
 _TRAIL_RADIUS_M = 0.08
 _BACKGROUND = (246, 247, 249)
-_EYE, _TARGET = (-40.0, 0.0, 28.0), (2.0, 0.0, -3.0)  # behind and above the vehicle, as on a page
+_EYE, _TARGET = (-49.0, 0.0, 35.0), (-3.0, 0.0, -3.0)  # behind and above: a published grid fits in a square view
 
 
 class RerunWriter:
@@ -51,14 +51,14 @@ class RerunWriter:
 
     def __init__(self, path: Path, reader: SceneReader) -> None:
         self._rr: Any = import_extra("rerun", "rerun")
-        self._path, self._reader = path, reader
+        self._reader = reader
         self._drawn: dict[str, set[int]] = {panel.name: set() for panel in reader.panels}
         batches = self._rr.ChunkBatcherConfig(flush_tick=timedelta(days=1))  # frames, not seconds, say when
         self._waiting = 0
         self._recording = self._rr.RecordingStream("carlasc", recording_id=uuid4(), batcher_config=batches)
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
-        self._recording.save(path, default_blueprint=self._blueprint())
+        self._file = PipedFile(path, partial(self._recording.save, default_blueprint=self._blueprint()))
         self._recording.send_recording_name(reader.name)
         self._write_static()
 
@@ -93,20 +93,13 @@ class RerunWriter:
         Raises:
             OSError: it could not be written.
         """
-        try:
-            self._flush()
-        finally:
-            self._recording.disconnect()
-        with self._path.open("rb") as file:
-            file.seek(max(0, self._path.stat().st_size - 64))
-            if _FOOTER not in file.read():
-                raise _cut_short()
+        self._recording.flush()
+        self._recording.disconnect()
+        self._file.close()
 
     def _flush(self) -> None:
-        try:
-            self._recording.flush()
-        except RuntimeError as error:  # the thread that writes has ended
-            raise _cut_short() from error
+        self._recording.flush()
+        self._file.check()
         self._waiting = 0
 
     def _write_static(self) -> None:
@@ -206,7 +199,3 @@ class RerunWriter:
             line_grid=False,
             eye_controls=blueprint.EyeControls3D(position=_EYE, look_target=_TARGET, eye_up=(0, 0, 1)),
         )
-
-
-def _cut_short() -> OSError:
-    return OSError(errno.EIO, "the Rerun SDK could not write all of it; the disk may be full")

@@ -11,6 +11,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
+from carlasc.viewing.choosing import list_fields
 from carlasc.viewing.colors import AFTER_CLASSES, Entry
 from carlasc.viewing.remapping import RemappedSequence
 from carlasc.viewing.rendering.drawings import Drawing
@@ -36,12 +37,11 @@ def check_boxes(data: RemappedSequence) -> None:
     Raises:
         MissingDataError: it has neither.
     """
-    fields = data.sequence.fields()
-    if "boxes" not in fields and not {"points", "instances"} <= fields:
+    if not data.has("boxes") and not data.has("points", "instances"):
         raise MissingDataError(
             data.sequence.location,
             expected="the field boxes, or points with instances",
-            found=", ".join(sorted(fields)) or "nothing",
+            found=list_fields(data.sequence),
             advice="leave out `boxes`",
         )
 
@@ -52,13 +52,10 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
     Raises:
         FormatError: the boxes or the scan do not have the format.
     """
-    sequence = data.sequence
     annotated = data.read_boxes(frame)
     if annotated is not None:
         return annotated
-    numbered = "boxes" not in sequence.fields() and all(
-        frame in sequence.frames(field) for field in ("points", "instances")
-    )
+    numbered = not data.has("boxes") and frame in data.frames_with("points", "instances")
     return tight_boxes(data.read_scan(frame) if numbered else Scan(np.empty((0, 3), np.float32)))
 
 

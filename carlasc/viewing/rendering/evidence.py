@@ -46,8 +46,8 @@ def check_color(color: GridColor, reader: SceneReader) -> None:
         raise ArgumentError("color", expected="class where no grid is shown", found=repr(color))
     data, frames = reader.data, reader.frames
     field = f"{data.grid}/{_PARTS[color]}"
-    missing = np.setdiff1d(frames, data.sequence.frames(field))
-    if len(missing):
+    missing = sorted(set(frames) - data.frames_with(field))
+    if missing:
         raise MissingDataError(
             data.sequence.location,
             expected=f"the field {field} in all frames that are shown",
@@ -72,7 +72,7 @@ def evidence_drawing(data: RemappedSequence, frame: int, color: GridColor, *, eg
         FormatError: the grid does not have the format.
     """
     grid = data.read_grid(frame)
-    values = data.sequence.read(f"{data.grid}/{_PARTS[color]}", frame).reshape(grid.spec.size)
+    values = data.read_part(_PARTS[color], frame)
     numbers, legend = _classify(values, color)
     colors = np.array([entry.color for entry in legend], np.uint8)
     return voxel_drawing(grid.spec, colors[numbers], grid.labels > 0, legend, "no voxel is occupied", ego)
