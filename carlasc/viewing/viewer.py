@@ -9,7 +9,7 @@ from typing import overload
 
 from carlasc.errors import ArgumentError
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.page.page import PageResult, write_page
+from carlasc.viewing.page.page import PAGES, PageResult, write_page
 from carlasc.viewing.recordings.run import RECORDINGS, RecordingResult, write_recording
 from carlasc.viewing.scene import Scene, as_scene
 from carlasc.viewing.window.window import show_window
@@ -85,7 +85,11 @@ def view(
     if scene.palette == "height":
         raise ArgumentError("palette", expected="class or colorblind", found="height")
     target = None if out is None else Path(out)
-    is_recording = target is not None and target.suffix.lower() in RECORDINGS
+    ending = "" if target is None else target.suffix.lower()
+    if ending not in ("", *PAGES, *RECORDINGS):
+        expected = f"a name that ends in {', '.join((PAGES[0], *RECORDINGS))}, or without an ending for a folder"
+        raise ArgumentError("out", expected=expected, found=str(out))
+    is_recording = ending in RECORDINGS
     if (beside is not None or beside_grid is not None) and (target is None or is_recording):
         raise ArgumentError("beside", expected="a page, .html or a folder", found=str(out or "a window"))
     if target is not None and is_recording:

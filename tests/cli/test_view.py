@@ -52,6 +52,7 @@ def test_a_recording_is_written_and_its_size_said_before_all_points_are_kept(gol
         (["-o", "a.mcap", "--beside", "other"], 2, "--beside: expected a page"),
         (["-o", "a.html", "--full-points"], 2, "--full-points: expected a recording"),
         (["--to", "a.rrd", "--grid", "fine"], 1, "fine"),
+        (["--to", "a.rdd"], 2, "ends in .html, .rrd, .mcap, or without"),
     ],
 )
 def test_a_mistake_is_one_line_and_the_right_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):

@@ -18,6 +18,9 @@ from carlasc.viewing.page.folder import FRAMES, check_folder, writing_folder
 from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import check_target
 
+PAGES = (".html", ".htm")
+"""Endings of the names of pages in one file."""
+
 MAX_FRAMES = 60  # of a page in one file, if the scene gives no range: a few megabytes
 
 
@@ -60,7 +63,7 @@ def write_page(
     if in_folder:
         check_folder(out, overwrite)
     else:
-        check_target(out, (".html", ".htm"), overwrite)
+        check_target(out, PAGES, overwrite)
     if not 0.01 <= thin_m <= 10:
         raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=str(thin_m))
     content = open_content(scene, thin_m, beside, beside_grid)
