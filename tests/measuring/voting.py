@@ -28,7 +28,7 @@ _KEYS = {
     "cylindrical": "cylindrical",
     "every sample": "every_sample",
 }
-_FRAMES = 12
+_FRAMES = 24
 _PEAK = """
 import re, resource, sys
 from pathlib import Path
