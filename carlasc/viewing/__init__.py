@@ -8,13 +8,12 @@ from carlasc.loading import late_names
 
 if TYPE_CHECKING:
     from carlasc.viewing.colors import ClassColors, Entry, colorblind_palette
-    from carlasc.viewing.page.page import PageResult
-    from carlasc.viewing.recordings.run import RecordingResult
     from carlasc.viewing.rendering.cameras import Viewpoint
     from carlasc.viewing.rendering.drawings import Drawing, error_drawing, flow_drawing, grid_drawing, scan_drawing
     from carlasc.viewing.rendering.pictures import Panel, draw_panels, render_comparison, render_grid, render_scan
     from carlasc.viewing.rendering.run import RenderResult, render
     from carlasc.viewing.scene import FrameContent, GridPanel, Scene, SceneReader
+    from carlasc.viewing.targets import ViewResult
     from carlasc.viewing.viewer import view
     from carlasc.viewing.window.window import Window
 else:
@@ -22,13 +21,12 @@ else:
         __name__,
         {
             "colors": ("ClassColors", "Entry", "colorblind_palette"),
-            "page.page": ("PageResult",),
-            "recordings.run": ("RecordingResult",),
             "rendering.cameras": ("Viewpoint",),
             "rendering.drawings": ("Drawing", "error_drawing", "flow_drawing", "grid_drawing", "scan_drawing"),
             "rendering.pictures": ("Panel", "draw_panels", "render_comparison", "render_grid", "render_scan"),
             "rendering.run": ("RenderResult", "render"),
             "scene": ("FrameContent", "GridPanel", "Scene", "SceneReader"),
+            "targets": ("ViewResult",),
             "viewer": ("view",),
             "window.window": ("Window",),
         },
@@ -40,12 +38,11 @@ __all__ = [
     "Entry",
     "FrameContent",
     "GridPanel",
-    "PageResult",
     "Panel",
-    "RecordingResult",
     "RenderResult",
     "Scene",
     "SceneReader",
+    "ViewResult",
     "Viewpoint",
     "Window",
     "colorblind_palette",

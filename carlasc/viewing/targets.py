@@ -1,11 +1,45 @@
-"""The file that a picture or a page is written to."""
+"""The file or the folder that a picture, a page or a recording is written to."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from carlasc.errors import ArgumentError, ConflictError
+
+MAX_FRAMES = 60
+"""Frames of a page in one file and of a recording, if the scene gives no range: a few megabytes."""
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """The page or the recording that was written.
+
+    Attributes:
+        out: the file, or the folder of a page.
+        sequence: path of the sequence.
+        panels: titles of the grids in it.
+        frames: the frames in it.
+        size_bytes: size of the file, or of all files in the folder.
+        elapsed_s: how long it took, seconds.
+        notes: what was chosen where the scene left a choice.
+    """
+
+    out: Path
+    sequence: str
+    panels: tuple[str, ...]
+    frames: tuple[int, ...]
+    size_bytes: int
+    elapsed_s: float
+    notes: tuple[str, ...]
+
+
+def first_frames(frames: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the first `MAX_FRAMES` frames, and a note if there are more."""
+    if len(frames) <= MAX_FRAMES:
+        return frames, ()
+    return frames[:MAX_FRAMES], (f"{len(frames)} frames found, showing the first {MAX_FRAMES}",)
 
 
 def check_target(out: Path, endings: Sequence[str], overwrite: bool) -> None:

@@ -9,9 +9,10 @@ from typing import overload
 
 from carlasc.errors import ArgumentError
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.page.page import PAGES, PageResult, write_page
-from carlasc.viewing.recordings.run import RECORDINGS, RecordingResult, write_recording
+from carlasc.viewing.page.page import PAGES, write_page
+from carlasc.viewing.recordings.run import RECORDINGS, write_recording
 from carlasc.viewing.scene import Scene, as_scene
+from carlasc.viewing.targets import ViewResult
 from carlasc.viewing.window.window import show_window
 
 
@@ -27,7 +28,7 @@ def view(
     overwrite: bool = ...,
     progress: Callable[[int, int], None] | None = ...,
     report: Callable[[str], None] | None = ...,
-) -> PageResult | RecordingResult: ...
+) -> ViewResult: ...
 
 
 @overload
@@ -50,7 +51,7 @@ def view(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     report: Callable[[str], None] | None = None,
-) -> PageResult | RecordingResult | None:
+) -> ViewResult | None:
     """Write a scene as a page for any browser or as a recording, or, without `out`, show it in a window until that is closed.
 
     Args:

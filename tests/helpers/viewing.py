@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from carlasc.viewing import PageResult, RenderResult, Scene, render, view
+from carlasc.viewing import RenderResult, Scene, ViewResult, render, view
 
 _SCENE_OPTIONS = {field.name for field in fields(Scene)} - {"source"}
 
@@ -16,7 +16,7 @@ def draw(source: Any, out: Any = None, **options: Any) -> RenderResult:
     return render(Scene(source, **scene), out, **others)
 
 
-def write_page(source: Any, out: Any, **options: Any) -> PageResult:
+def write_page(source: Any, out: Any, **options: Any) -> ViewResult:
     """Write a scene as a page."""
     scene, others = _split(options)
     return view(Scene(source, **scene), out, **others)

@@ -20,7 +20,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, DependencyError, StorageError
 from carlasc.metrics import Outcome
 from carlasc.storage import FolderSink, layout
-from carlasc.viewing import RecordingResult, Scene, view
+from carlasc.viewing import Scene, ViewResult, view
 from carlasc.viewing.colors import ERRORS, PATH, UNLABELLED
 from carlasc.viewing.recordings.content import record_frames, thin_scan
 from carlasc.viewing.recordings.run import RECORDINGS
@@ -354,7 +354,7 @@ def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_fir
     else:
         lengths = [len(read_mcap(r.out)["/points"][5].message.data) // POINT.itemsize for r in (thin, full)]
     assert lengths == [1000, 3401]
-    assert isinstance(full, RecordingResult) and full.size_bytes == full.out.stat().st_size > thin.size_bytes
+    assert isinstance(full, ViewResult) and full.size_bytes == full.out.stat().st_size > thin.size_bytes
 
 
 @pytest.mark.parametrize("ending", RECORDINGS)
@@ -369,7 +369,7 @@ def test_the_size_is_estimated_within_a_few_percent(ending, tmp_path):
 
 @pytest.mark.parametrize("ending", RECORDINGS)
 def test_a_scene_without_a_range_shows_its_first_frames_and_says_so(ending, blocks, tmp_path, monkeypatch):
-    monkeypatch.setattr("carlasc.viewing.recordings.run.MAX_FRAMES", 2)
+    monkeypatch.setattr("carlasc.viewing.targets.MAX_FRAMES", 2)
     result = view(blocks, tmp_path / f"a{ending}")
     assert result.frames == (0, 1) and result.notes == ("3 frames found, showing the first 2",)
     assert view(Scene(blocks, frames=(0, None)), tmp_path / f"b{ending}").frames == (0, 1, 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,35 +16,10 @@ from carlasc.viewing.page.coding import pack_arrays
 from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content
 from carlasc.viewing.page.folder import FRAMES, check_folder, writing_folder
 from carlasc.viewing.scene import Scene
-from carlasc.viewing.targets import check_target
+from carlasc.viewing.targets import ViewResult, check_target, first_frames
 
 PAGES = (".html", ".htm")
 """Endings of the names of pages in one file."""
-
-MAX_FRAMES = 60  # of a page in one file, if the scene gives no range: a few megabytes
-
-
-@dataclass(frozen=True)
-class PageResult:
-    """The page that was written.
-
-    Attributes:
-        out: the file, or the folder.
-        sequence: path of the sequence.
-        panels: titles of the grids.
-        frames: the frames in the page.
-        size_bytes: size of the file, or of all files in the folder.
-        elapsed_s: how long it took, seconds.
-        notes: what was chosen where the scene left a choice.
-    """
-
-    out: Path
-    sequence: str
-    panels: tuple[str, ...]
-    frames: tuple[int, ...]
-    size_bytes: int
-    elapsed_s: float
-    notes: tuple[str, ...]
 
 
 def write_page(
@@ -56,7 +31,7 @@ def write_page(
     beside_grid: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> PageResult:
+) -> ViewResult:
     """Write a scene as a page; see `carlasc.viewing.view` for the arguments and errors."""
     started = time.monotonic()
     in_folder = out.suffix == ""
@@ -68,14 +43,14 @@ def write_page(
         raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=str(thin_m))
     content = open_content(scene, thin_m, beside, beside_grid)
     notes = content.reader.notes
-    if not in_folder and scene.frames is None and len(content.frames) > MAX_FRAMES:
-        notes = (*notes, f"{len(content.frames)} frames found, showing the first {MAX_FRAMES}")
-        content = replace(content, frames=content.frames[:MAX_FRAMES])
+    if not in_folder and scene.frames is None:
+        frames, more = first_frames(content.frames)
+        content, notes = replace(content, frames=frames), notes + more
     writer = _Writer(content, progress)
     size = writer.write_folder(out) if in_folder else writer.write_file(out)
     titles = tuple(panel.title for panel in content.panels)
     elapsed = time.monotonic() - started
-    return PageResult(out, content.reader.path, titles, content.frames, size, elapsed, notes)
+    return ViewResult(out, content.reader.path, titles, content.frames, size, elapsed, notes)
 
 
 class _Writer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,37 +14,11 @@ from carlasc.viewing.recordings.content import MAX_POINTS, RecordingWriter, reco
 from carlasc.viewing.recordings.foxglove import FoxgloveWriter
 from carlasc.viewing.recordings.rerun import RerunWriter
 from carlasc.viewing.scene import Scene, SceneReader
-from carlasc.viewing.targets import check_target
-
-MAX_FRAMES = 60
-"""Frames of a recording, if the scene gives no range."""
+from carlasc.viewing.targets import ViewResult, check_target, first_frames
 
 _WRITERS: dict[str, Callable[[Path, SceneReader], RecordingWriter]] = {".rrd": RerunWriter, ".mcap": FoxgloveWriter}
 RECORDINGS = tuple(_WRITERS)
 """Endings of the names of recordings: Rerun's, and the one that Foxglove reads."""
-
-
-@dataclass(frozen=True)
-class RecordingResult:
-    """The recording that was written.
-
-    Attributes:
-        out: the file.
-        sequence: path of the sequence.
-        panels: titles of the grids in it.
-        frames: the frames in it.
-        size_bytes: size of the file.
-        elapsed_s: how long it took, seconds.
-        notes: what was chosen where the scene left a choice.
-    """
-
-    out: Path
-    sequence: str
-    panels: tuple[str, ...]
-    frames: tuple[int, ...]
-    size_bytes: int
-    elapsed_s: float
-    notes: tuple[str, ...]
 
 
 def write_recording(
@@ -55,21 +29,21 @@ def write_recording(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
     report: Callable[[str], None] | None = None,
-) -> RecordingResult:
+) -> ViewResult:
     """Write a scene as a recording; see `carlasc.viewing.view` for the arguments and errors."""
     started = time.monotonic()
     check_target(out, RECORDINGS, overwrite)
     reader = scene.open().right_handed()
-    if scene.frames is None and len(reader.frames) > MAX_FRAMES:
-        note = f"{len(reader.frames)} frames found, showing the first {MAX_FRAMES}"
-        reader = replace(reader, frames=reader.frames[:MAX_FRAMES], notes=(*reader.notes, note))
+    if scene.frames is None:
+        frames, more = first_frames(reader.frames)
+        reader = replace(reader, frames=frames, notes=reader.notes + more)
     max_points = None if full_points else MAX_POINTS
     if full_points and report is not None:
         size = estimate_size(reader, out.suffix, max_points)
         report(f"{out}: about {size / 1e6:,.0f} MB: {len(reader.frames)} frames with all of their points")
     write_output(out, lambda file: _write(reader, Path(file.name), out.suffix, max_points, progress))
     titles = tuple(panel.title for panel in reader.panels)
-    return RecordingResult(
+    return ViewResult(
         out, reader.path, titles, reader.frames, out.stat().st_size, time.monotonic() - started, reader.notes
     )  # fmt: skip
 
