@@ -179,7 +179,7 @@ def _names(line: str, path: str, case: Path) -> bool:
     relative = Path(path).relative_to(case).as_posix()
     final = re.sub(r"\.([^/]+)\.[^./]+-[0-9]+\.[0-9a-f]{8}\.part$", r"\1", relative)
     names = {final, *(parent.as_posix() for parent in Path(final).parents if parent != Path())}
-    return any(name.removesuffix(".part").removesuffix(".replaced").removeprefix(".") in line for name in names)
+    return any(name.removesuffix(".part").removesuffix(".replaced") in line for name in names)
 
 
 def _without_refused(content: Content) -> Content:

@@ -153,6 +153,9 @@ def _run(name: str, size: Size, out: Path) -> tuple[list[dict[str, Any]], str]:
     if size.repeats == 1:
         options += ["--benchmark-min-rounds=1", "--benchmark-max-time=0.001"]
     selected = [f"{_TESTS}/benchmarks/test_bench_{name}.py::{test}" for test in FILES[name]]
+    # A test that measures may itself run in a worker of pytest-xdist, where benchmarks turn themselves off.
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST_")}
+    environment["PYTHONPATH"] = os.pathsep.join([str(_TESTS.parent), os.environ.get("PYTHONPATH", "")])
     ran = subprocess.run(
         [
             sys.executable,
@@ -164,7 +167,7 @@ def _run(name: str, size: Size, out: Path) -> tuple[list[dict[str, Any]], str]:
             *selected,
         ],
         cwd=_TESTS.parent,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(_TESTS.parent), os.environ.get("PYTHONPATH", "")])},
+        env=environment,
         capture_output=True,
         text=True,
         check=False,

@@ -434,7 +434,7 @@ def test_the_limits_of_quantisation(millimetres: float) -> None:
 
 def test_leftovers_of_an_older_replacement_are_removed_and_a_copy_of_the_user_stays(data: Path, tmp_path: Path) -> None:
     pack(data / "Val", tmp_path / "x.h5")
-    for name in (".x.h5.replaced", "x.h5.old"):
+    for name in ("x.h5.replaced", "x.h5.old"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "file").write_bytes(b"1")
     pack(data / "Val", tmp_path / "x.h5", overwrite=True)

@@ -239,7 +239,7 @@ def test_overwrite_keeps_the_old_store_until_the_new_one_is_finished(store: Path
     before = files_of(store)
     sink = ZarrSink(store, overwrite=True)
     sink.sequence(SCANS).close()
-    assert files_of(store.with_name(".x.zarr.replaced")) == before
+    assert files_of(store.with_name("x.zarr.replaced")) == before
     joined = ZarrSink(store, overwrite=True)  # a second process of the same run, or the run again
     assert not joined.is_finished
     joined.finish()
@@ -257,7 +257,7 @@ def test_a_run_that_ends_between_the_old_store_and_the_new_one_leaves_nothing_in
         patched.setattr("carlasc.storage.targets.LocalTarget.put", end)
         with pytest.raises(KeyboardInterrupt):
             ZarrSink(store, overwrite=True)
-    assert [entry.name for entry in tmp_path.iterdir()] == [".x.zarr.replaced"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.zarr.replaced"]
     sink = ZarrSink(store, overwrite=True)
     sink.sequence(SCANS).close()
     sink.finish()

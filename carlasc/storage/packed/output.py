@@ -55,8 +55,8 @@ def unfinished(path: Path) -> Path:
 
 
 def replaced(path: Path) -> Path:
-    """Return where an older store waits until the new one is whole: under a hidden name, which no user gives to a copy of their own."""
-    return path.with_name(f".{path.name}.replaced")
+    """Return where an older store waits until the new one is whole: `<name>.replaced`, which users hardly call a copy of their own."""
+    return path.with_name(f"{path.name}.replaced")
 
 
 def unfinished_error(where: str | os.PathLike[str]) -> FormatError:

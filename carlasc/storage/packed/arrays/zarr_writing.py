@@ -55,7 +55,7 @@ class ZarrSink(Sink):
         Args:
             out: the store.
             options: how it is packed; None: as the store is packed that exists.
-            overwrite: start again where a finished store exists, or one with other options. A finished local store is kept as `.<name>.replaced`
+            overwrite: start again where a finished store exists, or one with other options. A finished local store is kept as `<name>.replaced`
                 until the new one is finished; in an object store it is removed first.
 
         Raises:
