@@ -43,6 +43,7 @@ def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
         sync_all([temporary])
         if create:
             os.link(temporary, path)  # a rename would replace a file that another process has just written
+            temporary.unlink()  # before the folder is synced, or a power failure could bring it back
         else:
             temporary.replace(path)
         sync_all([path.parent])

@@ -52,6 +52,15 @@ def test_several_files_are_synced_before_any_gets_its_name(tmp_path: Path, synce
     assert [(tmp_path / name).read_bytes() for name in ("a", "x/b", "c")] == [b"1", b"2", b"3"]
 
 
+def test_the_temporary_name_of_a_new_file_is_gone_before_its_folder_is_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names: list[str] = []
+    monkeypatch.setattr(durability, "_sync", lambda _: names.append(",".join(path.name for path in tmp_path.iterdir())))
+    assert write_atomic(tmp_path / "a", b"1", create=True)
+    assert names[-1] == "a"
+
+
 @needs_proc
 def test_a_file_that_is_removed_stays_removed(tmp_path: Path, synced: list[str]) -> None:
     (tmp_path / "mark.json").write_bytes(b"{}")

@@ -85,6 +85,15 @@ def test_a_second_run_goes_on_with_the_numbers_of_the_first(tmp_path: Path) -> N
     assert [number.to_pylist() for number in numbers] == [[0] * 3, [1] * 3]
 
 
+def test_a_sequence_that_is_written_again_keeps_its_number(tmp_path: Path) -> None:
+    for path in (SCANS, WHOLE, SCANS):
+        with ParquetSink(tmp_path / "x.parquet").sequence(path) as writer:
+            writer.write("labels", 0, np.arange(3, dtype=np.uint32))
+    ParquetSink(tmp_path / "x.parquet").finish()
+    tables = [parquet.read_table(tmp_path / "x.parquet" / path / "labels.parquet") for path in (SCANS, WHOLE)]
+    assert [table["sequence"].to_pylist() for table in tables] == [[0] * 3, [1] * 3]
+
+
 def test_negative_zeros_and_nan_payloads_survive(tmp_path: Path) -> None:
     flow = np.zeros((40, 3), np.float32)
     flow[::2] = -0.0

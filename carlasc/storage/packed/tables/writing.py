@@ -71,7 +71,7 @@ class ParquetSink(PackedSink):
         self._sequences = {
             about["path"]: file.parent.relative_to(self._part).as_posix() for file, about in done.items()
         }
-        self._next_number = 1 + max((about.get(NUMBER, -1) for about in done.values()), default=-1)
+        self._numbers = {str(about["path"]): int(about.get(NUMBER, 0)) for about in done.values()}
 
     def finished(self, path: str) -> bool:
         """Whether an earlier run that was interrupted has written this sequence whole."""
@@ -82,7 +82,8 @@ class ParquetSink(PackedSink):
         folder = node_of(path, self.location)
         self._sequences.pop(path, None)
         remove(self._part / folder)
-        number, self._next_number = self._next_number, self._next_number + 1
+        # One that is written again keeps its number, so that an interrupted run leaves the bytes of one that was not.
+        number = self._numbers.setdefault(path, 1 + max(self._numbers.values(), default=-1))
         return ParquetWriter(self._part, path, folder, number, self.options, self._sequences)
 
     def finish(self, *, incomplete: bool = False) -> None:
