@@ -59,8 +59,10 @@ def test_a_png_says_its_resolution_where_one_is_given(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4", "a.webp"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, CarlascError])
-def test_interrupted_pictures_leave_no_file(tmp_path, name, error):
-    before = os.listdir("/tmp")
+def test_interrupted_pictures_leave_no_file(tmp_path, monkeypatch, name, error):
+    temporary = tmp_path / "temporary"  # of its own: other tests use that of the system at the same time
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
 
     def broken():
         if name != "a.png":
@@ -69,8 +71,8 @@ def test_interrupted_pictures_leave_no_file(tmp_path, name, error):
 
     with pytest.raises(error):
         write_pictures(tmp_path / name, broken(), 10)
-    assert os.listdir(tmp_path) == []
-    assert not {left for left in set(os.listdir("/tmp")) - set(before) if left.startswith("carlasc-")}
+    assert os.listdir(tmp_path) == ["temporary"]
+    assert os.listdir(temporary) == []
 
 
 def test_an_existing_film_stays_until_the_new_one_is_complete(tmp_path):
