@@ -176,9 +176,7 @@ class _Cache(FunctionCache):
                     fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     return
                 time.sleep(0.02)
-        except (
-            OSError
-        ):  # a file system without locks, or a folder that is read-only now: this process compiles by itself
+        except OSError:  # no locks, or no right to write: this process compiles by itself
             self._release()
 
     def _release(self) -> None:
