@@ -52,11 +52,11 @@ benchmark: $(VENV)/ready ## time the hot paths (docs/performance.md)
 faults: $(VENV)/ready ## kill, damage and deceive every command, and publish the figures, minutes (SIZE=long: hours; COUNT=N cases of each kind)
 	@$(RUN)/python -c "import atheris" 2>/dev/null || $(RUN)/pip install --quiet --constraint constraints.txt "atheris>=3.0" \
 		|| echo "atheris cannot be installed here: mutations that are guided by coverage are left out"
-	PYTHONPATH=tests:examples $(RUN)/python -m faults --size $(or $(SIZE),quick) $(if $(COUNT),--count $(COUNT))
+	PYTHONPATH=tests:tests/tools:examples $(RUN)/python -m faults --size $(or $(SIZE),quick) $(if $(COUNT),--count $(COUNT))
 
 figures: $(VENV)/ready ## measure every figure of the documentation, on an idle machine, 20 minutes (SIZE=full: an hour or more; SIZE=tiny: try all, into build/; ONLY=GROUP)
 	@mkdir -p build
-	PYTHONPATH=tests $(RUN)/python -m measuring --size $(or $(SIZE),quick) $(if $(ONLY),--only $(ONLY)) $(if $(filter tiny,$(SIZE)),--out build/figures.json)
+	PYTHONPATH=tests:tests/tools $(RUN)/python -m measuring --size $(or $(SIZE),quick) $(if $(ONLY),--only $(ONLY)) $(if $(filter tiny,$(SIZE)),--out build/figures.json)
 
 benchmark-ssc: $(VENV)/ready ## train networks on simulated drives and print the tables, 20 minutes (SIZE=medium: hours, SIZE=full: on a GPU)
 	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import scan
+from helpers.datasets.sequences import scan
 
 import carlasc
 from carlasc.converting import Cloud, Sensor

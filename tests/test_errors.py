@@ -7,7 +7,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
-from helpers import jobs
+from helpers.processes import jobs
 
 from carlasc.errors import (
     ArgumentError,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.films import Image
+from helpers.readers.pictures import Image
 
 ROOT = Path(__file__).parents[1]
 

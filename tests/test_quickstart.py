@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from helpers.drives import write_drive  # noqa: E402
-from helpers.range_server import serve_folder  # noqa: E402
+from helpers.datasets.drives import write_drive  # noqa: E402
+from helpers.servers.range_server import serve_folder  # noqa: E402
 
 from carlasc.core.grids import GridSpec  # noqa: E402
 from carlasc.storage.packing import pack  # noqa: E402

@@ -20,7 +20,7 @@ from carlasc.converting import convert
 from carlasc.core.tables import CARLA
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-from helpers.kitti import write_kitti
+from helpers.datasets.kitti import write_kitti
 
 FRAMES = range(20, 100)
 MIRROR = np.array([1, -1, 1])

@@ -27,7 +27,7 @@ from carlasc.metrics import TruthScore, score_truth
 from carlasc.viewing import ClassColors, Panel, draw_panels, grid_drawing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-from helpers.kitti import write_kitti
+from helpers.datasets.kitti import write_kitti
 
 SEED, FRAMES, JUDGED = 1, range(101), (10, 30, 50, 70, 90)
 GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}

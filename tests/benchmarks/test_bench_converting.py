@@ -7,8 +7,8 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.kitti import write_kitti
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.kitti import write_kitti
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 from carlasc.captures import Drive, Lidar
 from carlasc.converting import convert

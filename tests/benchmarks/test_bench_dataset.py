@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the table: pytest has it already
-from helpers.drives import write_drive
-from helpers.lidar_frames import street_frame
-from helpers.plain_loader import PlainLoader
+from helpers.datasets.drives import write_drive
+from helpers.references.plain_loader import PlainLoader
+from helpers.scenes.lidar_frames import street_frame
 
 from carlasc.dataset.samples import Dataset
 

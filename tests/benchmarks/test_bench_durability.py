@@ -10,7 +10,7 @@ import itertools
 from pathlib import Path
 
 import pytest
-from helpers.captures import write_capture
+from helpers.datasets.captures import write_capture
 
 from carlasc.captures.town.simulation import simulate
 from carlasc.core.grids import GridSpec

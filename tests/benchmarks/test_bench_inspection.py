@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.lidar_frames import street_frame
+from helpers.scenes.lidar_frames import street_frame
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.voting.ballot import count_votes

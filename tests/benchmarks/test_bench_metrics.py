@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers.plain_metrics import panoptic_quality, rayiou
+from helpers.references.plain_metrics import panoptic_quality, rayiou
 
 from carlasc import GridSpec
 from carlasc.metrics import ConfusionMatrix, PanopticQuality, RayIoU, known, rayiou_directions

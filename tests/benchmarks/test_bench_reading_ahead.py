@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the table: pytest has it already
-from helpers.drives import write_drive
-from helpers.lidar_frames import street_frame
+from helpers.datasets.drives import write_drive
+from helpers.scenes.lidar_frames import street_frame
 
 import carlasc
 from carlasc.dataset import Dataset, ShardSampler
@@ -56,7 +56,7 @@ def served(folder: Path, delay_s: float = 0.0) -> Iterator[str]:
     """Serve a folder from a process of its own, which waits before each answer; yield its URL."""
     command = [
         sys.executable,
-        str(Path(__file__).parents[1] / "helpers" / "range_server.py"),
+        str(Path(__file__).parents[1] / "helpers" / "servers" / "range_server.py"),
         str(folder),
         str(delay_s),
     ]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.lidar_frames import street_frame
+from helpers.scenes.lidar_frames import street_frame
 from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec

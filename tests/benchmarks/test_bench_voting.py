@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.lidar_frames import street_frame
-from helpers.plain_voting import plain_grid, plain_votes
+from helpers.references.plain_voting import plain_grid, plain_votes
+from helpers.scenes.lidar_frames import street_frame
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.voting.ballot import count_votes

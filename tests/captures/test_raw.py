@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import make_recording, write_capture
+from helpers.datasets.captures import make_recording, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -11,9 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import pytest
-from helpers import clusters, interrupted, slurm
-from helpers.captures import read_tree, write_capture
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.captures import read_tree, write_capture
+from helpers.datasets.tiny_kitti import write_tiny_kitti
+from helpers.processes import interrupted
+from helpers.servers import dask_cluster, slurm
 
 from carlasc.inspection import validate
 from carlasc.running import open_cluster
@@ -138,7 +139,7 @@ def test_ctrl_c_stops_the_workers_at_once_and_the_next_run_finishes(capture, tmp
 def test_the_same_command_continues_after_the_scheduler_was_lost(capture, tmp_path):
     root, whole = capture
     command = ("regrid", root, "-o", tmp_path / "out", "--preset", "coarse", "--cluster")
-    with clusters.scheduler(tmp_path) as (address, scheduler), clusters.worker(address):
+    with dask_cluster.scheduler(tmp_path) as (address, scheduler), dask_cluster.worker(address):
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         process = subprocess.Popen(
             [sys.executable, "-m", "carlasc", *map(str, command), address],
@@ -150,7 +151,7 @@ def test_the_same_command_continues_after_the_scheduler_was_lost(capture, tmp_pa
         _, stderr = process.communicate(timeout=60)
     assert (process.returncode, stderr.count("\n")) == (1, 1)
     assert stderr.startswith(f"carlasc: the scheduler {address}: the connection was lost")
-    with clusters.scheduler(tmp_path) as (address, _), clusters.worker(address):
+    with dask_cluster.scheduler(tmp_path) as (address, _), dask_cluster.worker(address):
         assert "existed)" in run(*command, address)
     assert read_tree(tmp_path / "out") == whole
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.tiny_kitti import write_labels, write_tiny_kitti
+from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 from typer.testing import CliRunner
 
 from carlasc.cli import app

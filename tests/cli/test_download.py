@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.http_server import Site, serve
+from helpers.servers.http_server import Site, serve
 from typer.testing import CliRunner
 
 from carlasc.cli import app

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from helpers import passing
+from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
 from carlasc.cli import app
@@ -17,7 +17,7 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return passing.write_sequence(tmp_path_factory.mktemp("street"), frames=8)
+    return passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=8)
 
 
 def test_held_out_rays_are_printed_below_the_checks(street):
@@ -63,7 +63,7 @@ def test_options_that_make_no_sense_exit_2(street, arguments):
 
 
 def test_a_drive_without_poses_is_one_line_and_exit_1(tmp_path):
-    folder = passing.write_sequence(tmp_path, frames=2, poses=False)
+    folder = passing_car.write_sequence(tmp_path, frames=2, poses=False)
     result = run(folder, "--holdout")
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
@@ -71,7 +71,7 @@ def test_a_drive_without_poses_is_one_line_and_exit_1(tmp_path):
 
 
 def test_a_scan_that_cannot_be_read_is_listed_and_exits_1(tmp_path):
-    folder = passing.write_sequence(tmp_path, frames=8)
+    folder = passing_car.write_sequence(tmp_path, frames=8)
     (folder / "cartesian" / "labels" / "000004.label").write_bytes(b"odd")
     result = run(folder, *OPTIONS)
     assert result.exit_code == 1

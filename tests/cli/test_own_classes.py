@@ -13,7 +13,7 @@ import carlasc
 from carlasc.cli import app
 from carlasc.core.geometry import invert, transform_points, translation
 
-CODE = Path(__file__).parents[1] / "helpers/lab_converter.py"
+CODE = Path(__file__).parents[1] / "helpers/converters/lab_converter.py"
 PATH = "Train/LAB_monday/cartesian"
 NAMES = {0: "unlabelled", 1: "road", 2: "car", 3: "building"}
 

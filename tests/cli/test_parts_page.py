@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.captures import read_tree, write_capture
+from helpers.datasets.captures import read_tree, write_capture
 
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid

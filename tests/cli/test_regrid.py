@@ -3,8 +3,8 @@ import math
 
 import numpy as np
 import pytest
-from helpers import passing
-from helpers.captures import read_tree, write_capture
+from helpers.datasets.captures import read_tree, write_capture
+from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
 from carlasc.cli import app
@@ -140,7 +140,7 @@ def test_a_folder_without_a_capture_is_1(tmp_path):
 
 
 def test_advice_names_options_where_the_library_names_arguments(tmp_path, capture):
-    street = passing.write_sequence(tmp_path / "street", (), frames=2, poses=False)
+    street = passing_car.write_sequence(tmp_path / "street", (), frames=2, poses=False)
     assert "`--poses kiss-icp`" in _regrid(street, "--res", 0.4).stderr
     assert _regrid("--preset", "coarse").exit_code == 0
     advice = _regrid("--preset", "coarse", "--voting", "sample").stderr

@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.films import Image, read_mp4
+from helpers.readers.pictures import Image, read_mp4
 from typer.testing import CliRunner
 
 from carlasc.cli import app

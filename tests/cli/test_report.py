@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from helpers import passing
+from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
 from carlasc import GridSpec
@@ -22,7 +22,7 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder = passing.write_sequence(tmp_path_factory.mktemp("street"), frames=6)
+    folder = passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=6)
     regrid(folder, SPEC, observe=FromScans(window=(-2, 2)), workers=1)
     return folder
 
@@ -69,7 +69,7 @@ def test_a_frame_that_cannot_be_read_is_listed_and_exits_1(made, tmp_path):
 
 @pytest.mark.parametrize("grid", [(), ("--grid", "other")])
 def test_a_place_without_grids_is_one_line_and_exit_1(tmp_path, grid):
-    folder = passing.write_sequence(tmp_path, frames=2)
+    folder = passing_car.write_sequence(tmp_path, frames=2)
     result = run(folder, *grid)
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1

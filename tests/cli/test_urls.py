@@ -12,8 +12,10 @@ from pathlib import Path
 
 import fsspec
 import pytest
-from helpers.captures import read_tree, write_capture
-from helpers.object_store import (
+from helpers.datasets.captures import read_tree, write_capture
+from helpers.datasets.sequences import files_of
+from helpers.datasets.tiny_kitti import write_tiny_kitti
+from helpers.servers.object_store import (
     BUCKET,
     SECRET,
     FaultyServer,
@@ -23,8 +25,6 @@ from helpers.object_store import (
     options_for,
     s3_server,
 )
-from helpers.sequences import files_of
-from helpers.tiny_kitti import write_tiny_kitti
 from typer.testing import CliRunner
 
 from carlasc.captures import find_captures

@@ -2,7 +2,7 @@ import json
 import sys
 
 import pytest
-from helpers.blocks import write_blocks
+from helpers.scenes.road_blocks import write_blocks
 from typer.testing import CliRunner
 
 from carlasc.cli import app

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from helpers.kitti import SMALL_LIDAR, KittiTruth, write_kitti
+from helpers.datasets.kitti import SMALL_LIDAR, KittiTruth, write_kitti
 
 from carlasc.captures import Drive
 

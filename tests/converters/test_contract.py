@@ -1,7 +1,7 @@
 """The contract of converters, on drives in memory: what the toolkit does itself for any data set."""
 
 import numpy as np
-from helpers.drive_converter import IDS, DriveConverter
+from helpers.converters.drive_converter import IDS, DriveConverter
 
 from carlasc.converting import Sensor
 from carlasc.core import rotation_z

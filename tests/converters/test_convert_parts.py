@@ -1,8 +1,8 @@
 """A conversion in parts deals out whole recordings, and makes the same files as one command."""
 
 import pytest
-from helpers.captures import read_tree
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.captures import read_tree
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 from typer.testing import CliRunner
 
 from carlasc.cli import app

@@ -1,8 +1,8 @@
 """A conversion to a packed store: the same scans and grids as in a folder."""
 
 import pytest
-from helpers.captures import read_tree
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.captures import read_tree
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.tiny_kitti import write_labels, write_tiny_kitti
+from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert, converter_names, load_converter
@@ -178,7 +178,7 @@ def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path
     write_tiny_kitti(tmp_path / "in", frames=60)
     convert("kitti", tmp_path / "in", tmp_path / "whole", grids="none", workers=1)
     arguments = ["kitti", str(tmp_path / "in"), str(tmp_path / "out"), "--grids", "none", "--workers", "1"]
-    helper = Path(__file__).parents[1] / "helpers" / "interrupted.py"
+    helper = Path(__file__).parents[1] / "helpers" / "processes" / "interrupted.py"
     done = subprocess.run(
         [sys.executable, helper, name, "100", "convert", *arguments],
         start_new_session=True,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.recordings import MemoryFrame, MemoryRecording, MemoryWriter
+from helpers.datasets.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
 from carlasc.converting import (
     Cloud,

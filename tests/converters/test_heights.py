@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.drive_converter import DriveConverter
+from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
 from carlasc.converting import Sensor, convert

@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert

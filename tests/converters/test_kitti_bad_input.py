@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.kitti import write_calibration
-from helpers.tiny_kitti import write_labels, write_tiny_kitti
+from helpers.datasets.kitti import write_calibration
+from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from carlasc_converters.kitti import SemanticKitti
 from carlasc_converters.kitti_voxels import unpack_bits
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
 from carlasc.converting import convert, export

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.kitti import write_kitti
+from helpers.datasets.kitti import write_kitti
 
 import carlasc
 from carlasc.captures import Drive
@@ -34,8 +34,8 @@ def test_flow_of_moving_vehicles_is_right_and_that_of_everything_static_exactly_
 
 def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
     """A car ahead at constant distance drives as fast as the ego vehicle; both turn."""
-    from helpers.kitti import write_poses
-    from helpers.tiny_kitti import write_labels, write_tiny_kitti
+    from helpers.datasets.kitti import write_poses
+    from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 
     from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 
@@ -60,7 +60,7 @@ def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
 
 
 def test_without_instances_moving_points_have_no_known_flow_and_that_is_said(tmp_path):
-    from helpers.tiny_kitti import write_labels, write_tiny_kitti
+    from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 
     folder = write_tiny_kitti(tmp_path / "in", points=10)
     for frame in range(3):

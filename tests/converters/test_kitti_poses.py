@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from helpers.kitti import write_kitti
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.kitti import write_kitti
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
 from carlasc.captures import Drive, Lidar

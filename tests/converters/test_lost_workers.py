@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import read_tree
-from helpers.deadly_converter import Deadly
-from helpers.lab_converter import Lab
+from helpers.converters.deadly_converter import Deadly
+from helpers.converters.lab_converter import Lab
+from helpers.datasets.captures import read_tree
 
 from carlasc.converting import convert
 from carlasc.running import open_cluster

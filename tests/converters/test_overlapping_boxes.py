@@ -1,7 +1,7 @@
 from typing import ClassVar
 
 import numpy as np
-from helpers.drive_converter import DriveConverter
+from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
 from carlasc.converting import convert

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.drive_converter import DriveConverter, DriveFrame
-from helpers.recordings import MemoryWriter
+from helpers.converters.drive_converter import DriveConverter, DriveFrame
+from helpers.datasets.recordings import MemoryWriter
 
 import carlasc
 from carlasc.converting import Sensor, convert

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 import pytest
-from helpers.drives import write_drive
-from helpers.range_server import serve_folder
+from helpers.datasets.drives import write_drive
+from helpers.servers.range_server import serve_folder
 
 import carlasc
 from carlasc.core.grids import GridSpec

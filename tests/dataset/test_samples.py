@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from helpers.drives import bend, write_drive
-from helpers.plain_loader import PlainLoader
+from helpers.datasets.drives import bend, write_drive
+from helpers.references.plain_loader import PlainLoader
 
 import carlasc.storage
 from carlasc.core.grids import GridSpec

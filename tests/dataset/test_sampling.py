@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.drives import write_drive
+from helpers.datasets.drives import write_drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.drives import write_drive
+from helpers.datasets.drives import write_drive
 
 import carlasc
 from carlasc import Dataset, GridSpec

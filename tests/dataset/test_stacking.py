@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from helpers.drives import bend, random_points
+from helpers.datasets.drives import bend, random_points
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 

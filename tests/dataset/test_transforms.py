@@ -2,7 +2,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers.drives import bend, random_points, write_drive
+from helpers.datasets.drives import bend, random_points, write_drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.drives import bend, random_points, write_drive
-from helpers.plain_voting import plain_votes
+from helpers.datasets.drives import bend, random_points, write_drive
+from helpers.references.plain_voting import plain_votes
 
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec

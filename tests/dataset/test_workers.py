@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers.drives import write_drive
+from helpers.datasets.drives import write_drive
 
 from carlasc.core.grids import GridSpec
 from carlasc.dataset import FIELDS, Dataset, Flip, collate

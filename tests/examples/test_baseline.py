@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.completion import SPEC, write_split
+from helpers.datasets.completion import SPEC, write_split
 
 from carlasc import Dataset
 from carlasc import open as open_source

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.completion import SPEC, write_split
+from helpers.datasets.completion import SPEC, write_split
 
 from carlasc.errors import ArgumentError, DependencyError
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.completion import SPEC, write_split
+from helpers.datasets.completion import SPEC, write_split
 
 from carlasc import Dataset, GridSpec
 from carlasc import open as open_source

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.completion import write_split
-from helpers.range_server import serve_folder
+from helpers.datasets.completion import write_split
+from helpers.servers.range_server import serve_folder
 
 import carlasc
 from carlasc import ShardSampler, pack

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.exported import files_and_bytes, write_scene
+from helpers.datasets.exported import files_and_bytes, write_scene
 
 from carlasc.converting import export
 from carlasc.errors import FormatError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.exported import PATH, files_and_bytes, scene_grid, write_scene
+from helpers.datasets.exported import PATH, files_and_bytes, scene_grid, write_scene
 from typer.testing import CliRunner
 
 from carlasc.cli import app

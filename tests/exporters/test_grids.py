@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.exported import (
+from helpers.datasets.exported import (
     CAR,
     PATH,
     SPEC,

@@ -5,8 +5,8 @@ import pytest
 from carlasc_converters.exporters.kitti import TO_PREDICTED, TO_RAW
 from carlasc_converters.exporters.occlusion import occluded_voxels
 from carlasc_converters.kitti_voxels import pack_bits, unpack_bits
-from helpers.exported import files_and_bytes, write_scene
-from helpers.sequences import write_dataset
+from helpers.datasets.exported import files_and_bytes, write_scene
+from helpers.datasets.sequences import write_dataset
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.exported import files_and_bytes, read_index
+from helpers.datasets.exported import files_and_bytes, read_index
 
 from carlasc.converting import export, mirror_boxes, mirror_points, mirror_poses
 from carlasc.core.boxes import Boxes

@@ -10,8 +10,8 @@ from carlasc_converters.exporters.classes import mapping_of
 from carlasc_converters.exporters.kinds import KINDS
 from carlasc_converters.exporters.kitti import TO_RAW
 from carlasc_converters.exporters.opensceneflow import CATEGORIES
-from helpers.drive_converter import DriveConverter
-from helpers.exported import occ3d_cell, read_occ3d
+from helpers.converters.drive_converter import DriveConverter
+from helpers.datasets.exported import occ3d_cell, read_occ3d
 from typer.testing import CliRunner
 
 import carlasc

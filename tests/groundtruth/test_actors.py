@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers import passing
-from helpers.captures import read_tree
+from helpers.datasets.captures import read_tree
+from helpers.scenes import passing_car
 
 import carlasc
 from carlasc import FromScans
@@ -101,7 +101,7 @@ class TestKept:
 
 @pytest.fixture
 def street(tmp_path):
-    return passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+    return passing_car.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def passes(monkeypatch):
 
 def run(street, name="mine", frames=None, workers=1, **options):
     result = carlasc.regrid(
-        street, passing.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=workers
+        street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=workers
     )
     assert result.failures == ()
     return {file: data for file, data in read_tree(street / "cartesian" / name).items() if file[:1].isdigit()}
@@ -191,7 +191,7 @@ class TestPass:
             steps = []
             carlasc.regrid(
                 street,
-                passing.SPEC,
+                passing_car.SPEC,
                 name=name,
                 frames=(4, 6),
                 observe=FromScans(**options),

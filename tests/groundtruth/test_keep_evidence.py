@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.captures import write_capture
-from helpers.sequences import scan
+from helpers.datasets.captures import write_capture
+from helpers.datasets.sequences import scan
 from typer.testing import CliRunner
 
 import carlasc

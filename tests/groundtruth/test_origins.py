@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.drive_converter import DriveConverter
+from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
 from carlasc.converting import Sensor, convert

@@ -7,9 +7,9 @@ from hashlib import blake2b
 
 import numpy as np
 import pytest
-from helpers import passing
-from helpers.actors import MovingBox, scan_of
-from helpers.captures import write_capture
+from helpers.datasets.captures import write_capture
+from helpers.scenes import passing_car
+from helpers.scenes.box_actors import MovingBox, scan_of
 
 import carlasc
 from carlasc import Grid, GridSpec
@@ -32,7 +32,7 @@ GRID = layout.grid_folder(SPEC)
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return passing.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
+    return passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
 
 
 def make(source, out=None, **options):
@@ -167,7 +167,7 @@ def test_an_overwritten_grid_has_a_report_of_its_own(street, made, tmp_path):
 
 
 def test_a_frame_that_fails_is_not_in_the_report(tmp_path):
-    folder = passing.write_sequence(tmp_path, frames=3)
+    folder = passing_car.write_sequence(tmp_path, frames=3)
     (folder / "cartesian" / "labels" / "000001.label").write_bytes(b"odd")
     result = make(folder, tmp_path / "out", observe=FromScans(window=(0, 0), dynamic="tube"))
     assert [failure.frame for failure in result.failures] == [1]
@@ -288,7 +288,7 @@ def test_more_lines_in_a_text_file_are_no_change():
 
 
 def test_a_run_into_the_source_digests_what_lies_beside_the_grid(tmp_path):
-    folder = passing.write_sequence(tmp_path, frames=4)
+    folder = passing_car.write_sequence(tmp_path, frames=4)
     make(folder)
     assert set(report_in(folder).digests) >= {"points", "labels", "flow", f"{GRID}/labels"}
     assert FolderSink(folder).sequence("cartesian").read_document(layout.report_file(GRID)) is not None

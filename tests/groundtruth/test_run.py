@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import make_recording, read_tree, write_capture
+from helpers.datasets.captures import make_recording, read_tree, write_capture
 
 from carlasc.captures.raw import Capture
 from carlasc.captures.writing import CaptureWriter

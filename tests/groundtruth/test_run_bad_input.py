@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.captures import read_tree, write_capture
+from helpers.datasets.captures import read_tree, write_capture
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError

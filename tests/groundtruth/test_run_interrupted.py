@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from helpers import interrupted
-from helpers.captures import read_tree, write_capture
+from helpers.datasets.captures import read_tree, write_capture
+from helpers.processes import interrupted
 
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid

@@ -6,7 +6,7 @@ import sys
 from itertools import permutations
 
 import pytest
-from helpers.captures import read_tree, write_capture
+from helpers.datasets.captures import read_tree, write_capture
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from helpers import passing
-from helpers.captures import make_recording, read_tree, write_capture
+from helpers.datasets.captures import make_recording, read_tree, write_capture
+from helpers.scenes import passing_car
 
 from carlasc.captures.writing import CaptureWriter
 from carlasc.core.grids import GridSpec
@@ -78,17 +78,17 @@ def test_a_grid_of_carlasc_0_1_0_is_continued_and_compared(made):
 
 
 def test_a_grid_that_carlasc_0_1_0_made_from_scans_is_not_continued_since_scans_give_other_grids_now(tmp_path):
-    street = passing.write_sequence(tmp_path, frames=4)
-    regrid(street, passing.SPEC, name="mine", workers=1)
+    street = passing_car.write_sequence(tmp_path, frames=4)
+    regrid(street, passing_car.SPEC, name="mine", workers=1)
     path = street / "cartesian/mine/params.json"
     params = json.loads(path.read_bytes())
     record = {key: value for key, value in params["carlasc"].items() if key not in ("format", "rule")}
     path.write_text(json.dumps(params | {"carlasc": {"version": "0.1.0", **record}}))
     before = read_tree(street)
     with pytest.raises(ConflictError, match="carlasc.rule 1 where this run has 2"):
-        regrid(street, passing.SPEC, name="mine", workers=1)
+        regrid(street, passing_car.SPEC, name="mine", workers=1)
     assert read_tree(street) == before
-    assert regrid(street, passing.SPEC, name="mine", workers=1, overwrite=True).made == 4
+    assert regrid(street, passing_car.SPEC, name="mine", workers=1, overwrite=True).made == 4
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers.captures import read_tree, write_capture
+from helpers.datasets.captures import read_tree, write_capture
 
 import carlasc
 from carlasc.core.grids import GridSpec

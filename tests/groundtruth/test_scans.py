@@ -8,8 +8,8 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
-from helpers import passing
-from helpers.scenes import drive, write_drive
+from helpers.scenes import passing_car
+from helpers.scenes.box_street import drive, write_drive
 from typer.testing import CliRunner
 
 import carlasc
@@ -28,19 +28,19 @@ FRAME = 20
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return passing.write_sequence(tmp_path_factory.mktemp("street"))
+    return passing_car.write_sequence(tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture(scope="module")
 def truth():
-    return passing.reference(FRAME)
+    return passing_car.reference(FRAME)
 
 
 def grid_of(sequence, name, frame=FRAME):
     return next(iter(carlasc.open(sequence).sequences().values())).grid(name, frame)
 
 
-def make(sequence, name, frames=(FRAME, FRAME + 1), spec=passing.SPEC, **options):
+def make(sequence, name, frames=(FRAME, FRAME + 1), spec=passing_car.SPEC, **options):
     observe = FromScans(**options.pop("settings", {}))
     return carlasc.regrid(sequence, spec, name=name, frames=frames, observe=observe, workers=1, **options)
 
@@ -67,10 +67,10 @@ def test_a_passing_car_leaves_a_tube_under_semantickittis_rule_and_none_when_ali
 
 
 def test_no_voxel_farther_than_one_from_the_passing_car_is_called_a_vehicle(street, scores):
-    car, here = passing.street(FRAME), passing.sensor_pose(FRAME)[:3, 3]
-    near = passing.SPEC.voxel_size + 1e-6
+    car, here = passing_car.street(FRAME), passing_car.sensor_pose(FRAME)[:3, 3]
+    near = passing_car.SPEC.voxel_size + 1e-6
     for name in ("align", "current"):
-        found = passing.SPEC.centers()[grid_of(street, name).labels == VEHICLE] + here
+        found = passing_car.SPEC.centers()[grid_of(street, name).labels == VEHICLE] + here
         moving = found[found[:, 1] > 0]
         assert len(moving)
         assert ((moving > car.lower[-1] - near) & (moving < car.upper[-1] + near)).all()
@@ -97,7 +97,7 @@ def test_what_stands_is_the_same_whatever_becomes_of_movers(street, scores):
 
 
 def test_numbered_points_do_as_well_as_flow(tmp_path, truth, scores):
-    street = passing.write_sequence(tmp_path, ("labels", "instances"))
+    street = passing_car.write_sequence(tmp_path, ("labels", "instances"))
     make(street, "by_instances")
     iou, wrong = vehicle_score(grid_of(street, "by_instances"), truth)
     assert iou > scores["align"][0] - 0.05
@@ -106,7 +106,7 @@ def test_numbered_points_do_as_well_as_flow(tmp_path, truth, scores):
 
 def test_a_cylindrical_grid_has_no_tube_either(street):
     spec = GridSpec.published("cylindrical")
-    truth = passing.reference(FRAME, spec)
+    truth = passing_car.reference(FRAME, spec)
     for dynamic in ("tube", "align"):
         make(street, dynamic, spec=spec, settings={"dynamic": dynamic})
     sequences = carlasc.open(street).sequences()
@@ -125,13 +125,13 @@ def test_a_frame_does_not_depend_on_which_frames_a_run_makes(street):
 
 def test_processes_make_the_same_grids(street):
     make(street, "one", frames=(18, 22))
-    carlasc.regrid(street, passing.SPEC, name="two", frames=(18, 22), observe=FromScans(), workers=2)
+    carlasc.regrid(street, passing_car.SPEC, name="two", frames=(18, 22), observe=FromScans(), workers=2)
     for frame in range(18, 22):
         assert (grid_of(street, "one", frame).labels == grid_of(street, "two", frame).labels).all()
 
 
 def test_an_executor_that_outlives_a_run_sees_the_files_of_the_next(tmp_path):
-    street = passing.write_sequence(tmp_path)
+    street = passing_car.write_sequence(tmp_path)
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:
         make(street, "before", executor=executor)
         for path in street.rglob(f"velodyne/{FRAME:06d}.bin"):
@@ -145,9 +145,9 @@ def test_an_executor_that_outlives_a_run_sees_the_files_of_the_next(tmp_path):
 
 
 def test_times_that_do_not_rise_are_named(tmp_path):
-    street = passing.write_sequence(tmp_path, ("labels", "instances"))
+    street = passing_car.write_sequence(tmp_path, ("labels", "instances"))
     (path,) = street.rglob(layout.TIMES)
-    times = np.arange(passing.FRAMES) * 0.1
+    times = np.arange(passing_car.FRAMES) * 0.1
     times[22] = times[21]
     path.write_bytes(layout.encode_times(times))
     with pytest.raises(
@@ -261,7 +261,7 @@ def test_rays_through_a_box_are_those_a_plain_look_at_all_rays_finds():
 
 class TestBadInput:
     def test_no_poses_offer_kiss_icp(self, tmp_path):
-        street = passing.write_sequence(tmp_path, frames=3, poses=False)
+        street = passing_car.write_sequence(tmp_path, frames=3, poses=False)
         with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=\"kiss-icp\""):
             make(street, "x", frames=None)
 
@@ -275,13 +275,13 @@ class TestBadInput:
         assert poses[7, 0, 3] == pytest.approx(5.6, abs=0.3)
 
     def test_scans_without_labels_give_geometry_and_say_so(self, tmp_path):
-        street = passing.write_sequence(tmp_path, (), frames=3)
+        street = passing_car.write_sequence(tmp_path, (), frames=3)
         result = make(street, "x", frames=None)
         assert "no labels" in result.notes[0]
         assert set(np.unique(grid_of(street, "x", 1).labels)) == {0, 3}
 
     def test_what_is_found_without_a_field_that_shows_motion_is_said(self, tmp_path):
-        street = passing.write_sequence(tmp_path, ("labels",), frames=20)
+        street = passing_car.write_sequence(tmp_path, ("labels",), frames=20)
         (note,) = make(street, "x", frames=(10, 11)).notes
         assert "cartesian: free space shows 1 actors that move" in note
         assert ", although nothing else says so" in note
@@ -290,11 +290,11 @@ class TestBadInput:
         assert make(street, "z", frames=(10, 11), settings={"dynamic": "tube"}).notes == ()
 
     def test_a_window_larger_than_the_sequence_is_fine(self, tmp_path):
-        street = passing.write_sequence(tmp_path, frames=3)
+        street = passing_car.write_sequence(tmp_path, frames=3)
         assert make(street, "x", frames=None, settings={"window": (-500, 500)}).made == 3
 
     def test_flow_that_is_no_number_counts_as_standing(self, tmp_path):
-        street = passing.write_sequence(tmp_path, frames=3)
+        street = passing_car.write_sequence(tmp_path, frames=3)
         writer = FolderSink(tmp_path).sequence("Val/Street/cartesian")
         flow = next(iter(carlasc.open(street).sequences().values())).read("flow", 1).copy()
         flow[:10] = np.nan
@@ -302,7 +302,7 @@ class TestBadInput:
         assert make(street, "x", frames=None).failures == ()
 
     def test_poses_that_jump_name_the_frame_and_force_goes_on(self, tmp_path):
-        street = passing.write_sequence(tmp_path, frames=6)
+        street = passing_car.write_sequence(tmp_path, frames=6)
         path = street / "cartesian" / "poses.txt"
         poses = layout.decode_poses(path.read_bytes(), "poses.txt")
         poses[4:, 0, 3] += 30
@@ -312,7 +312,7 @@ class TestBadInput:
         assert make(street, "x", frames=None, settings={"force": True}).made == 6
 
     def test_a_scan_cut_short_fails_its_frames_and_the_command_says_which(self, tmp_path):
-        street = passing.write_sequence(tmp_path, frames=30)
+        street = passing_car.write_sequence(tmp_path, frames=30)
         path = street / "cartesian" / "velodyne" / "000002.bin"
         path.write_bytes(path.read_bytes()[:-3])
         arguments = ["regrid", str(street), "--preset", "coarse", "--window=-1:1", "--workers", "1", "--frames", "0:30"]
@@ -323,9 +323,9 @@ class TestBadInput:
 
 class TestFromFinerGrids:
     def test_a_coarser_grid_of_the_finest_there_is(self, street):
-        fine = replace(passing.SPEC, size=(256, 256, 16))
+        fine = replace(passing_car.SPEC, size=(256, 256, 16))
         make(street, "fine", frames=(20, 22), spec=fine)
-        result = carlasc.regrid(street, passing.SPEC, name="coarse", observe=FromGrid("fine"), workers=1)
+        result = carlasc.regrid(street, passing_car.SPEC, name="coarse", observe=FromGrid("fine"), workers=1)
         assert result.made == 2
         coarse, finer = grid_of(street, "coarse", 20), grid_of(street, "fine", 20)
         assert coarse.counts.sum() == finer.counts.sum()
@@ -339,4 +339,4 @@ class TestFromFinerGrids:
 
     def test_a_grid_that_is_not_there_is_named(self, street):
         with pytest.raises(MissingDataError, match="the grid ghost"):
-            carlasc.regrid(street, passing.SPEC, observe=FromGrid("ghost"))
+            carlasc.regrid(street, passing_car.SPEC, observe=FromGrid("ghost"))

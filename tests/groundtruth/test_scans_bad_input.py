@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import passing
+from helpers.scenes import passing_car
 
 import carlasc
 from carlasc import FromScans
@@ -17,7 +17,7 @@ VEHICLE = CARLA.id_of("Vehicle")
 
 
 def make(street, name="x", frames=(FRAME, FRAME + 1), **options):
-    result = carlasc.regrid(street, passing.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=1)
+    result = carlasc.regrid(street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=1)
     assert result.failures == ()
     return result
 
@@ -42,14 +42,14 @@ def road(grid):
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     """Return the grid of scans in which nothing is wrong."""
-    street = passing.write_sequence(tmp_path_factory.mktemp("good"), ("labels", "instances"), FRAMES)
+    street = passing_car.write_sequence(tmp_path_factory.mktemp("good"), ("labels", "instances"), FRAMES)
     make(street)
     return grid_of(street)
 
 
 @pytest.fixture
 def street(tmp_path):
-    return passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+    return passing_car.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
 
 
 def swapped(frame, ids):
@@ -83,13 +83,13 @@ def test_wrong_numbers_of_actors_do_not_swallow_the_road(street, good, wrong, se
 
 
 def test_a_car_that_appears_from_nowhere_is_where_it_is_seen(tmp_path, good):
-    street = passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+    street = passing_car.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
 
     def only_from(frame, labels):
         return labels if frame >= FRAME else np.where(moving(frame), 0, labels).astype(np.uint32)
 
     def moving(frame):
-        return passing.scan(frame, passing.sensor_pose(frame))[2]
+        return passing_car.scan(frame, passing_car.sensor_pose(frame))[2]
 
     change(street, "labels", only_from)
     change(
@@ -105,7 +105,7 @@ def test_a_car_that_appears_from_nowhere_is_where_it_is_seen(tmp_path, good):
 
 @pytest.mark.parametrize("fields", [(), ("labels",), ("labels", "instances"), ("labels", "flow")])
 def test_one_scan_alone_gives_what_it_saw(tmp_path, fields):
-    street = passing.write_sequence(tmp_path, fields, frames=1)
+    street = passing_car.write_sequence(tmp_path, fields, frames=1)
     result = make(street, frames=None)
     assert result.made == 1
     assert any("one scan only" in note for note in result.notes)
@@ -114,7 +114,7 @@ def test_one_scan_alone_gives_what_it_saw(tmp_path, fields):
 
 
 def test_scans_of_two_a_second_are_merged(tmp_path, good):
-    street = passing.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
+    street = passing_car.write_sequence(tmp_path, ("labels", "instances"), FRAMES)
     change_times = street / "cartesian" / layout.TIMES
     poses_file = street / "cartesian" / layout.POSES
     poses = layout.decode_poses(poses_file.read_bytes(), "poses.txt")
@@ -147,7 +147,7 @@ def test_motion_from_a_field_that_is_not_there_is_one_line(street, motion):
 
 
 def test_motion_from_numbers_needs_labels(tmp_path):
-    street = passing.write_sequence(tmp_path, ("instances",), 3)
+    street = passing_car.write_sequence(tmp_path, ("instances",), 3)
     with pytest.raises(MissingDataError, match="expected instances in the sequence, found no field that shows motion"):
         make(street, frames=None, motion="instances")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.plain_voting import plain_grid, plain_votes
+from helpers.references.plain_voting import plain_grid, plain_votes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.plain_voting import plain_grid, plain_votes
+from helpers.references.plain_voting import plain_grid, plain_votes
 
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.voting.ballot import count_votes

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from helpers.lidar_frames import street_frame
-from helpers.plain_voting import plain_votes
+from helpers.references.plain_voting import plain_votes
+from helpers.scenes.lidar_frames import street_frame
 from hypothesis import given
 from hypothesis import strategies as st
 

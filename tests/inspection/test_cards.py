@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sequences import files_of, write_dataset
-from helpers.tiny_kitti import write_tiny_kitti
+from helpers.datasets.sequences import files_of, write_dataset
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from helpers import passing
+from helpers.scenes import passing_car
 
 import carlasc
 from carlasc import Grid, GridSpec
@@ -29,7 +29,7 @@ SMALL = GridSpec("cartesian", (10, 4, 2), (0.0, -2.0, -1.0), (10.0, 2.0, 1.0))
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return passing.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
+    return passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
 
 
 def sequence_of(folder):
@@ -37,7 +37,7 @@ def sequence_of(folder):
 
 
 def plan_of(observe):
-    return Plan(passing.SPEC, "evaluation", observe, Voting(), FrameRange.of(None))
+    return Plan(passing_car.SPEC, "evaluation", observe, Voting(), FrameRange.of(None))
 
 
 def grid_without(folder, frame, observe=OBSERVE):
@@ -70,7 +70,7 @@ def test_hiding_scans_keeps_the_lines_of_poses_that_go_by_the_order_of_the_scans
 
 
 def test_a_left_out_scan_changes_nothing_in_the_grid_at_its_frame(tmp_path):
-    folder = passing.write_sequence(tmp_path, frames=FRAMES)
+    folder = passing_car.write_sequence(tmp_path, frames=FRAMES)
     before = grid_without(folder, 8)
     writer = FolderSink(folder.parent.parent).sequence("Val/Street/cartesian")
     rng = np.random.default_rng(0)
@@ -165,7 +165,7 @@ def test_swept_voxels_are_those_whose_centre_the_vehicle_covers():
 def test_traces_are_told_from_a_clean_grid(street):
     scores = {
         dynamic: holdout(
-            street, passing.SPEC, observe=FromScans(window=(-6, 6), dynamic=dynamic), every=4, workers=1
+            street, passing_car.SPEC, observe=FromScans(window=(-6, 6), dynamic=dynamic), every=4, workers=1
         ).total
         for dynamic in ("tube", "align", "current")
     }
@@ -179,7 +179,7 @@ def test_traces_are_told_from_a_clean_grid(street):
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory):
-    return passing.write_sequence(tmp_path_factory.mktemp("bare"), fields=(), frames=9)
+    return passing_car.write_sequence(tmp_path_factory.mktemp("bare"), fields=(), frames=9)
 
 
 def test_a_drive_without_labels_is_measured(bare):
@@ -206,7 +206,7 @@ def test_executors_give_the_same_scores_and_progress_counts_frames(bare):
 
 
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_are_measured(tmp_path):
-    folder = passing.write_sequence(tmp_path, frames=9)
+    folder = passing_car.write_sequence(tmp_path, frames=9)
     (folder / "cartesian" / "labels" / "000004.label").write_bytes(b"odd")
     result = holdout(folder, observe=FromScans(window=(-1, 1)), every=3, workers=1)
     (failure,) = result.failures

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from helpers import passing
+from helpers.scenes import passing_car
 
 import carlasc
 from carlasc import GridSpec
@@ -27,7 +27,7 @@ NAME = f"cartesian/{GRID}"
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder = passing.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
+    folder = passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
     regrid(folder, SPEC, observe=FromScans(window=(-2, 2)), workers=1)
     return folder
 

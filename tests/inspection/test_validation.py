@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes import MIRROR, camera_poses, drive, write_drive
+from helpers.scenes.box_street import MIRROR, camera_poses, drive, write_drive
 
 import carlasc
 from carlasc.core.geometry import invert

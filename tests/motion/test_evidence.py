@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.moving_scenes import CAR, GROUND, PERSON, WALL, WALLS, car, film, person
+from helpers.scenes.moving_scenes import CAR, GROUND, PERSON, WALL, WALLS, car, film, person
 
 from carlasc.captures.lidar import Lidar
 from carlasc.errors import FormatError

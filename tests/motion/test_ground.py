@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.moving_scenes import GROUND, HEIGHT_M, WALLS, car, cast, person
+from helpers.scenes.moving_scenes import GROUND, HEIGHT_M, WALLS, car, cast, person
 
 from carlasc.core.geometry import Transform, translation
 from carlasc.motion.ground import ground_height, ground_points

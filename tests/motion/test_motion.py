@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.actors import PERIOD_S, MovingBox, scan_of
+from helpers.scenes.box_actors import PERIOD_S, MovingBox, scan_of
 
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.motion import link_segments, segment_by_flow, segment_by_instances, standing_points

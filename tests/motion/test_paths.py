@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.actors import PERIOD_S, MovingBox, box_surface, scan_of
+from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.registration import best_sighting, follow

@@ -7,7 +7,8 @@ import signal
 from pathlib import Path
 
 import pytest
-from helpers import clusters, jobs
+from helpers.processes import jobs
+from helpers.servers import dask_cluster
 
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.running import open_cluster, run_all
@@ -55,12 +56,14 @@ def test_a_cluster_without_workers(tmp_path: Path):
     import dask
 
     with pytest.raises(ArgumentError, match="workers: expected the number of jobs or workers that helpers"):
-        run("helpers.clusters.no_workers")
-    with pytest.raises(CarlascError, match="cluster helpers.clusters.broken: it does not start: no more machines"):
-        run("helpers.clusters.broken")
+        run("helpers.servers.dask_cluster.no_workers")
+    with pytest.raises(
+        CarlascError, match="cluster helpers.servers.dask_cluster.broken: it does not start: no more machines"
+    ):
+        run("helpers.servers.dask_cluster.broken")
     with (
         dask.config.set({"carlasc.workers-timeout": "300ms"}),
-        clusters.scheduler(tmp_path) as (address, _),
+        dask_cluster.scheduler(tmp_path) as (address, _),
         pytest.raises(CarlascError, match="no worker came within 0.3 s: look at its jobs"),
     ):
         run(address)
@@ -72,27 +75,35 @@ def test_workers_with_other_versions_and_workers_without_carlasc(tmp_path: Path)
         "import carlasc; carlasc.__version__ = '0.0.1'": r"carlasc 0\.0\.1",
         "sys.modules['carlasc'] = None": "none",
     }
-    with clusters.scheduler(tmp_path) as (address, _):
+    with dask_cluster.scheduler(tmp_path) as (address, _):
         for before, found in wrong.items():
             message = rf"^worker tcp://\S+: expected carlasc .* found {found}"
-            with clusters.worker(address, before), pytest.raises(CarlascError, match=message):
+            with dask_cluster.worker(address, before), pytest.raises(CarlascError, match=message):
                 run(address)
-        with clusters.worker(address):
+        with dask_cluster.worker(address):
             assert run(address) == [0, 1, 4, 9]
 
 
 @pytest.mark.slow
 def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
     other = "import carlasc; carlasc.__version__ = '0.0.1'"
-    with clusters.scheduler(tmp_path) as (address, _), clusters.worker(address), open_cluster(address) as cluster:
+    with (
+        dask_cluster.scheduler(tmp_path) as (address, _),
+        dask_cluster.worker(address),
+        open_cluster(address) as cluster,
+    ):
         results = run_all(jobs.name_of_process, range(1000), executor=cluster)
         next(results)
-        with clusters.worker(address, other), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
+        with dask_cluster.worker(address, other), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
             list(results)
 
 
 def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
-    with clusters.scheduler(tmp_path) as (address, process), clusters.worker(address), open_cluster(address) as cluster:
+    with (
+        dask_cluster.scheduler(tmp_path) as (address, process),
+        dask_cluster.worker(address),
+        open_cluster(address) as cluster,
+    ):
         results = run_all(jobs.name_of_process, range(1000), executor=cluster)
         next(results)
         process.send_signal(signal.SIGKILL)
@@ -105,4 +116,4 @@ def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_class_that_starts_a_cluster():
-    assert run("helpers.clusters.two_workers") == [0, 1, 4, 9]
+    assert run("helpers.servers.dask_cluster.two_workers") == [0, 1, 4, 9]

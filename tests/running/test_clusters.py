@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from helpers import jobs
+from helpers.processes import jobs
 
 from carlasc.errors import CarlascError
 from carlasc.running import open_cluster, run_all

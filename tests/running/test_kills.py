@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from helpers import jobs
+from helpers.processes import jobs
 
 from carlasc.running import Engine, open_cluster, run_all
 from carlasc.running.pools import LostTaskError

@@ -8,7 +8,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
-from helpers import jobs
+from helpers.processes import jobs
 
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.running.processes import run_all

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers.sequences import write_dataset
+from helpers.datasets.sequences import write_dataset
 
 from carlasc.storage.packing import pack
 

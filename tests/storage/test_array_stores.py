@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import files_of
+from helpers.datasets.sequences import files_of
 
 import carlasc
 from carlasc.errors import FormatError

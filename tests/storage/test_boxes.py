@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import scan
+from helpers.datasets.sequences import scan
 
 import carlasc
 from carlasc.errors import FormatError

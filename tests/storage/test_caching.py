@@ -14,9 +14,9 @@ from pathlib import Path
 import fsspec
 import numpy as np
 import pytest
-from helpers.cache_jobs import PIECE, read_files, tree_at
-from helpers.range_server import Served, serve_folder
-from helpers.sequences import files_of, write_dataset
+from helpers.datasets.sequences import files_of, write_dataset
+from helpers.processes.cache_jobs import PIECE, read_files, tree_at
+from helpers.servers.range_server import Served, serve_folder
 
 import carlasc
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, StorageError

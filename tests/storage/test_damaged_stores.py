@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sequences import files_of, write_dataset
-from helpers.tables import seal_tables
+from helpers.datasets.parquet_tables import seal_tables
+from helpers.datasets.sequences import files_of, write_dataset
 
 import carlasc
 from carlasc.errors import FormatError

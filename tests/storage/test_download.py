@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.http_server import Site, serve
+from helpers.servers.http_server import Site, serve
 
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
 from carlasc.storage.downloads import TransferSettings, archives, download, extraction

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import params, write_dataset
+from helpers.datasets.sequences import params, write_dataset
 
 import carlasc
 from carlasc.errors import FormatError, MissingDataError

@@ -10,8 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from helpers.hub_server import Hub, hub_server
-from helpers.sequences import FRAMES, files_of, write_dataset
+from helpers.datasets.sequences import FRAMES, files_of, write_dataset
+from helpers.servers.hub_server import Hub, hub_server
 from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.object_store import BUCKET, SECRET, FaultyServer, every, faulty_server, options_for, s3_server
-from helpers.sequences import files_of, write_dataset
+from helpers.datasets.sequences import files_of, write_dataset
+from helpers.servers.object_store import BUCKET, SECRET, FaultyServer, every, faulty_server, options_for, s3_server
 
 import carlasc
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, StorageError, without_credentials

@@ -12,8 +12,8 @@ from typing import Any
 import fsspec
 import numpy as np
 import pytest
-from helpers.object_store import faulty_server
-from helpers.sequences import files_of, write_dataset
+from helpers.datasets.sequences import files_of, write_dataset
+from helpers.servers.object_store import faulty_server
 from storage.test_zipped import write_zip
 
 import carlasc

@@ -8,8 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.object_store import BUCKET, FaultyServer, environment_for, every, faulty_server, options_for, s3_server
-from helpers.sequences import files_of
+from helpers.datasets.sequences import files_of
+from helpers.servers.object_store import (
+    BUCKET,
+    FaultyServer,
+    environment_for,
+    every,
+    faulty_server,
+    options_for,
+    s3_server,
+)
 from storage.test_shared_writing import FRAMES, PATH, arrays_of, start_sink, write_block
 
 import carlasc

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sequences import files_of, lines, params, scan
+from helpers.datasets.sequences import files_of, lines, params, scan
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

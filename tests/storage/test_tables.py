@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import FRAMES
-from helpers.tables import seal_tables
+from helpers.datasets.parquet_tables import seal_tables
+from helpers.datasets.sequences import FRAMES
 
 import carlasc
 from carlasc.errors import ArgumentError, FormatError

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.sequences import files_of, scan
+from helpers.datasets.sequences import files_of, scan
 
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError

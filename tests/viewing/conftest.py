@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import pytest
-from helpers.blocks import write_blocks
-from helpers.browser import start_chromium
+from helpers.displays.browser import start_chromium
+from helpers.scenes.road_blocks import write_blocks
 
 
 @pytest.fixture(scope="session")

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers.blocks import write_blocks
-from helpers.browser import Page
-from helpers.pixels import blue_pixels, middle_of, red_pixels
+from helpers.displays.browser import Page
+from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
+from helpers.scenes.road_blocks import write_blocks
 from helpers.viewing import write_page
 
 from carlasc.core.grids import GridSpec

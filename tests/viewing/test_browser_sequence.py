@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from helpers.blocks import add_evidence, add_poses, write_blocks
-from helpers.browser import Page, serve_folder
-from helpers.pixels import middle_of, red_pixels
+from helpers.displays.browser import Page, serve_folder
+from helpers.readers.pixels import middle_of, red_pixels
+from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
 from helpers.viewing import write_page
 
 pytestmark = pytest.mark.slow

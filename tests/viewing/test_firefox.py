@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.blocks import add_evidence, add_poses, write_blocks
-from helpers.browser import serve_folder
-from helpers.firefox import start_firefox
-from helpers.pixels import blue_pixels, middle_of, red_pixels
-from helpers.screens import virtual_screen
+from helpers.displays.browser import serve_folder
+from helpers.displays.firefox import start_firefox
+from helpers.displays.virtual_screen import virtual_screen
+from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
+from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
 from helpers.viewing import write_page
 
 pytestmark = pytest.mark.slow

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from helpers.blocks import write_blocks
+from helpers.scenes.road_blocks import write_blocks
 from helpers.viewing import write_page
 
 from carlasc.core.grids import GridSpec
@@ -108,7 +108,7 @@ def test_what_cannot_be_written_is_refused(blocks, tmp_path):
 
 def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     """A frame as full as a real one: 130,000 points, a coarse grid of 20,000 voxels; its bytes times 60."""
-    from helpers.scenes import Street
+    from helpers.scenes.box_street import Street
 
     from carlasc.core.geometry import translation
     from carlasc.storage.folders.folder import FolderSink

@@ -6,8 +6,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers.blocks import add_evidence, add_poses, write_blocks
-from helpers.pixels import BLUE, RED
+from helpers.readers.pixels import BLUE, RED
+from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
 from helpers.viewing import write_page
 
 from carlasc.core.evidence import VoxelFlag

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.blocks import ROAD, write_blocks
-from helpers.pixels import BLUE, RED
-from helpers.recorded import POINT, read_mcap, read_metadata, read_rrd, verify_rrd, voxels_of
+from helpers.readers.pixels import BLUE, RED
+from helpers.readers.recorded import POINT, read_mcap, read_metadata, read_rrd, verify_rrd, voxels_of
+from helpers.scenes.road_blocks import ROAD, write_blocks
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, rotations_of, translation

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.blocks import write_blocks
+from helpers.scenes.road_blocks import write_blocks
 
 import carlasc
 from carlasc.core.frames import FrameRange

@@ -5,9 +5,9 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.browser import OUTPUT, Page
-from helpers.pixels import has_color
-from helpers.screens import virtual_screen
+from helpers.displays.browser import OUTPUT, Page
+from helpers.displays.virtual_screen import virtual_screen
+from helpers.readers.pixels import has_color
 from helpers.viewing import write_page
 
 from carlasc import regrid, simulate

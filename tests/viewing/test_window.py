@@ -7,10 +7,10 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from helpers.blocks import write_blocks
-from helpers.browser import OUTPUT
-from helpers.pixels import blue_pixels, middle_of, red_pixels
-from helpers.screens import virtual_screen
+from helpers.displays.browser import OUTPUT
+from helpers.displays.virtual_screen import virtual_screen
+from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
+from helpers.scenes.road_blocks import write_blocks
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, translation

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 pytest.importorskip("carla", reason="the carla package is not installed: pip install 'carlasc[carla]'")
 
 import carla
-from helpers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
+from helpers.servers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 
 from carlasc.captures import Capture, Lidar, ServerError, record
 from carlasc.captures.carla.sensors import ActorNumbers

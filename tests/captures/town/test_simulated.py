@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers.captures import read_tree
+from helpers.datasets.captures import read_tree
 from typer.testing import CliRunner
 
 import carlasc

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from converters.formats.kitti_drive import KittiDrive, write_scan
-from helpers.kitti import write_calibration, write_poses
+from helpers.datasets.kitti import write_calibration, write_poses
 
 from carlasc.testing.drives import KINDS
 

@@ -2,8 +2,8 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.films import Image
-from helpers.pixels import RED
+from helpers.readers.pictures import Image
+from helpers.readers.pixels import RED
 from helpers.viewing import draw
 from hypothesis import given, settings
 from hypothesis import strategies as st

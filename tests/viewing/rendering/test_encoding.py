@@ -2,7 +2,7 @@ import os
 
 import numpy as np
 import pytest
-from helpers.films import Image, count_gif, read_mp4
+from helpers.readers.pictures import Image, count_gif, read_mp4
 
 from carlasc.errors import ArgumentError, CarlascError, StorageError
 from carlasc.viewing.rendering.encoding import encodable_size, is_film, write_pictures

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from helpers.films import Image
-from helpers.pixels import grid_with, has_color, middle_of
+from helpers.readers.pictures import Image
+from helpers.readers.pixels import grid_with, has_color, middle_of
 from helpers.viewing import draw
 
 from carlasc.core.evidence import VoxelFlag
@@ -93,7 +93,7 @@ def test_colours_of_evidence_need_a_grid_and_a_known_name(certain, tmp_path, blo
 
 
 def test_a_scan_beside_the_grid_keeps_the_colours_of_its_classes(blocks, tmp_path):
-    from helpers.pixels import red_pixels
+    from helpers.readers.pixels import red_pixels
 
     path = draw(
         blocks,

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from helpers.blocks import write_blocks
-from helpers.films import Image, read_mp4
-from helpers.pixels import blue_pixels, middle_of, red_pixels
+from helpers.readers.pictures import Image, read_mp4
+from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
+from helpers.scenes.road_blocks import write_blocks
 
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, MissingDataError

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.pixels import BLUE, RED, blue_pixels, grid_with, has_color, middle_of, red_pixels
+from helpers.readers.pixels import BLUE, RED, blue_pixels, grid_with, has_color, middle_of, red_pixels
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan

@@ -2,8 +2,8 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.films import Image, count_gif, read_mp4
-from helpers.pixels import BLUE, RED, blue_pixels, grid_with, middle_of, red_pixels
+from helpers.readers.pictures import Image, count_gif, read_mp4
+from helpers.readers.pixels import BLUE, RED, blue_pixels, grid_with, middle_of, red_pixels
 from helpers.viewing import draw
 
 from carlasc.core.geometry import translation

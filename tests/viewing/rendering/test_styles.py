@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.films import Image
+from helpers.readers.pictures import Image
 from helpers.viewing import draw
 
 from carlasc.errors import ArgumentError, ConflictError

@@ -1,0 +1,119 @@
+"""The kinds of faults, and what was found, as the documentation shows it: `measuring` puts it into the pages."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from faults.outcome import Outcome
+
+ROOT = Path(__file__).parents[3]
+FIGURES = ROOT / "docs" / "studies" / "faults.json"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    Attributes:
+        module: where its function `run(count, seed, folder)` is.
+        cases: what its cases are called.
+        what: what is done and checked, for the table.
+        quick: number of cases that take minutes.
+        long: number of cases that take hours.
+    """
+
+    module: str
+    cases: str
+    what: str
+    quick: int
+    long: int
+
+
+KINDS = {
+    "kills": Kind(
+        "faults.kills",
+        "kills",
+        "A command is ended by a signal (SIGKILL, SIGTERM, SIGINT) at a random moment and run again, up to three times: "
+        "the bytes are those of an undisturbed run, and nothing is left over",
+        100,
+        1000,
+    ),
+    "calls": Kind(
+        "faults.calls",
+        "failed system calls",
+        "The k-th open, write, rename, sync or read of a command fails (EIO, ENOSPC, EDQUOT), or the process ends there: "
+        "one line, and the next run completes",
+        500,
+        100_000,
+    ),
+    "crashes": Kind(
+        "faults.crashes",
+        "power losses",
+        "The writes of a command are replayed up to a random point, and what was not synced is dropped, reordered or zeroed: "
+        "every reader finds a file whole or not at all",
+        500,
+        100_000,
+    ),
+    "mutations": Kind(
+        "faults.mutations",
+        "damaged files",
+        "A file of any format is damaged: it is refused in one line, within bounded memory and time",
+        20_000,
+        1_000_000,
+    ),
+    "coverage": Kind(
+        "faults.coverage",
+        "inputs of libFuzzer",
+        "The same, guided by the lines of carlasc that an input reaches (atheris, where it is installed)",
+        5_000,
+        500_000,
+    ),
+    "hostile": Kind(
+        "faults.hostile",
+        "hostile files",
+        "Files and servers that were made to do harm: each is refused in one line that names it, and nothing outside the output is created",
+        1_000,
+        1_000,
+    ),
+}
+"""Every kind, in the order of the table. A kind that has no module yet is left out of a run."""
+
+
+def keep(outcome: Outcome, date: datetime.date) -> None:
+    """Write an outcome into the figures, in place of the one of its kind."""
+    rows = read()
+    rows[outcome.kind] = {"date": date.isoformat(), **dataclasses.asdict(outcome), "seconds": round(outcome.seconds)}
+    FIGURES.write_text(json.dumps({kind: rows[kind] for kind in KINDS if kind in rows}, indent=2) + "\n")
+
+
+def read() -> dict[str, dict[str, Any]]:
+    """Return the figures of each kind that was run."""
+    return json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the table of the documentation."""
+    lines = [
+        "| kind | what is done, and what must hold | cases | faults found | minutes | date |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, row in rows.items():
+        minutes = max(1, round(row["seconds"] / 60))
+        lines.append(
+            f"| {name} | {KINDS[name].what} | {row['tried']:,} | {len(row['found'])} | {minutes} | {row['date']} |"
+        )
+    return "\n".join(lines)
+
+
+def line(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the line of the README."""
+    tried = [f"{row['tried']:,} {KINDS[name].cases}" for name, row in rows.items()]
+    listed = " and ".join(filter(None, (", ".join(tried[:-1]), tried[-1])))
+    found = sum(len(row["found"]) for row in rows.values())
+    result = f"{found} faults found" if found else "no torn file, no lost frame"
+    return f"**Reliability:** {listed}, {result} ([figures and promises](docs/reliability.md))."
