@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 
@@ -139,3 +140,21 @@ class Voting:
             raise ArgumentError(
                 "min_confidence", expected="a probability from 0 to below 1", found=str(self.min_confidence)
             )
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """What grids are made, and from what: what `regrid` and `convert` share.
+
+    Attributes:
+        spec: geometry of the grids; None takes the published coarse one.
+        observe: what observes the scene; None takes a capture if there is one, otherwise scans.
+        voting: how votes are counted; None takes the default of what observes the scene.
+        follow_ground: in a conversion, move the grid up or down by whole voxels where the ground is below it, or far above its lower
+            bound; False keeps the bounds of `spec`.
+    """
+
+    spec: GridSpec | None = None
+    observe: Observe | None = None
+    voting: Voting | None = None
+    follow_ground: bool = True

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from carlasc.motion.ground import ground_height, ground_points
     from carlasc.motion.linking import Chain, Linker
     from carlasc.motion.movers import Movers, find_movers, follow_movers
+    from carlasc.motion.options import MotionOptions, MotionSource, PoseOptions, PoseSource
     from carlasc.motion.segments import (
         Segment,
         Standing,
@@ -35,6 +36,7 @@ else:
             "ground": ("ground_height", "ground_points"),
             "linking": ("Chain", "Linker"),
             "movers": ("Movers", "find_movers", "follow_movers"),
+            "options": ("MotionOptions", "MotionSource", "PoseOptions", "PoseSource"),
             "segments": (
                 "Segment",
                 "Standing",
@@ -55,7 +57,11 @@ __all__ = [
     "Evidence",
     "Extent",
     "Linker",
+    "MotionOptions",
+    "MotionSource",
     "Movers",
+    "PoseOptions",
+    "PoseSource",
     "Segment",
     "Sighting",
     "Standing",

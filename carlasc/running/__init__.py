@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.parts import Part
 from carlasc.running.processes import count_workers, run_all
 
@@ -20,4 +21,4 @@ else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-__all__ = ["Engine", "Part", "count_workers", "open_cluster", "run_all"]
+__all__ = ["Engine", "Part", "Run", "count_workers", "open_cluster", "run_all"]

@@ -1,0 +1,58 @@
+"""Where poses come from, and what tells which points move: the options that grids and conversions share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from carlasc.errors import ArgumentError
+
+PoseSource = Literal["auto", "file", "kiss-icp"]
+MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Where the poses of scans come from.
+
+    Attributes:
+        source: "file": those of the data; "kiss-icp": estimated from the scans (needs the extra `kitti`); "auto": those of the data
+            where they exist, otherwise estimated. Estimated poses are written only where the sequence has none.
+        force: accept poses that are farther apart than a vehicle can move or turn, or under which scans do not overlap.
+
+    Raises:
+        ArgumentError: an unknown source.
+    """
+
+    source: PoseSource = "auto"
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        if self.source not in get_args(PoseSource):
+            raise ArgumentError("poses", expected=f"one of {', '.join(get_args(PoseSource))}", found=repr(self.source))
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """What tells which points move, and how.
+
+    Attributes:
+        source: "boxes", "instances", "flow": the field of the sequence; "evidence": free space: a point moves if rays of other scans
+            passed through its place; "none": nothing is known to move, unless its class says so; "auto": the best of these fields that
+            exists, and "evidence" for what it misses, unless every point has flow.
+        min_speed_m_s: slower actors count as static, in metres per second.
+
+    Raises:
+        ArgumentError: an unknown source, or a speed that is not positive.
+    """
+
+    source: MotionSource = "auto"
+    min_speed_m_s: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.source not in get_args(MotionSource):
+            raise ArgumentError(
+                "motion", expected=f"one of {', '.join(get_args(MotionSource))}", found=repr(self.source)
+            )
+        if not self.min_speed_m_s > 0:
+            raise ArgumentError("min_speed_m_s", expected="a positive number", found=str(self.min_speed_m_s))
