@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import ArgumentError, import_extra
+from carlasc.errors import import_extra
 from carlasc.viewing.colors import Entry
 from carlasc.viewing.rendering.styles import check_size
-
 
 INK, FAINT = (40, 42, 48), (110, 114, 122)
 NO_SWATCH = (-1, -1, -1)
