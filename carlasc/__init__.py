@@ -52,6 +52,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; the table below says th
     from carlasc.inspection import validate as validate
     from carlasc.metrics import evaluate as evaluate
     from carlasc.metrics import scores as scores
+    from carlasc.running import Run as Run
     from carlasc.storage import Cache as Cache
     from carlasc.storage import Sink as Sink
     from carlasc.storage import Source as Source
@@ -99,6 +100,7 @@ _HOMES = {  # room -> its names that are also names of `carlasc`
         "Scan",
         "VoxelFlag",
     ),
+    "running": ("Run",),
     "storage": (
         "Cache",
         "Sink",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from carlasc.running.engines import Engine
-from carlasc.running.options import Run
+from carlasc.running.options import Run, count_cores
 from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.processes import run_all
 
 if TYPE_CHECKING:
     from carlasc.running.clusters import open_cluster as open_cluster
@@ -21,4 +21,4 @@ else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-__all__ = ["Engine", "Part", "Run", "count_workers", "open_cluster", "run_all"]
+__all__ = ["Engine", "Part", "Run", "count_cores", "open_cluster", "run_all"]
