@@ -24,6 +24,7 @@ from carlasc.cli.common import (
     progress_bar,
     report_failures,
 )
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
@@ -146,25 +147,29 @@ def evaluate(
         check_plot(plot)  # before anything is counted
     common: dict[str, Any] = {
         "grid": grid, "truth_grid": truth_grid, "source_classes": source_classes, "frames": frames,
-        "workers": workers or 1,
     }  # fmt: skip
     name = name or Path(source).name
     if all_conventions:
-        with progress_bar("Scoring") as progress, engine(cluster, workers) as common["executor"]:
-            found = evaluate_by_all_conventions(source, truth, name=name, progress=progress, **common)
+        with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
+            found = evaluate_by_all_conventions(
+                source, truth, name=name, run=Run(workers or 1, executor, progress=progress), **common
+            )
         _print_conventions(found, as_json)
         return
 
     region = None if (near_m, far_m, fov) == (0.0, None, 360.0) else _Region(near_m, far_m, fov)
     common["convention"] = convention
-    with progress_bar("Scoring") as progress, engine(cluster, workers) as common["executor"]:
-        scoring = Scoring(voxels, region, [part.value for part in by or ()], rays)
-        result = score(source, truth, scoring=scoring, name=name, progress=progress, **common)
+    with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
+        scoring, run = (
+            Scoring(voxels, region, [part.value for part in by or ()], rays),
+            Run(workers or 1, executor, progress=progress),
+        )
+        result = score(source, truth, scoring=scoring, name=name, run=run, **common)
     other = None
     if compare is not None:
-        with progress_bar("Scoring the other") as progress, engine(cluster, workers) as common["executor"]:
-            scoring = Scoring(voxels, region)
-            other = score(compare, truth, scoring=scoring, name=Path(compare).name, progress=progress, **common)
+        with progress_bar("Scoring the other") as progress, engine(cluster, workers) as executor:
+            scoring, run = Scoring(voxels, region), Run(workers or 1, executor, progress=progress)
+            other = score(compare, truth, scoring=scoring, name=Path(compare).name, run=run, **common)
     if per_frame is not None:
         from carlasc.storage.files import write_output
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +13,7 @@ from carlasc.metrics.conventions import CONVENTIONS, Convention
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
 from carlasc.metrics.scorer import LabelPair, Scorer, Scoring
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 
 _TOGETHER = 8  # frames that a worker scores in one task
@@ -27,12 +27,10 @@ def evaluate(
     grid: str | None = None,
     truth_grid: str | None = None,
     source_classes: str | None = None,
-    scoring: Scoring = Scoring(),
+    scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
     frames: Frames = None,
     name: str | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Evaluation:
     """Score predicted grids against the ground truth, one frame in memory at a time.
 
@@ -50,9 +48,7 @@ def evaluate(
         scoring: which voxels count, and what is scored beside the classes.
         frames: the frames that are scored; None scores all frames of the ground truth.
         name: name of the predictions in tables.
-        workers: number of processes that score; None for one per core.
-        executor: scores instead of processes of our own; it is not shut down.
-        progress: called with (frames done, frames in total).
+        run: how the work is spread, and who is told of its progress.
 
     Returns:
         The scores. Frames that could not be scored are listed in `failures`.
@@ -65,7 +61,7 @@ def evaluate(
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
     frames_of = _choose_frames(pairs, frames)
     scorer = Scorer(convention, pairs, source_classes, scoring)
-    _score_frames([scorer], frames_of, workers, executor, progress)
+    _score_frames([scorer], frames_of, run)
     result = scorer.result(name or _name_of(source), notes)
     if isinstance(result, CarlascError):
         raise result
@@ -81,9 +77,7 @@ def evaluate_by_all_conventions(
     source_classes: str | None = None,
     frames: Frames = None,
     name: str | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Mapping[str, Evaluation | CarlascError]:
     """Score predictions by every convention. Each frame is read once. The arguments have the meaning that they have in `evaluate`.
 
@@ -95,9 +89,7 @@ def evaluate_by_all_conventions(
         source_classes: name of the class table of the predictions.
         frames: the frames that are scored.
         name: name of the predictions in tables.
-        workers: number of processes that score; None for one per core.
-        executor: scores instead of processes of our own; it is not shut down.
-        progress: called with (frames done, frames in total).
+        run: how the work is spread, and who is told of its progress.
 
     Returns:
         For the name of each convention: the scores, or the error that says why the data cannot be scored by it.
@@ -105,7 +97,7 @@ def evaluate_by_all_conventions(
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
     frames_of = _choose_frames(pairs, frames)
     scorers = {convention: Scorer(convention, pairs, source_classes, Scoring()) for convention in CONVENTIONS}
-    _score_frames(list(scorers.values()), frames_of, workers, executor, progress)
+    _score_frames(list(scorers.values()), frames_of, run)
     return {convention: scorer.result(name or _name_of(source), notes) for convention, scorer in scorers.items()}
 
 
@@ -136,15 +128,9 @@ class _FrameBatch:
     frames: tuple[int, ...]
 
 
-def _score_frames(
-    scorers: Sequence[Scorer],
-    frames_of: list[tuple[Pair, list[int]]],
-    workers: int | None,
-    executor: Engine | None,
-    progress: Callable[[int, int], None] | None,
-) -> None:
+def _score_frames(scorers: Sequence[Scorer], frames_of: list[tuple[Pair, list[int]]], run: Run) -> None:
     """Read each frame once, and add its scores to each scorer."""
-    size = 1 if executor is None and workers == 1 else _TOGETHER
+    size = 1 if run.is_alone else _TOGETHER
     batches = [
         _FrameBatch(pair, tuple(numbers[first : first + size]))
         for pair, numbers in frames_of
@@ -152,13 +138,13 @@ def _score_frames(
     ]
     total, done = sum(len(numbers) for _, numbers in frames_of), 0
     score, fail = partial(_score_batch, scorers=scorers), partial(_fail_batch, scorers=scorers)
-    with closing(run_all(score, batches, workers=workers, executor=executor, lost=fail)) as results:
+    with closing(run_all(score, batches, run, lost=fail)) as results:
         for batch, parts in zip(batches, results, strict=True):
             for scorer, part in zip(scorers, parts, strict=True):
                 scorer.merge(part)
             done += len(batch.frames)
-            if progress is not None:
-                progress(done, total)
+            if run.progress is not None:
+                run.progress(done, total)
 
 
 def _score_batch(batch: _FrameBatch, scorers: Sequence[Scorer]) -> list[Scorer]:

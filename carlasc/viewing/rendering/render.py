@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
@@ -78,13 +78,11 @@ def render(
     what: str | None = None,
     color: GridColor = "class",
     boxes: bool = False,
-    camera: CameraOptions = CameraOptions(),
-    style: StyleOptions = StyleOptions(),
+    camera: CameraOptions = CameraOptions(),  # noqa: B008 (frozen)
+    style: StyleOptions = StyleOptions(),  # noqa: B008 (frozen)
     fps: float | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> RenderResult:
     """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). No screen and no GPU are needed.
 
@@ -105,10 +103,8 @@ def render(
             scans are in the frame of its sensor.
         style: size, legend, captions and type; for a screen or for a paper.
         fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
-        workers: number of processes; None takes all cores. With an executor: the number of its workers.
-        executor: draws instead of processes of our own; it is not shut down.
         overwrite: whether an existing file is replaced.
-        progress: called with (pictures done, pictures in all).
+        run: how the pictures are spread over processes, and who is told of the progress.
 
     Returns:
         What was drawn, and the file that it is in.
@@ -151,8 +147,8 @@ def render(
     shots = _plan_shots(drawer, pictures, camera)
     if fps is None:
         fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(_take, shots, workers=workers, executor=executor)) as drawn:
-        write_pictures(target, _reported(drawn, len(shots), progress), fps, sheet.dpi)
+    with closing(run_all(_take, shots, run)) as drawn:
+        write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
     if legend_file is not None and entries and sheet.font_size is not None:
         write_pictures(legend_file, [draw_legend(entries, sheet.font_size, sheet.size[0])], fps, sheet.dpi)
     return RenderResult(

@@ -6,6 +6,7 @@ import pytest
 from helpers.readers.pictures import Image, count_gif, read_mp4
 from helpers.readers.pixels import BLUE, RED, blue_pixels, grid_with, middle_of, red_pixels
 
+from carlasc import Run
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLASC11
@@ -60,7 +61,13 @@ def test_a_frame_becomes_a_png(drive, tmp_path):
 
 def test_a_range_of_frames_becomes_a_film_that_follows_the_vehicle(drive, tmp_path):
     done = []
-    result = render(Scene(drive, frames=(1, 4)), tmp_path / "a.mp4", camera=CameraOptions(view="bev"), style=StyleOptions(size=SIZE, ego=False, legend=False), progress=lambda *step: done.append(step))  # fmt: skip
+    result = render(
+        Scene(drive, frames=(1, 4)),
+        tmp_path / "a.mp4",
+        camera=CameraOptions(view="bev"),
+        style=StyleOptions(size=SIZE, ego=False, legend=False),
+        run=Run(1, progress=lambda *step: done.append(step)),
+    )
     meta, frames = read_mp4(result.out)
     assert (result.frames, len(frames), meta["fps"]) == ((1, 2, 3), 3, 10.0)
     assert done == [(1, 3), (2, 3), (3, 3)]
@@ -91,7 +98,9 @@ def test_with_a_still_camera_a_static_block_stays_in_place(drive, tmp_path, view
 
 
 def test_two_processes_draw_what_one_draws(drive, tmp_path):
-    one, two = (render(drive, tmp_path / f"{n}.gif", style=StyleOptions(size=(160, 90)), workers=n).out for n in (1, 2))
+    one, two = (
+        render(drive, tmp_path / f"{n}.gif", style=StyleOptions(size=(160, 90)), run=Run(n)).out for n in (1, 2)
+    )
     assert one.read_bytes() == two.read_bytes()
 
 
@@ -385,7 +394,7 @@ def test_ctrl_c_leaves_no_file(drive, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        render(drive, tmp_path / "a.mp4", style=StyleOptions(size=SIZE), progress=stop)
+        render(drive, tmp_path / "a.mp4", style=StyleOptions(size=SIZE), run=Run(1, progress=stop))
     assert list(tmp_path.iterdir()) == []
 
 
