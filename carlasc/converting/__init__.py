@@ -10,8 +10,8 @@ from carlasc.storage.metadata import Axes
 
 if TYPE_CHECKING:
     from carlasc.converting.exporter import Exported, Exporter, Files, FrameExporter, SequenceExporter, SequenceFile
-    from carlasc.converting.exporting import ExportResult, export
-    from carlasc.converting.options import option_names
+    from carlasc.converting.exporting import export
+    from carlasc.converting.layout_options import FlowSource, LayoutOptions
     from carlasc.converting.protocol import (
         Cloud,
         Converter,
@@ -23,23 +23,26 @@ if TYPE_CHECKING:
         VoxelContent,
     )
     from carlasc.converting.registry import (
+        OptionDeclaration,
         converter_names,
         exporter_names,
         load_converter,
         load_exporter,
+        option_declarations,
+        read_options,
         remaps_to_carla,
     )
     from carlasc.converting.resampling import TargetFrame, is_same, resample_to, resampling_notes
-    from carlasc.converting.results import ConvertResult, Failure
+    from carlasc.converting.results import ConvertResult, ExportResult, Failure
     from carlasc.converting.run import convert
-    from carlasc.converting.scans import VOXEL_FILES
+    from carlasc.converting.scan_stage import VOXEL_FILES
 else:
     __getattr__, __dir__ = late_names(
         __name__,
         {
             "exporter": ("Exported", "Exporter", "Files", "FrameExporter", "SequenceExporter", "SequenceFile"),
-            "exporting": ("ExportResult", "export"),
-            "options": ("option_names",),
+            "exporting": ("export",),
+            "layout_options": ("FlowSource", "LayoutOptions"),
             "protocol": (
                 "Cloud",
                 "Converter",
@@ -50,11 +53,20 @@ else:
                 "Trajectory",
                 "VoxelContent",
             ),
-            "registry": ("converter_names", "exporter_names", "load_converter", "load_exporter", "remaps_to_carla"),
+            "registry": (
+                "OptionDeclaration",
+                "converter_names",
+                "exporter_names",
+                "load_converter",
+                "load_exporter",
+                "option_declarations",
+                "read_options",
+                "remaps_to_carla",
+            ),
             "resampling": ("TargetFrame", "is_same", "resample_to", "resampling_notes"),
-            "results": ("ConvertResult", "Failure"),
+            "results": ("ConvertResult", "ExportResult", "Failure"),
             "run": ("convert",),
-            "scans": ("VOXEL_FILES",),
+            "scan_stage": ("VOXEL_FILES",),
         },
     )
 
@@ -69,8 +81,11 @@ __all__ = [
     "Exporter",
     "Failure",
     "Files",
+    "FlowSource",
     "FrameExporter",
     "FrameHandle",
+    "LayoutOptions",
+    "OptionDeclaration",
     "Recording",
     "Sensor",
     "SequenceExporter",
@@ -91,7 +106,8 @@ __all__ = [
     "mirror_points",
     "mirror_poses",
     "mirror_spec",
-    "option_names",
+    "option_declarations",
+    "read_options",
     "remaps_to_carla",
     "resample_to",
     "resampling_notes",

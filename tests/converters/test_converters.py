@@ -11,12 +11,14 @@ import pytest
 from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 
 import carlasc
-from carlasc.converting import convert, converter_names, load_converter
+from carlasc.converting import LayoutOptions, convert, converter_names, load_converter
 from carlasc.errors import ArgumentError, DependencyError, MissingDataError
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 from carlasc.storage import Sink
 from carlasc.storage.sinks import SequenceWriter
 
-PLAIN = {"grids": "none", "flow": "none", "workers": 1}
+PLAIN = {"grids": None, "layout": LayoutOptions(flow="none"), "run": Run(workers=1)}
 
 THIRD_PARTY = """
 import numpy as np
@@ -65,7 +67,7 @@ def test_kitti_and_poss_are_there():
 
 def test_a_third_partys_converter_is_found_and_used(installed, tmp_path):
     assert "lab" in converter_names()
-    result = convert("lab", installed, tmp_path / "out", force=True, **PLAIN)
+    result = convert("lab", installed, tmp_path / "out", poses=PoseOptions(force=True), **PLAIN)
     assert (result.made, result.failures) == (2, ())
     sequence = carlasc.open(tmp_path / "out").sequences()["Test/LAB_a/cartesian"]
     assert sequence.read("points", 1)[0].tolist() == [2, -2, 2, 2]
@@ -82,7 +84,7 @@ def test_a_converter_that_does_not_load_is_named(installed):
 
 def test_what_a_converter_lacks_is_an_argument_error(installed, tmp_path):
     with pytest.raises(MissingDataError, match="lab: expected voxel grids, found none"):
-        convert("lab", installed, tmp_path / "out", grids="voxels", force=True)
+        convert("lab", installed, tmp_path / "out", poses=PoseOptions(force=True), grids="voxels")
     with pytest.raises(ArgumentError, match="option: expected no options for this data set, found color"):
         convert("lab", installed, tmp_path / "out", options={"color": "red"})
 
@@ -119,7 +121,7 @@ def test_actors_of_semanticposs_that_go_nowhere_have_no_flow(tmp_path):
         write_labels(folder, frame, np.repeat([7 | 1 << 16, 7 | 2 << 16], 200))
     np.savetxt(folder / "poses.txt", np.tile(np.eye(4)[:3].ravel(), (20, 1)))
     (folder / "calib.txt").unlink()
-    convert("poss", tmp_path / "in", tmp_path / "out", grids="none", force=True, workers=1)
+    convert("poss", tmp_path / "in", tmp_path / "out", poses=PoseOptions(force=True), grids=None, run=Run(workers=1))
     flow = carlasc.open(tmp_path / "out").sequences()["Train/POSS_00/cartesian"].read("flow", 10)
     assert np.abs(flow[:200] - [8, 0, 0]).max() < 0.3
     assert not flow[200:].any()
@@ -159,14 +161,14 @@ class Memory(Sink):
 def test_any_sink_will_do(tmp_path):
     write_tiny_kitti(tmp_path / "in")
     sink = Memory()
-    convert("kitti", tmp_path / "in", sink, grids="none", workers=2)
+    convert("kitti", tmp_path / "in", sink, grids=None, run=Run(workers=2))
     kept = sink.writers["Train/KITTI_00/cartesian"]
     assert {(name, frame) for name, frame in kept.fields} == {
         (name, frame) for name in ("points", "labels", "flow", "instances") for frame in range(3)
     }
     assert {"poses.txt", "times.txt", "carlasc.json"} == set(kept.texts)
     with pytest.raises(ArgumentError, match="convert to a folder or a .zarr store"):
-        convert("kitti", tmp_path / "in", sink, grids="scans")
+        convert("kitti", tmp_path / "in", sink)
 
 
 def files_of(root):
@@ -176,7 +178,7 @@ def files_of(root):
 @pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
 def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path, name):
     write_tiny_kitti(tmp_path / "in", frames=60)
-    convert("kitti", tmp_path / "in", tmp_path / "whole", grids="none", workers=1)
+    convert("kitti", tmp_path / "in", tmp_path / "whole", grids=None, run=Run(workers=1))
     arguments = ["kitti", str(tmp_path / "in"), str(tmp_path / "out"), "--grids", "none", "--workers", "1"]
     helper = Path(__file__).parents[1] / "helpers" / "processes" / "interrupted.py"
     done = subprocess.run(
@@ -192,6 +194,6 @@ def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path
     expected = files_of(tmp_path / "whole")
     assert 0 < len(there) < len(expected)
     assert all(expected[path] == data for path, data in there.items() if path.suffix != ".part")
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", workers=1)
+    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids=None, run=Run(workers=1))
     assert result.skipped > 0
     assert files_of(tmp_path / "out") == expected
