@@ -161,7 +161,7 @@ def _make_grids(
     converted = _ConvertedScans(sink, conversions)
     if not converted.sequences():
         return None  # every frame failed, and is reported
-    spec, notes = grids.spec or GridSpec.published(), []
+    spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
         spec, notes = _fit(spec, [one.ground for one in conversions if one.ground is not None], sink.location)
     observe = replace(grids.observe if isinstance(grids.observe, FromScans) else FromScans(), force=poses.force)
