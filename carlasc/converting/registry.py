@@ -11,8 +11,8 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter
@@ -149,7 +149,7 @@ def read_options(kind: type[Converter] | type[Exporter], options: Mapping[str, A
     """
     options, known = options or {}, {declared.name: declared for declared in option_declarations(kind)}
     if unknown := sorted(set(options) - set(known)):
-        expected = f"one of {', '.join(known)}" if known else f"no options for {kind.title}"
+        expected = f"one of {', '.join(known)}" if known else "no options for this data set"
         raise ArgumentError("options", expected=expected, found=", ".join(unknown))
     return {name: known[name].read(value) for name, value in options.items()}
 
@@ -160,10 +160,11 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
     if get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
         text = next((extra for extra in extras if isinstance(extra, str)), "")
-    types = [part for part in (get_args(hint) or (hint,)) if part is not NoneType]
-    literal = next((part for part in (hint, *types) if get_origin(part) is Literal), None)
-    choices = () if literal is None else tuple(choice for choice in get_args(literal) if choice is not None)
-    found = str if literal is not None else types[0] if len(types) == 1 else None
+    types = [
+        part for part in (get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)) if part is not NoneType
+    ]
+    choices = get_args(types[0]) if get_origin(types[0]) is Literal else ()
+    found = None if len(types) > 1 else str if choices else types[0]
     if found not in (str, int, float, bool) or not all(isinstance(choice, str) for choice in choices):
         expected = "an option of the type str, int, float, bool or a Literal of texts"
         raise DependencyError(f"{kind.__name__}: {parameter.name}", expected=expected, found=str(hint))

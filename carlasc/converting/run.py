@@ -134,15 +134,14 @@ def convert(
 
 
 class _ConvertedScans(Source):
-    """What some conversions wrote to a sink: the sequences that have scans."""
+    """What some conversions wrote to a sink."""
 
     def __init__(self, sink: Sink, conversions: Series[Conversion]) -> None:
         self.location, self._source = sink.location, sink.source()
         self._paths = {sequence_path(conversion.plan.recording) for conversion in conversions}
 
     def sequences(self) -> dict[str, Sequence]:
-        found = self._source.sequences()
-        return {path: found[path] for path in found if path in self._paths and "points" in found[path].fields()}
+        return {path: sequence for path, sequence in self._source.sequences().items() if path in self._paths}
 
 
 def _make_grids(
@@ -158,15 +157,15 @@ def _make_grids(
     All grids have the same bounds, so that one training set can hold them: those of the options, moved to where the ground is if that is
     asked for.
     """
-    converted = _ConvertedScans(sink, conversions)
-    if not converted.sequences():
+    conversions = [conversion for conversion in conversions if conversion.has_scans]
+    if not conversions:
         return None  # every frame failed, and is reported
     spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
         spec, notes = _fit(spec, [one.ground for one in conversions if one.ground is not None], sink.location)
     observe = replace(grids.observe if isinstance(grids.observe, FromScans) else FromScans(), force=poses.force)
     result = regrid(
-        converted,
+        _ConvertedScans(sink, conversions),
         spec,
         out,
         observe=observe,

@@ -79,6 +79,11 @@ class Conversion:
         """Number of frames that were converted."""
         return len(self.plan.unfinished - self._failed)
 
+    @property
+    def has_scans(self) -> bool:
+        """Whether the scan of any frame exists."""
+        return any(handle.number not in self._failed for handle in self.plan.recording.frames)
+
     def _estimate_first(self) -> None:
         """Estimate the poses before scans are written, because scans are corrected by them: each scan is then read twice."""
         plan = self.plan

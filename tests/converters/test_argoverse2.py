@@ -306,7 +306,7 @@ def test_a_folder_without_logs_and_an_unknown_option_are_refused(tmp_path):
     with pytest.raises(MissingDataError, match="found no such folder"):
         Argoverse2(tmp_path / "typo").sequences()
     with pytest.raises(ArgumentError, match="expected no options for this data set, found flow"):
-        Argoverse2(tmp_path, flow="yes")
+        convert("argoverse2", tmp_path, tmp_path / "out", options={"flow": "yes"})
 
 
 @pytest.fixture(scope="module")

@@ -121,7 +121,8 @@ def test_validate_points_out_a_faulty_copy(simulated, converted, tmp_path, fault
 
 
 def test_labels_and_frame_of_kitti_leave_points_and_classes_as_they_are(simulated, tmp_path):
-    convert("kitti", simulated[0], tmp_path, layout=LayoutOptions(classes="semantickitti", axes="right"), **PLAIN)
+    layout = LayoutOptions("semantickitti", "right", "none")
+    convert("kitti", simulated[0], tmp_path, **PLAIN | {"layout": layout})
     sequence = sequence_of(tmp_path)
     points, both = raw(simulated[1].folder, 4)
     assert sequence.read("points", 4).tobytes() == points.tobytes()

@@ -179,12 +179,13 @@ def test_arguments_that_make_no_sense_are_named(tmp_path, folder):
     for name, value in (
         ("classes", "semanticposs"),
         ("axes", "up"),
-        ("grids", "all"),
         ("poses", "gps"),
         ("flow", "icp"),
     ):
         with pytest.raises(ArgumentError, match=f"{name}: expected one of"):
             run(tmp_path, **{name: value})
+    with pytest.raises(ArgumentError, match="grids: expected GridOptions"):
+        run(tmp_path, grids="scans")
     with pytest.raises(ArgumentError, match=r"name: expected one of .*kitti.*, found 'kiti'"):
         convert("kiti", tmp_path / "in", tmp_path / "out")
 

@@ -155,8 +155,8 @@ def test_areas_are_found_below_the_folder(table: Path, tmp_path: Path) -> None:
     assert [area.name for area in SynthCity(tmp_path).sequences()] == ["SYNTHCITY_area1", "SYNTHCITY_area-2"]
     with pytest.raises(MissingDataError, match="Parquet tables, one per area"):
         SynthCity(tmp_path / "none").sequences()
-    with pytest.raises(ArgumentError, match="grid: expected one of cartesian, cartesian_fine, found cylindrical"):
-        SynthCity(tmp_path, grid="cylindrical").sequences()
+    with pytest.raises(ArgumentError, match="grid: expected one of cartesian, cartesian_fine, found 'cylindrical'"):
+        convert("synthcity", tmp_path, tmp_path / "out", options={"grid": "cylindrical"}, run=Run(1))
 
 
 def test_notes_say_that_nothing_is_free(table: Path) -> None:

@@ -12,7 +12,7 @@ from helpers.datasets.exported import PATH, files_and_bytes, scene_grid, write_s
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.converting import export, exporter_names, load_exporter, option_names
+from carlasc.converting import export, exporter_names, load_exporter, option_declarations
 from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
 from carlasc.running import Run
 
@@ -51,7 +51,11 @@ def test_ours_are_there_and_have_titles_and_options():
     for name in OURS:
         assert f"{name}: {load_exporter(name).title}" in result.output
     assert "(options: grid, predictions, every)" in result.output
-    assert option_names(load_exporter("occ3d")) == ("grid", "predictions", "height_m")
+    assert tuple(option.name for option in option_declarations(load_exporter("occ3d"))) == (
+        "grid",
+        "predictions",
+        "height_m",
+    )
 
 
 def test_the_exporter_of_the_documentation_works(installed, tmp_path):
@@ -91,8 +95,8 @@ def test_options_of_the_command_line_are_those_of_the_constructor(installed, tmp
         (("--option", "above_m"), "--option: expected NAME=VALUE, each name once, found 'above_m'"),
         (("--option", "a=1", "--option", "a=2"), "--option: expected NAME=VALUE, each name once, found 'a=2'"),
         (("--option", "above_m=high"), "above_m: expected a number, found 'high'"),
-        (("--option", "below_m=1"), "--option: expected one of grid, above_m, found below_m"),
-        (("--predictions",), "--option: expected one of grid, above_m, found predictions"),
+        (("--option", "below_m=1"), "options: expected one of grid, above_m, found below_m"),
+        (("--predictions",), "options: expected one of grid, above_m, found predictions"),
     ],
 )
 def test_wrong_options_are_named_and_the_exit_code_is_2(installed, tmp_path, options, message):

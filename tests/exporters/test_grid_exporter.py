@@ -287,7 +287,7 @@ def test_what_cannot_be_exported_is_named_in_one_line(tmp_path, name):
     write_scene(tmp_path / "in", frames=1)
     with pytest.raises(MissingDataError, match="expected the grid fine, found small"):
         export(name, tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
-    with pytest.raises(ArgumentError, match="option: expected one of grid, .*, found nonsense"):
+    with pytest.raises(ArgumentError, match="options: expected one of grid, .*, found nonsense"):
         export(name, tmp_path / "in", tmp_path / "out", options={"nonsense": 1}, run=Run(workers=1))
     writer = FolderSink(tmp_path / "in").sequence(PATH)
     round_ = GridSpec("cylindrical", (4, 4, 2), (0.0, -3.0, -2.0), (8.0, 3.0, 0.5))
