@@ -153,9 +153,7 @@ class ActorMotion:
             self._ended, key=_SightingChain.size, reverse=True
         )  # so that no worker has a long one left at the end
         self._ended = []
-        with closing(
-            run_all(self._estimate, chains, workers=self._run_options.workers, executor=self._run_options.executor)
-        ) as estimates:
+        with closing(run_all(self._estimate, chains, self._run_options)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):
                 for frame, velocity in zip(chain.frames, velocities, strict=True):
                     self._velocities.setdefault(frame, {})[chain.actor] = velocity

@@ -20,7 +20,7 @@ from carlasc.converting.results import ExportResult, Failure, StepCounter, check
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.options import Run
 from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, one_pool, run_all
+from carlasc.running.processes import one_pool, run_all
 from carlasc.storage.durability import make_folder, rename, sync_tree
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json, write_atomic, write_many
 
@@ -63,7 +63,7 @@ def export(
         ConflictError: `out` lies inside `source`, or holds an export of other sequences or with other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
-    start, workers = time.perf_counter(), count_workers(run.workers)
+    start = time.perf_counter()
     kind = load_exporter(name)
     exporter = kind(**read_options(kind, options))
     opened, root = storage.as_source(source), Path(out)
@@ -84,8 +84,8 @@ def export(
     remove_stale(root)
     ours = _deal(exporter, chosen, run.part)
     steps = StepCounter(run.progress, sum(len(exported.frames) for exported in ours))
-    with one_pool(workers, run.executor) as pool:
-        writing = _SequenceExport(exporter, root, overwrite, Run(workers, pool), steps)
+    with one_pool(run) as pooled:
+        writing = _SequenceExport(exporter, root, overwrite, pooled, steps)
         for exported in ours:
             writing.add(exported)
     if run.part.count == 1 or all(_is_whole(exporter, exported, root / exported.folder) for exported in chosen):
@@ -271,7 +271,7 @@ class _SequenceExport:
         self.steps(frames)
 
     def _made(self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]) -> Generator[Any, None, None]:
-        return run_all(function, jobs, workers=self.run.workers, executor=self.run.executor, lost=_fail)
+        return run_all(function, jobs, self.run, lost=_fail)
 
 
 def _fail(job: ExportJob, message: str) -> str:

@@ -27,7 +27,7 @@ from carlasc.groundtruth.run import RegridResult, regrid
 from carlasc.motion.options import PoseOptions
 from carlasc.running.options import Run
 from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, one_pool
+from carlasc.running.processes import one_pool
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Source
@@ -82,11 +82,11 @@ def convert(
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
-    start, workers = time.perf_counter(), count_workers(run.workers)
+    start = time.perf_counter()
     converter = load_converter(name) if isinstance(name, str) else name
     target, given = layout.of(converter), read_options(converter, options)
     root, sink = Path(source), as_sink(out, part=run.part)
-    check_shared(sink.location, 1 if run.executor is None and workers == 1 else 2)
+    check_shared(sink.location, run)
     _check(root, sink, split, grids, run.part)
 
     recordings = choose_recordings(converter(root, **given).sequences(), root, sequences, split)
@@ -104,8 +104,7 @@ def convert(
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, _provenance(converter))
 
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
-    with one_pool(workers, run.executor) as pool:
-        pooled = Run(workers, pool)
+    with one_pool(run) as pooled:
         conversions = [Conversion(plan, converter, target, pooled, steps) for plan in plans]
         with ExitStack() as writers:
             for conversion in conversions:
@@ -115,7 +114,9 @@ def convert(
             sink.finish(incomplete=True)  # what is missing could not be read, and is reported
         made = None
         if isinstance(grids, GridOptions):
-            made = _make_grids(conversions, grids, sink, out, poses, replace(pooled, progress=steps.stage()))
+            made = _make_grids(
+                conversions, grids, sink, out, poses, replace(pooled, part=Part(), progress=steps.stage())
+            )
 
     failures = [failure for conversion in conversions for failure in conversion.failures]
     notes = [note for conversion in conversions for note in conversion.notes]
@@ -163,17 +164,11 @@ def _make_grids(
     spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
         spec, notes = _fit(spec, [one.ground for one in conversions if one.ground is not None], sink.location)
-    observe = replace(grids.observe if isinstance(grids.observe, FromScans) else FromScans(), force=poses.force)
-    result = regrid(
-        _ConvertedScans(sink, conversions),
-        spec,
-        out,
-        observe=observe,
-        voting=grids.voting or Voting(),
-        workers=run.workers,
-        executor=run.executor,
-        progress=run.progress,
+    observe = replace(
+        grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=PoseOptions("file", poses.force)
     )
+    voting = grids.voting or Voting()
+    result = regrid(_ConvertedScans(sink, conversions), spec, out, observe=observe, voting=voting, run=run)
     return replace(result, notes=(*notes, *result.notes))
 
 

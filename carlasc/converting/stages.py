@@ -146,7 +146,7 @@ class Conversion:
 
     def _work(self, blocks: Sequence[FrameBlock[Any]]) -> Iterator[ConvertedFrame]:
         """Yield the frames of blocks after they were converted; what workers cannot write is written here."""
-        run = partial(run_all, FrameBlock.convert, workers=self.run_options.workers, executor=self.run_options.executor)
+        run = partial(run_all, FrameBlock.convert, run=self.run_options)
 
         def one_by_one(block: FrameBlock[Any], message: str) -> list[ConvertedFrame]:
             """Work on the frames of a lost block again, each alone: one of them may have killed the workers."""

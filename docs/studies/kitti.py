@@ -17,14 +17,13 @@ from clock import Clock
 from PIL import Image
 
 import carlasc
-from carlasc import Grid, GridSpec
+from carlasc import Grid, GridSpec, Run
 from carlasc.captures import Drive
 from carlasc.converting import FlowSource, LayoutOptions, convert
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, count_votes, regrid
 from carlasc.metrics import TruthScore, score_truth
-from carlasc.running import Run
 from carlasc.viewing import ClassColors, Panel, draw_panels, grid_drawing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
@@ -59,7 +58,7 @@ def make(folder: Path, rule: str, name: str) -> dict[int, Grid]:
             observe=FromScans(dynamic=rule),  # type: ignore[arg-type]
             frames=(frame, frame + 1),
             name=f"{grid}_{frame}",
-            workers=1,
+            run=Run(workers=1),
         )
         if result.failures:
             raise SystemExit(result.failures[0].message)

@@ -326,7 +326,9 @@ def test_movers_of_the_real_sample_leave_no_trail_in_a_grid(converted, monkeypat
     assert sorted(body.name for body in judge.movers) == ["track 1", "track 2"]
     spec = GridSpec.published().with_resolution(0.2)
     frames = (frame, frame + 1)
-    result = carlasc.regrid(converted, spec, name="fine", frames=frames, observe=FromScans(window=window), workers=1)
+    result = carlasc.regrid(
+        converted, spec, name="fine", frames=frames, observe=FromScans(window=window), run=Run(workers=1)
+    )
     assert not result.failures
     (sequence,) = carlasc.open(converted).sequences().values()
     measures = judge.measure(sequence.grid("fine", frame), frame)
