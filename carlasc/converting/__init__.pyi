@@ -7,6 +7,7 @@ from .exporter import SequenceFile as SequenceFile
 from .exporting import export as export
 from .layout_options import FlowSource as FlowSource
 from .layout_options import LayoutOptions as LayoutOptions
+from .plans import SplitName as SplitName
 from .protocol import Cloud as Cloud
 from .protocol import Converter as Converter
 from .protocol import FrameHandle as FrameHandle
