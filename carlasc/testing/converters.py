@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import carlasc
-from carlasc.converting import Converter, LayoutOptions, convert, load_converter
+from carlasc import storage
+from carlasc.converting import Converter, LayoutOptions, convert, load_converter, read_options
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, relative_to, transform_points
 from carlasc.motion import PoseOptions
@@ -42,7 +42,7 @@ class ConverterContract:
     ids: Mapping[str, int]
     drive: SimulatedDrive = SimulatedDrive()
     keeps: frozenset[str] = frozenset({"labels", "instances", "boxes", "poses", "times"})
-    options: Mapping[str, str] = {}
+    options: Mapping[str, Any] = {}
     points_m: float = 1e-4
     poses_m: float = 1e-6
 
@@ -68,7 +68,7 @@ class ConverterContract:
             run=Run(workers=1),
         )
         assert result.failures == ()
-        (sequence,) = carlasc.open(out).sequences().values()
+        (sequence,) = storage.open(out).sequences().values()
         return sequence
 
     @pytest.fixture(scope="class")
@@ -87,7 +87,7 @@ class ConverterContract:
 
     @pytest.fixture
     def sequence(self, out: Path) -> Sequence:
-        (sequence,) = carlasc.open(out).sequences().values()
+        (sequence,) = storage.open(out).sequences().values()
         return sequence
 
     def test_every_point_is_kept_in_its_place(self, sequence: Sequence) -> None:
@@ -173,7 +173,7 @@ class ConverterContract:
         assert not speed[truth == 0][instances[truth == 0] == 0].any()
 
     def test_frames_are_read_in_other_processes(self, source: Path) -> None:
-        (recording,) = self._class()(source, **self.options).sequences()
+        (recording,) = self._class()(source, **read_options(self._class(), self.options)).sequences()
         handle = recording.frames[1]
         again = pickle.loads(pickle.dumps(handle))
         for one, other in zip(handle.read(), again.read(), strict=True):
