@@ -22,9 +22,8 @@ if TYPE_CHECKING:
         Voting,
     )
     from carlasc.groundtruth.run import RegridResult, regrid
-    from carlasc.groundtruth.voting.ballot import Ballot, VoteRule, Votes, count_votes
-    from carlasc.groundtruth.voting.evidence import Evidence
-    from carlasc.groundtruth.voting.observations import Observation
+    from carlasc.groundtruth.voting.ballot import Ballot, Observation, VoteRule, Votes, count_votes
+    from carlasc.groundtruth.voting.certainty import VoxelCertainty
 else:
     __getattr__, __dir__ = late_names(
         __name__,
@@ -44,9 +43,8 @@ else:
                 "Voting",
             ),
             "run": ("RegridResult", "regrid"),
-            "voting.ballot": ("Ballot", "VoteRule", "Votes", "count_votes"),
-            "voting.evidence": ("Evidence",),
-            "voting.observations": ("Observation",),
+            "voting.ballot": ("Ballot", "Observation", "VoteRule", "Votes", "count_votes"),
+            "voting.certainty": ("VoxelCertainty",),
         },
     )
 
@@ -54,7 +52,6 @@ __all__ = [
     "Ballot",
     "Complete",
     "Dynamic",
-    "Evidence",
     "FrameFailure",
     "FromCapture",
     "FromGrid",
@@ -68,6 +65,7 @@ __all__ = [
     "VoteRule",
     "Votes",
     "Voting",
+    "VoxelCertainty",
     "count_votes",
     "regrid",
     "resample",

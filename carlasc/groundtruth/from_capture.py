@@ -14,8 +14,7 @@ from carlasc.captures.raw import Capture, Recording, find_captures
 from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.inputs import FrameData, FrameInput, Plan, SequenceInput, choose_frames
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Source

@@ -23,7 +23,7 @@ from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
-from carlasc.groundtruth.voting.evidence import Evidence
+from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.running.engines import Engine
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
@@ -98,7 +98,7 @@ class FrameData:
     fields: Mapping[str, NDArray[Any]]
     grid: Grid
     votes: Votes | None
-    evidence: Evidence | None = None
+    evidence: VoxelCertainty | None = None
 
 
 class Steps:

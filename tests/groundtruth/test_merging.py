@@ -13,7 +13,7 @@ from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.from_scans.regions import STATIC
-from carlasc.groundtruth.voting.observations import NOWHERE
+from carlasc.groundtruth.voting.ballot import NOWHERE
 from carlasc.motion import Extent, Track
 from carlasc.storage import FolderSink, FolderSource, layout
 

@@ -19,18 +19,17 @@ from carlasc.groundtruth.from_scans.merging import Instant, Merger
 from carlasc.groundtruth.from_scans.regions import STATIC, Regions
 from carlasc.groundtruth.inputs import Plan
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.voting.ballot import Ballot, Votes
-from carlasc.groundtruth.voting.evidence import (
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
+from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
-    Evidence,
     Matter,
+    VoxelCertainty,
     class_shares,
     is_occupied,
     matter_of,
     probability,
 )
-from carlasc.groundtruth.voting.marking import mark
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.kernel import mark
 
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
@@ -50,7 +49,7 @@ class MergedFrame:
 
     grid: Grid
     votes: Votes
-    evidence: Evidence | None = None
+    evidence: VoxelCertainty | None = None
 
 
 def merge_frame(plan: Plan, feed: ScanFeed, actors: Actors, frame: int, window: list[int]) -> MergedFrame:
@@ -149,7 +148,9 @@ class _Merging:
             return MergedFrame(grid, votes)
         inferred, hits = (np.concatenate(parts) for parts in zip(*completed, strict=True))
         flags, shares = self._flags(inferred, contested), class_shares(hits, self.classes)
-        return MergedFrame(grid, votes, Evidence(scene.occupied.reshape(size), shares, flags.reshape(size), views))
+        return MergedFrame(
+            grid, votes, VoxelCertainty(scene.occupied.reshape(size), shares, flags.reshape(size), views)
+        )
 
     def _scene(self, votes: Votes) -> _Scene:
         """Return what the votes for the static scene and in the actors' bodies say."""

@@ -20,7 +20,7 @@ from carlasc.core.scans import runs_of_origins
 from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.regions import STATIC, Regions
 from carlasc.groundtruth.options import Dynamic
-from carlasc.groundtruth.voting.observations import NOWHERE, Observation
+from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
 from carlasc.motion import Track, usual_shell
 
 _DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
