@@ -8,7 +8,6 @@ from carlasc.loading import late_names
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.from_grid import resample
-    from carlasc.groundtruth.jobs import FrameFailure
     from carlasc.groundtruth.options import (
         Complete,
         Dynamic,
@@ -24,12 +23,13 @@ if TYPE_CHECKING:
     from carlasc.groundtruth.run import RegridResult, regrid
     from carlasc.groundtruth.voting.ballot import Ballot, Observation, VoteRule, Votes, count_votes
     from carlasc.groundtruth.voting.certainty import VoxelCertainty
+    from carlasc.groundtruth.work import FrameFailure
 else:
     __getattr__, __dir__ = late_names(
         __name__,
         {
             "from_grid": ("resample",),
-            "jobs": ("FrameFailure",),
+            "work": ("FrameFailure",),
             "options": (
                 "Complete",
                 "Dynamic",

@@ -12,12 +12,13 @@ from carlasc.loading import late_names
 if TYPE_CHECKING:
     from carlasc.motion.bodies import Extent, seen_from, usual_shell
     from carlasc.motion.boxes import segment_by_boxes, tracks_from_boxes
-    from carlasc.motion.evidence import HORIZON_S, Evidence, Sighting, find_evidence
+    from carlasc.motion.evidence import HORIZON_S, FreeSpaceEvidence, Sighting, find_evidence
     from carlasc.motion.ground import ground_height, ground_points
-    from carlasc.motion.linking import Chain, Linker
     from carlasc.motion.movers import Movers, find_movers, follow_movers
     from carlasc.motion.options import MotionOptions, MotionSource, PoseOptions, PoseSource
     from carlasc.motion.segments import (
+        Chain,
+        Linker,
         Segment,
         Standing,
         is_fast,
@@ -32,12 +33,13 @@ else:
         {
             "bodies": ("Extent", "seen_from", "usual_shell"),
             "boxes": ("segment_by_boxes", "tracks_from_boxes"),
-            "evidence": ("HORIZON_S", "Evidence", "Sighting", "find_evidence"),
+            "evidence": ("HORIZON_S", "FreeSpaceEvidence", "Sighting", "find_evidence"),
             "ground": ("ground_height", "ground_points"),
-            "linking": ("Chain", "Linker"),
             "movers": ("Movers", "find_movers", "follow_movers"),
             "options": ("MotionOptions", "MotionSource", "PoseOptions", "PoseSource"),
             "segments": (
+                "Chain",
+                "Linker",
                 "Segment",
                 "Standing",
                 "is_fast",
@@ -54,8 +56,8 @@ __all__ = [
     "HORIZON_S",
     "LONGEST_M",
     "Chain",
-    "Evidence",
     "Extent",
+    "FreeSpaceEvidence",
     "Linker",
     "MotionOptions",
     "MotionSource",

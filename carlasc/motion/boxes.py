@@ -12,8 +12,8 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
 from carlasc.core.scans import Scan
 from carlasc.motion.bodies import Extent
+from carlasc.motion.paths import resample, smooth
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
-from carlasc.motion.smoothing import resample, smooth
 from carlasc.motion.tracks import BODY_MARGIN_M, Track
 
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
@@ -26,7 +26,7 @@ _JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart are differen
 
 
 @dataclass(frozen=True)
-class _Sightings:
+class _ObjectBoxes:
     """The boxes of one object.
 
     Attributes:
@@ -45,8 +45,8 @@ class _Sightings:
     labels: NDArray[np.int64]
     weights: NDArray[np.float64]
 
-    def part(self, rows: NDArray[np.int64]) -> _Sightings:
-        return _Sightings(*(values[rows] for values in vars(self).values()))
+    def part(self, rows: NDArray[np.int64]) -> _ObjectBoxes:
+        return _ObjectBoxes(*(values[rows] for values in vars(self).values()))
 
 
 def tracks_from_boxes(
@@ -152,11 +152,11 @@ def _inside(
     return near[inside & above]
 
 
-def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _Sightings:
+def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
     """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
     chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
     frames = np.array([frame for frame, _, _ in found], np.int64)
-    return _Sightings(
+    return _ObjectBoxes(
         frames,
         np.array([times[frame] for frame in frames.tolist()]),
         np.concatenate([box.sensor_T_box for box in chosen]),
@@ -166,7 +166,7 @@ def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) 
     )
 
 
-def _split_at_jumps(sightings: _Sightings) -> list[_Sightings]:
+def _split_at_jumps(sightings: _ObjectBoxes) -> list[_ObjectBoxes]:
     """Split the boxes of a number where no object can get from one to the next."""
     steps = np.linalg.norm(np.diff(sightings.poses[:, :3, 3], axis=0), axis=1)
     jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(sightings.seconds)) + 1
@@ -174,7 +174,7 @@ def _split_at_jumps(sightings: _Sightings) -> list[_Sightings]:
 
 
 def _make_track(
-    instance: int, sightings: _Sightings, known: NDArray[np.int64], known_seconds: NDArray[np.float64]
+    instance: int, sightings: _ObjectBoxes, known: NDArray[np.int64], known_seconds: NDArray[np.float64]
 ) -> Track:
     """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
     seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
