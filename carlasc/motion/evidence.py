@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import as_pose
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, thin, transform_points, translation
+from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points, translation
 from carlasc.core.scans import runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
@@ -115,7 +115,7 @@ class _Kept:
         """Sort the points of a scan by the places from which they were seen: (place_T_world, view) for each."""
         views = []
         for part, origin in _places(scan):
-            place_T_world = invert(scan.world_T_sensor @ translation(origin))
+            place_T_world = invert(multiply(scan.world_T_sensor, translation(origin)))
             views.append(
                 (place_T_world, SortedReturns.of(scan.points[part] - origin if origin.any() else scan.points[part]))
             )
@@ -175,7 +175,7 @@ def _places(scan: Sighting) -> list[tuple[slice, NDArray[np.float32]]]:
     """Return the places from which the points of a scan were seen. Neighbouring places of one sensor that moves count as their middle."""
     joined: list[tuple[slice, list[NDArray[np.float32]]]] = []
     for part, origin in runs_of_origins(scan.origins, len(scan.points)):
-        if joined and np.linalg.norm(origin - joined[-1][1][0]) < _SAME_PLACE_M:
+        if joined and np.linalg.norm(origin - joined[-1][1][0], axis=0) < _SAME_PLACE_M:
             joined[-1] = (slice(joined[-1][0].start, part.stop), [*joined[-1][1], origin])
         else:
             joined.append((part, [origin]))
@@ -203,7 +203,7 @@ def _judge(
     for side, others in enumerate((before, after)):
         for bit, other in enumerate(others):
             for place_T_world, view in other.views:
-                pose = as_pose(place_T_world @ scan.world_T_sensor)
+                pose = as_pose(multiply(place_T_world, scan.world_T_sensor))
                 look_up(points, pose, view.start, view.slope, view.distance, bit, free[side], hit[side])
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)

@@ -186,7 +186,7 @@ class _MoverChain:
         # The faces that are seen change, so lower corner, middle and upper corner are measured, and the least motion counts.
         offsets = seconds - seconds.mean()
         corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
-        slopes = np.tensordot(offsets, corners, axes=(0, 0)) / np.square(offsets).sum()
+        slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
@@ -200,10 +200,14 @@ class _MoverChain:
         gap = np.maximum(np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0)
         offset = link.middle - last.middle - shift
         reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
-        if np.linalg.norm(gap[:2]) > reach or abs(gap[2]) > _REACH_M or np.linalg.norm(offset[:2]) > 3 * reach + 2.0:
+        if (
+            np.linalg.norm(gap[:2], axis=0) > reach
+            or abs(gap[2]) > _REACH_M
+            or np.linalg.norm(offset[:2], axis=0) > 3 * reach + 2.0
+        ):
             return None
         sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
-        return float(np.linalg.norm(gap) + 0.3 * np.linalg.norm(offset[:2]) + 0.2 * sizes.sum())
+        return float(np.linalg.norm(gap, axis=0) + 0.3 * np.linalg.norm(offset[:2], axis=0) + 0.2 * sizes.sum())
 
     def covers(self, link: _Link) -> bool:
         """Return whether a sighting is inside the place where the chain's next one is expected."""

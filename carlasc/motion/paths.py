@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, rotation_z, thin, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes
+from carlasc.motion.solving import least_squares
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
 _MAX_ACCELERATION_M_S2 = 6.0  # hard braking, a sharp bend
@@ -91,7 +92,7 @@ def is_standing(
         seconds: (F,) times, increasing.
     """
     thinned = [thin(points, _POINTS) for points in sightings]
-    body = [(points - positions[i]) @ rotation_z(headings[i])[:3, :3] for i, points in enumerate(thinned)]
+    body = [multiply(points - positions[i], rotation_z(headings[i])[:3, :3]) for i, points in enumerate(thinned)]
     still, moved = [], []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
@@ -119,7 +120,7 @@ def _limit_acceleration(
             before = bounded[index - step]
             change = velocities[index] - before
             most = _MAX_ACCELERATION_M_S2 * abs(seconds[index] - seconds[index - step])
-            length = float(np.linalg.norm(change))
+            length = float(np.linalg.norm(change, axis=0))
             bounded[index] = before + change * min(1.0, most / length) if length > 0 else before
     return bounded
 
@@ -162,8 +163,8 @@ def smooth_at(
     weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
     for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
         root = np.sqrt(weight)[:, None]
-        fit = np.linalg.lstsq(design * root, own * root, rcond=None)[0]
-        error = np.linalg.norm(own - design @ fit, axis=1)
+        fit = least_squares(design * root, own * root)
+        error = np.linalg.norm(own - multiply(design, fit), axis=1)
         weight = weight / (1 + (error / max(3 * _median(error), 0.02)) ** 2)
     return fit[0], fit[1] if degree else np.zeros_like(fit[0])
 
@@ -253,7 +254,8 @@ def _register(
         shifts: directions in which the ends of what is seen moved since then, and how far: see `_shift_of_ends`.
     """
     state = predicted.copy()
-    prior = expected = np.diag(1 / error**2)
+    prior = 1 / error**2
+    expected = np.diag(prior)
     ways = [(np.append(direction, 0.0), direction, shift) for direction, shift in shifts]
     for row, _, _ in ways:
         expected = expected + np.outer(row, row) / _ENDS_M**2
@@ -262,16 +264,16 @@ def _register(
         reach = first_reach * (_LAST_REACH_M / first_reach) ** (iteration / (_ITERATIONS - 1))
         pose = _pose(state)
         pairs, nearest = model.near(points, pose, reach**2)
-        information, pull = expected, prior @ (predicted - state)
+        information, pull = expected, prior * (predicted - state)
         for row, direction, shift in ways:
-            pull = pull + row * (direction @ (previous - state[:3]) + shift) / _ENDS_M**2
+            pull = pull + row * ((direction * (previous - state[:3])).sum() + shift) / _ENDS_M**2
         if len(pairs) >= 3:
-            arm, normal = model.points[nearest] @ pose[:3, :3].T, model.normals[nearest] @ pose[:3, :3].T
+            arm, normal = rotate_vectors(pose, model.points[nearest]), rotate_vectors(pose, model.normals[nearest])
             scale, share = max(2 * _POINT_M, _ROBUST * reach), min(1.0, _INDEPENDENT / len(pairs))
             slope, weighted, off = lay(points[pairs], pose[:3, 3], arm, normal, scale, share)
-            information = information + weighted.T @ slope
-            pull = pull + weighted.T @ off
-        state = state + np.linalg.solve(information, pull)
+            information = information + np.einsum("pi,pj->ij", weighted, slope)
+            pull = pull + np.einsum("pi,p->i", weighted, off)
+        state = state + least_squares(information, pull[:, None])[:, 0]
     return state
 
 
@@ -327,7 +329,7 @@ def _shift_of_ends(
     ahead = np.array([velocity[0], velocity[1], 0.0]) / speed
     shifts = []
     for direction in (ahead, np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])):
-        (low, high), (low_now, high_now) = ends(before @ direction), ends(now @ direction)
+        (low, high), (low_now, high_now) = (ends((points * direction).sum(axis=1)) for points in (before, now))
         if abs((high_now - low_now) - (high - low)) < _SAME_WIDTH_M:
             shifts.append((direction, (low_now + high_now) / 2 - (low + high) / 2))
     return shifts
@@ -363,10 +365,17 @@ def middles_of(sightings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
     """Return the index of the sighting to start with: one with many points, more than one side, and not at an end of the track."""
     counts = np.array([len(points) for points in sightings])
-    across = [np.linalg.eigvalsh(np.cov(p[:, :2], rowvar=False))[0] if len(p) > 2 else 0.0 for p in sightings]
+    across = [_least_variance(points[:, :2]) if len(points) > 2 else 0.0 for points in sightings]
     inner = np.arange(len(sightings))
     amid = np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)
     return int(np.argmax(counts * np.clip(np.array(across) / _SIDE_M**2, 1e-6, 1.0) * amid))
+
+
+def _least_variance(points: NDArray[np.float64]) -> float:
+    """Return the variance of (N, 2) points, N > 2, in the direction in which it is smallest."""
+    x, y = (points - points.mean(axis=0)).T
+    a, b, c = (float((one * other).sum()) / (len(points) - 1) for one, other in ((x, x), (x, y), (y, y)))
+    return (a + c) / 2 - float(np.sqrt(((a - c) / 2) ** 2 + b * b))
 
 
 @cached(error_model="python")

@@ -322,14 +322,14 @@ def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
     """Return how much a segment differs from the prediction of its predecessor; None if it cannot be the same actor."""
     if last.label != segment.label or last.velocity is None or segment.velocity is None:
         return None
-    change = float(np.linalg.norm(segment.velocity - last.velocity))
+    change = float(np.linalg.norm(segment.velocity - last.velocity, axis=0))
     predicted = last.points + (last.velocity + segment.velocity) / 2 * elapsed_s
     # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
     gap = np.maximum(
         predicted.min(axis=0) - segment.points.max(axis=0), segment.points.min(axis=0) - predicted.max(axis=0)
     )
-    distance = float(np.linalg.norm(np.maximum(gap, 0.0)))
+    distance = float(np.linalg.norm(np.maximum(gap, 0.0), axis=0))
     if distance > _GATE_M or change > _LINKED_M_S:
         return None
-    offset = float(np.linalg.norm(predicted.mean(axis=0) - segment.center))
+    offset = float(np.linalg.norm(predicted.mean(axis=0) - segment.center, axis=0))
     return distance + change + 0.1 * offset

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
 from carlasc.motion.bodies import Extent, Sizes, measure
 from carlasc.motion.paths import estimate_path, headings_of, is_standing, resample
@@ -173,7 +173,7 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
     lower, upper = sizes.complete(track.label, track.extent)
     middle = (lower + upper) / 2
     poses = track.world_T_actor.copy()
-    poses[:, :3, 3] += poses[:, :3, :3] @ middle
+    poses[:, :3, 3] += multiply(poses[:, :3, :3], middle[:, None])[..., 0]
     seen = replace(track.extent, lower=track.extent.lower - middle, upper=track.extent.upper - middle)
     return replace(
         track,
@@ -212,7 +212,7 @@ def _fit_box(
             sensors.append(transform_points(invert(pose), segment.origin))
         extent = measure(body, np.stack(sensors))
         middle = (extent.lower + extent.upper) / 2
-        positions = positions + rotation_z(headings[best])[:3, :3] @ middle
+        positions = positions + rotate_vectors(rotation_z(headings[best]), middle)
         extent = replace(extent, lower=extent.lower - middle, upper=extent.upper - middle)
     return positions, extent
 
