@@ -17,13 +17,14 @@ from types import FrameType
 from typing import Any
 
 import carlasc
-from carlasc import Dataset, FromCapture, FromScans, GridSpec, regrid
+from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, regrid
 from carlasc.captures import Lidar
 
 PACKAGE = str(Path(carlasc.__file__).parent) + os.sep
 SPEC = GridSpec.published().with_size((32, 32, 8))
 LIDAR = Lidar(channels=16, points=4000)
 FRAMES = 6
+ONE = Run(workers=1)
 
 
 @dataclass
@@ -80,26 +81,26 @@ def cases(folder: Path) -> dict[str, Callable[[], object]]:
 
     One frame of a capture and of scans is made, each with its tracks, its report and all other files of a run.
     """
-    carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, workers=1)
-    regrid(folder / "capture", SPEC, folder / "grids", workers=1)
+    carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, run=ONE)
+    regrid(folder / "capture", SPEC, folder / "grids", run=ONE)
     finer = GridSpec.published().with_size((64, 64, 16))
-    regrid(folder / "capture", finer, folder / "finer", workers=1)
+    regrid(folder / "capture", finer, folder / "finer", run=ONE)
     middle, observe = FRAMES // 2, FromScans()
     dataset = Dataset(folder / "grids", grid="evaluation_32x32x8")
 
     def scans() -> object:
         with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), workers=1)
+            return regrid(folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), run=ONE)
 
     def capture() -> object:
         with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(folder / "capture", SPEC, out, observe=FromCapture(), frames=(middle, middle + 1), workers=1)
+            return regrid(folder / "capture", SPEC, out, observe=FromCapture(), frames=(middle, middle + 1), run=ONE)
 
     return {
         "regrid from scans": scans,
         "regrid of a capture": capture,
         "Dataset[1]": lambda: dataset[1],
-        "evaluate": lambda: carlasc.evaluate(folder / "grids", folder / "grids", workers=1),
+        "evaluate": lambda: carlasc.evaluate(folder / "grids", folder / "grids", run=ONE),
     }
 
 

@@ -35,7 +35,7 @@ from carlasc.motion import (
     tracks_from_boxes,
 )
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.folders.folder import FolderSequence
@@ -96,23 +96,21 @@ class _MotionPass:
 
     Attributes:
         feed: its scans.
-        workers: number of scans, blocks or tracks that are worked on in parallel.
-        executor: runs the work instead of processes of our own.
-        progress: called with the number of scans that were read since the last call.
+        run: how the work is spread.
+        steps: called with the number of scans that were read since the last call.
     """
 
     feed: ScanFeed
-    workers: int
-    executor: Engine | None
-    progress: Callable[[int], None] | None
+    run: Run
+    steps: Callable[[int], None] | None
 
     def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> closing[Generator[Result]]:
         """Return the results of a function of each item, in a context that ends the work."""
-        return closing(run_all(function, items, workers=self.workers, executor=self.executor))
+        return closing(run_all(function, items, self.run))
 
     def _count(self, scans: int) -> None:
-        if self.progress is not None:
-            self.progress(scans)
+        if self.steps is not None:
+            self.steps(scans)
 
     def linked(self) -> list[Track]:
         """Return the tracks of the actors that flow or instances show."""
@@ -174,29 +172,26 @@ class _MotionPass:
 
 def find_actors(
     feed: ScanFeed,
-    *,
-    workers: int = 1,
-    executor: Engine | None = None,
-    progress: Callable[[int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
+    steps: Callable[[int], None] | None = None,
 ) -> MovingActors:
     """Find the actors of a sequence.
 
     Args:
         feed: the scans of the sequence.
-        workers: number of scans that are read in parallel.
-        executor: runs the work instead of processes of our own.
-        progress: called with the number of scans that were read since the last call.
+        run: how the work is spread over its scans, blocks of scans and tracks.
+        steps: called with the number of scans that were read since the last call.
 
     Raises:
         FormatError: a scan is not valid.
     """
-    steps = _MotionPass(feed, workers, executor, progress)
+    by = _MotionPass(feed, run, steps)
     boxes = _box_tracks(feed)
     moving_boxes = tuple(track for track in boxes if track.moves)
-    tracks = steps.boxed(boxes, moving_boxes) if boxes else steps.linked()
+    tracks = by.boxed(boxes, moving_boxes) if boxes else by.linked()
     moving: dict[int, NDArray[np.integer]] = {}
     if "evidence" in feed.motion:
-        movers, moving = steps.movers(moving_boxes)
+        movers, moving = by.movers(moving_boxes)
         tracks += movers
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving)
 
@@ -249,7 +244,7 @@ def key_of(feed: ScanFeed) -> str:
     about: dict[str, Any] = {
         "version": VERSION,
         "motion": feed.motion,
-        "min_speed_m_s": options.min_speed_m_s,
+        "min_speed_m_s": options.motion.min_speed_m_s,
         "range_m": [feed.min_range_m, str(feed.max_range_m)],
         "frames": feed.frames.tolist(),
         "poses": hashlib.sha256(sequence.poses.tobytes()).hexdigest(),
