@@ -236,7 +236,7 @@ def regrid_again(root: Path, attempt: Attempt) -> None:
 
 def tracks_in(root: Path, attempt: Attempt) -> None:
     """Read the tracks of actors that regrid keeps, which a run that goes on takes for damaged rather than stop."""
-    from carlasc.groundtruth.from_scans.actors import Actors
+    from carlasc.motion.tracks import MovingActors
 
     for file in sorted(root.rglob("*.npz")):
-        attempt(Actors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))
+        attempt(MovingActors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))

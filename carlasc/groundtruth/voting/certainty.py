@@ -136,7 +136,7 @@ def _volume(spec: GridSpec) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class VoxelCertainty:
     """How certain each voxel of a grid is. The attributes are the fields of the grid: see `docs/format.md#evidence`.
 
     Attributes:
@@ -172,7 +172,7 @@ def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
         classes: class table of the labels.
 
     Returns:
-        (N,) `Evidence.classes`: `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
+        (N,) `VoxelCertainty.classes`: `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
     """
     pairs, place = np.unique(
         votes["voxel"].astype(np.int64) * classes.num_channels + votes["label"], return_inverse=True
