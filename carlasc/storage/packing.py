@@ -33,12 +33,12 @@ from carlasc.storage.copying import (
 from carlasc.storage.folders.published import PublishedSequence
 from carlasc.storage.folders.trees import is_url
 from carlasc.storage.opening import as_source, open, open_sink
-from carlasc.storage.packed.protocol import Options, PackedSink, PackedSource, check_names
+from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions, check_names
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
 if TYPE_CHECKING:
-    from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter
+    from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
 _BLOCK = 8  # frames that are read together
 _AHEAD = 2  # threads that read ahead of the writer of a store that is appended to
@@ -116,7 +116,7 @@ def pack(
         StorageError: the store cannot be written: a full disk, a folder without write permission.
     """
     began = time.perf_counter()
-    options = Options(small, lossy_mm)
+    options = PackOptions(small, lossy_mm)
     count_workers(workers)
     part.refuse(overwrite)
     if PurePath(out).suffix != ".zarr":

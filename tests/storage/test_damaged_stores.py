@@ -19,8 +19,8 @@ import carlasc
 from carlasc.errors import FormatError
 from carlasc.storage import FolderSource, Sequence, Source, pack, unpack
 from carlasc.storage.opening import open_sink
-from carlasc.storage.packed.arrays.chunks import Encoding
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.chunks import Encoding
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.testing.data import SCANS, WHOLE
 
 PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
@@ -67,7 +67,7 @@ def test_a_sequence_whose_path_leads_elsewhere_is_not_unpacked(data: Path, tmp_p
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_fields_and_text_files_whose_names_lead_elsewhere_are_not_written(tmp_path: Path, kind: str) -> None:
-    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
+    writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     with pytest.raises(FormatError, match="leads elsewhere"):
         writer.write("../../../../victim/labels", 0, np.zeros((2, 2, 2), np.uint32))
     with pytest.raises(FormatError, match="leads elsewhere"):

@@ -9,8 +9,8 @@ from helpers.datasets.sequences import scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source
-from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.hdf5.hdf5_sink import HDF5Sink
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
@@ -130,7 +130,7 @@ def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
 
 def test_pcodec_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"\.zarr"):
-        HDF5Sink(tmp_path / "x.h5", Options(small=True))
+        HDF5Sink(tmp_path / "x.h5", PackOptions(small=True))
 
 
 def test_another_file_is_not_overwritten(tmp_path: Path) -> None:

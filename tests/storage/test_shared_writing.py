@@ -24,10 +24,10 @@ from hypothesis import strategies as st
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Sequence, pack, unpack
-from carlasc.storage.packed.arrays.zarr_finish import finish
-from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.targets import LocalTarget
+from carlasc.storage.zarr.zarr_finish import finish
+from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
 for package in ("numcodecs", "google_crc32c"):
     pytest.importorskip(package)
@@ -106,7 +106,7 @@ import sys
 from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from storage.test_shared_writing import start, write_block
-from carlasc.storage.packed.arrays.zarr_finish import finish
+from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.targets import LocalTarget
 out = Path(sys.argv[1])
 writer = start(out)
@@ -184,11 +184,11 @@ def test_frames_written_in_any_order_together_or_alone_give_the_same_files(
 ) -> None:
     folder, count = tmp_path_factory.mktemp("orders"), 7
     given = {frame: arrays_of(frame) for frame in range(count)}
-    whole = ZarrSink(folder / "a.zarr", Options(block=block)).sequence(PATH)
+    whole = ZarrSink(folder / "a.zarr", PackOptions(block=block)).sequence(PATH)
     whole.expect({}, {"points": 140})
     whole.write_frames(given)
     finish(LocalTarget(folder / "a.zarr"))
-    writer: ZarrWriter = ZarrSink(folder / "b.zarr", Options(block=block)).sequence(PATH)
+    writer: ZarrWriter = ZarrSink(folder / "b.zarr", PackOptions(block=block)).sequence(PATH)
     writer.expect({}, {"points": 140})
     items = data.draw(st.permutations([(frame, name) for frame in given for name in given[frame]]))
     while items:
@@ -373,11 +373,11 @@ def test_a_source_names_the_files_that_hold_frames(tmp_path: Path, reference: di
 @pytest.mark.parametrize("block", [0, 1025])
 def test_senseless_blocks_are_refused(block: int) -> None:
     with pytest.raises(ArgumentError, match="block: expected 1 to 1024 frames"):
-        Options(block=block)
+        PackOptions(block=block)
 
 
 def test_a_store_of_one_frame_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
-    with ZarrSink(tmp_path / "x.zarr", Options(block=1)) as sink, sink.sequence(PATH) as writer:
+    with ZarrSink(tmp_path / "x.zarr", PackOptions(block=1)) as sink, sink.sequence(PATH) as writer:
         writer.write_frames({0: arrays_of(1)})
         assert np.array_equal(writer.read("evaluation/counts", 0), arrays_of(1)["evaluation/counts"])
     sequence = carlasc.open(tmp_path / "x.zarr").sequences()[PATH]
@@ -386,7 +386,7 @@ def test_a_store_of_one_frame_in_blocks_of_one_frame_is_read(tmp_path: Path) -> 
 
 
 def test_a_store_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
-    with ZarrSink(tmp_path / "x.zarr", Options(block=1)) as sink, sink.sequence(PATH) as writer:
+    with ZarrSink(tmp_path / "x.zarr", PackOptions(block=1)) as sink, sink.sequence(PATH) as writer:
         writer.write_frames({frame: arrays_of(frame) for frame in range(FRAMES)})
     assert_whole(tmp_path / "x.zarr")
     assert len(list((tmp_path / "x.zarr" / PATH / "scans/labels/values/c").iterdir())) > 20

@@ -11,9 +11,9 @@ from helpers.datasets.sequences import files_of, scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source, layout
-from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.packing import pack
+from carlasc.storage.zarr.zarr_sink import ZarrSink
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
 
@@ -211,8 +211,8 @@ def test_a_second_run_finds_what_exists_and_other_options_are_a_conflict(tmp_pat
     assert again.has("points", 0) and not again.has("points", 1) and not again.has("labels", 0)
     assert np.array_equal(again.read("points", 0), points)
     with pytest.raises(ConflictError, match=r"same options, found one with lossy_mm None.*overwrite=True"):
-        ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1))
-    assert not ZarrSink(tmp_path / "x.zarr", Options(lossy_mm=1), overwrite=True).sequence(SCANS).has("points", 0)
+        ZarrSink(tmp_path / "x.zarr", PackOptions(lossy_mm=1))
+    assert not ZarrSink(tmp_path / "x.zarr", PackOptions(lossy_mm=1), overwrite=True).sequence(SCANS).has("points", 0)
 
 
 def test_more_is_added_to_a_finished_store_and_seen_when_it_is_finished_again(store: Path) -> None:
@@ -288,7 +288,7 @@ def test_nothing_but_a_store_is_written_to(tmp_path: Path, overwrite: bool) -> N
 @pytest.mark.parametrize("millimetres", [0, -1, float("nan"), 2000])
 def test_senseless_quantisation_is_refused(millimetres: float) -> None:
     with pytest.raises(ArgumentError):
-        Options(lossy_mm=millimetres)
+        PackOptions(lossy_mm=millimetres)
 
 
 def test_votes_keep_the_width_of_their_labels(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_pa
 from carlasc.inspection.overview import GridOverview, Overview, info
 from carlasc.inspection.statistics import Histogram, Statistics, stats
 from carlasc.storage import layout
-from carlasc.storage.packed.protocol import PackedSource
+from carlasc.storage.packed.stores import PackedSource
 from carlasc.storage.protocol import Sequence, Source
 
 MOTIONSC = """@article{wilson2022motionsc,

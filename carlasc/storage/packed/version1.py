@@ -1,6 +1,6 @@
 """Version 1 of the format of stores of arrays: frames lie one after the other, and every column has a table of offsets.
 
-HDF5 stores are of this version; zarr stores were until carlasc.storage.packed.arrays.zarr_store got version 2.
+HDF5 stores are of this version; zarr stores were until carlasc.storage.zarr.zarr_source got version 2.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import numpy as np
 
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.arrays.columns import Column, packing_of
-from carlasc.storage.packed.arrays.reading import (
+from carlasc.storage.packed.array_reading import (
     ArrayField,
     ArraySequence,
     ArrayStore,
@@ -20,6 +19,7 @@ from carlasc.storage.packed.arrays.reading import (
     document_node,
     field_node,
 )
+from carlasc.storage.packed.columns import Column, packing_of
 
 
 class OffsetsSequence(ArraySequence):

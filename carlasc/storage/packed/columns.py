@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.arrays.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
+from carlasc.storage.packed.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
 from carlasc.storage.packed.numbers import narrow, quantise
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.stores import PackOptions
 
 # Points per chunk: PCodec's bins fit the scene better than in a whole scan, and padding takes bits.
 _PCODEC_STEP = 8192
@@ -80,13 +80,13 @@ class Packing(ABC):
     kind: ClassVar[str]
     columns: tuple[Column, ...]
 
-    def __init__(self, entry: layout.Field, options: Options, attributes: Mapping[str, Any]) -> None:
+    def __init__(self, entry: layout.Field, options: PackOptions, attributes: Mapping[str, Any]) -> None:
         self.entry = entry
         self.attributes = attributes
         self.columns = self._columns(options)
 
     @abstractmethod
-    def _columns(self, options: Options) -> tuple[Column, ...]: ...
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]: ...
 
     @abstractmethod
     def split(self, array: NDArray[Any]) -> Columns:
@@ -113,7 +113,7 @@ class Points(Packing):
 
     kind = "points"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding("pcodec", 8) if options.small else Encoding(shuffle=SHUFFLE)
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
@@ -159,7 +159,7 @@ class Values(Packing):
 
     kind = "values"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         incompressible = self.entry.kind == "picture"
         encoding = Encoding(level=1) if incompressible else Encoding(shuffle=SHUFFLE)
         types = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype,)
@@ -180,7 +180,7 @@ class Flow(Packing):
 
     kind = "flow"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
         return Column("index", "u1", encoding, types=("u1", "<u4")), Column(
             "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, types=("<f4", "<f4")
@@ -208,7 +208,7 @@ class Cells(Packing):
 
     kind = "grid"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         shuffle = BITSHUFFLE if self.entry.kind == "count" else NO_SHUFFLE
         dtype = self.entry.dtype if self.entry.kind == "probability" else "u1"
         types = _WIDE_CELLS.get(self.entry.dtype, (self.entry.dtype,))
@@ -228,7 +228,7 @@ class Votes(Packing):
 
     kind = "votes"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         return (
             Column("voxel", "<i4", Encoding(shuffle=SHUFFLE), "index"),
             Column("label", "u1", Encoding(), "class", types=("u1", "<u2")),
@@ -259,7 +259,7 @@ class BoxTable(Packing):
 
     kind = "boxes"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
         return (
             Column("geometry", "<f8", encoding, self.entry.unit, rows=len(_GEOMETRY), least=FEW),
@@ -284,10 +284,10 @@ class BoxTable(Packing):
 
 
 def packing_of(
-    entry: layout.Field, options: Options | None = None, attributes: Mapping[str, Any] | None = None
+    entry: layout.Field, options: PackOptions | None = None, attributes: Mapping[str, Any] | None = None
 ) -> Packing:
     """Return how a field is packed: by `options` when it is written, by the store's `attributes` when it is read."""
-    options = options or Options()
+    options = options or PackOptions()
     if attributes is None:
         attributes = {"scale_m": options.scale_m} if entry.kind == "position" and options.lossy_mm else {}
     kind: Callable[..., Packing] = Cells if entry.per == "voxel" else _BY_KIND.get(entry.kind, Values)

@@ -17,18 +17,18 @@ from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.arrays.blocks import StoredField
-from carlasc.storage.packed.arrays.chunks import in_threads
-from carlasc.storage.packed.arrays.fields import VERSION, Encoded
-from carlasc.storage.packed.arrays.reading import SEQUENCE, document_node, field_node
-from carlasc.storage.packed.arrays.zarr_begin import Root, existing_options
-from carlasc.storage.packed.arrays.zarr_finish import EXPECTED, finish, format_expected, parse_expected
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
-from carlasc.storage.packed.arrays.zarr_store import ZarrSource
-from carlasc.storage.packed.protocol import Options, check_names, node_of
+from carlasc.storage.packed.array_layout import VERSION, Encoded
+from carlasc.storage.packed.array_reading import SEQUENCE, document_node, field_node
+from carlasc.storage.packed.chunks import in_threads
+from carlasc.storage.packed.stores import PackOptions, check_names, node_of
 from carlasc.storage.protocol import identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.block_tables import StoredField
+from carlasc.storage.zarr.root import Root, existing_options
+from carlasc.storage.zarr.zarr_finish import EXPECTED, finish, format_expected, parse_expected
+from carlasc.storage.zarr.zarr_metadata import METADATA, group_metadata
+from carlasc.storage.zarr.zarr_source import ZarrSource
 
 _PUTS = 16  # objects that are written side by side
 _CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
@@ -46,7 +46,7 @@ class ZarrSink(Sink):
     is_readable = True
 
     def __init__(
-        self, out: str | os.PathLike[str] | Target, options: Options | None = None, overwrite: bool = False
+        self, out: str | os.PathLike[str] | Target, options: PackOptions | None = None, overwrite: bool = False
     ) -> None:
         """Start a store, or join one that is being written, or was interrupted, with the same options.
 
@@ -66,7 +66,7 @@ class ZarrSink(Sink):
             import_extra(module, "zarr")
         self.target = out if isinstance(out, Target) else LocalTarget(Path(out))
         self.location = self.target.location
-        self.options = options or (Options() if overwrite else existing_options(self.target)) or Options()
+        self.options = options or (PackOptions() if overwrite else existing_options(self.target)) or PackOptions()
         if self.options.small:
             import_extra("pcodec", "zarr")
         self._root = Root(self.target, self.options, overwrite)
@@ -103,7 +103,7 @@ class ZarrWriter(SequenceWriter):
 
     concurrent = True
 
-    def __init__(self, target: Target, group: str, path: str, options: Options, root: Root) -> None:
+    def __init__(self, target: Target, group: str, path: str, options: PackOptions, root: Root) -> None:
         self.target = target
         self.group = group
         self.path = path

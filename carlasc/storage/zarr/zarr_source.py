@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import RemoteTree, Tree
-from carlasc.storage.packed.arrays.fields import FieldLayout, open_field
-from carlasc.storage.packed.arrays.reading import (
+from carlasc.storage.packed.array_layout import FieldLayout, open_field
+from carlasc.storage.packed.array_reading import (
     ArrayField,
     ArraySequence,
     ArraySource,
@@ -28,9 +28,9 @@ from carlasc.storage.packed.arrays.reading import (
     document_node,
     field_node,
 )
-from carlasc.storage.packed.arrays.shards import ZarrArray
-from carlasc.storage.packed.arrays.version1 import OffsetsSequence
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA
+from carlasc.storage.packed.version1 import OffsetsSequence
+from carlasc.storage.zarr.shards import ZarrArray
+from carlasc.storage.zarr.zarr_metadata import METADATA
 
 _T = TypeVar("_T")
 

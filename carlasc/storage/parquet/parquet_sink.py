@@ -23,18 +23,18 @@ from carlasc.storage.packed.output import (
     remove,
     unfinished,
 )
-from carlasc.storage.packed.protocol import (
+from carlasc.storage.packed.stores import (
     STORE,
     VERSION,
     FieldWriter,
-    Options,
     PackedSink,
     PackedWriter,
+    PackOptions,
     node_of,
 )
-from carlasc.storage.packed.tables.columns import statistics, table_field
-from carlasc.storage.packed.tables.footers import footer_checksums
-from carlasc.storage.packed.tables.reading import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE
+from carlasc.storage.parquet.footers import footer_checksums
+from carlasc.storage.parquet.parquet_source import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE
+from carlasc.storage.parquet.table_columns import statistics, table_field
 
 _LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
 _PAGE = 8 << 20  # bytes: one page holds a scan's column
@@ -43,7 +43,9 @@ _PAGE = 8 << 20  # bytes: one page holds a scan's column
 class ParquetSink(PackedSink):
     """Writes a folder of packed Parquet tables, which gets its name when the sink is closed, and not before."""
 
-    def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
+    ) -> None:
         """Start a store, or continue one whose packing was interrupted: its finished sequences are kept.
 
         Raises:
@@ -54,7 +56,7 @@ class ParquetSink(PackedSink):
         import_extra("pyarrow.parquet", "parquet")
         self.path = Path(path)
         self.location = str(path)
-        self.options = options or Options()
+        self.options = options or PackOptions()
         self.overwrite = overwrite
         if self.options.small:
             raise ArgumentError(
@@ -104,7 +106,7 @@ class ParquetWriter(PackedWriter):
     """Writes one sequence of a store of tables."""
 
     def __init__(
-        self, root: Path, path: str, folder: str, number: int, options: Options, finished: dict[str, str]
+        self, root: Path, path: str, folder: str, number: int, options: PackOptions, finished: dict[str, str]
     ) -> None:
         super().__init__(str(root / folder), path)
         self._folder = root / folder
@@ -183,7 +185,7 @@ def _write_table(table: Any, path: Path) -> None:
 class _TableWriter(FieldWriter):
     """Writes one field's file, row group by row group."""
 
-    def __init__(self, path: Path, field: str, number: int, options: Options) -> None:
+    def __init__(self, path: Path, field: str, number: int, options: PackOptions) -> None:
         super().__init__(field)
         self._number = number
         self.kind = table_field(field)

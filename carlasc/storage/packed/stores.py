@@ -23,7 +23,7 @@ STORE = "carlasc.store"
 
 
 @dataclass(frozen=True)
-class Options:
+class PackOptions:
     """How a store is packed.
 
     Attributes:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.folders.trees import Tree
-from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
-from carlasc.storage.packed.arrays.zarr_metadata import encoding_of
+from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
+from carlasc.storage.zarr.zarr_metadata import encoding_of
 
 _CHECKSUM = 4  # bytes
 _RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c

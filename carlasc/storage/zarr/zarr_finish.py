@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, remove_stale, to_json
-from carlasc.storage.packed.arrays.blocks import Table, block_of, parse_table
-from carlasc.storage.packed.arrays.chunks import SHUFFLE, Encoding, in_threads
-from carlasc.storage.packed.arrays.fields import VERSION, FieldLayout
-from carlasc.storage.packed.arrays.reading import FIELD, SEQUENCE, document_node, field_node
-from carlasc.storage.packed.arrays.shards import encode_chunk
-from carlasc.storage.packed.arrays.zarr_begin import read_root, remove_replaced
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, array_metadata, group_metadata
-from carlasc.storage.packed.protocol import STORE, check_names
+from carlasc.storage.packed.array_layout import VERSION, FieldLayout
+from carlasc.storage.packed.array_reading import FIELD, SEQUENCE, document_node, field_node
+from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
+from carlasc.storage.packed.stores import STORE, check_names
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.block_tables import Table, block_of, parse_table
+from carlasc.storage.zarr.root import read_root, remove_replaced
+from carlasc.storage.zarr.shards import encode_chunk
+from carlasc.storage.zarr.zarr_metadata import METADATA, array_metadata, group_metadata
 
 EXPECTED = "expected.json"  # the frames that a run has announced
 _SMALL = Encoding(shuffle=SHUFFLE)

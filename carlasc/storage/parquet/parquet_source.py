@@ -20,9 +20,9 @@ from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.output import TABLES_MARK
-from carlasc.storage.packed.protocol import PackedSequence, PackedSource
-from carlasc.storage.packed.tables.columns import table_field
-from carlasc.storage.packed.tables.footers import check_footer
+from carlasc.storage.packed.stores import PackedSequence, PackedSource
+from carlasc.storage.parquet.footers import check_footer
+from carlasc.storage.parquet.table_columns import table_field
 from carlasc.storage.protocol import Sequence
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence

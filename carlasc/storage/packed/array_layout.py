@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.arrays.columns import FEW, LEAST, Column, Packing, packing_of
-from carlasc.storage.packed.arrays.reading import COLUMN, FIELD, ArrayField, StoredColumn, check_attributes
-from carlasc.storage.packed.arrays.shards import ZarrArray, encode_chunk
-from carlasc.storage.packed.arrays.zarr_metadata import array_metadata
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.array_reading import COLUMN, FIELD, ArrayField, StoredColumn, check_attributes
+from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
+from carlasc.storage.packed.stores import PackOptions
+from carlasc.storage.zarr.shards import ZarrArray, encode_chunk
+from carlasc.storage.zarr.zarr_metadata import array_metadata
 
 VERSION = 2  # of the format in docs/storage.md
 SLOTS = 16  # a frame has room for this many typical frames
@@ -61,7 +61,7 @@ class FieldLayout:
                 where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
             )
         check_attributes(attributes, where)
-        options = Options(small=attributes.get("codec") == _PCODEC)
+        options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
             raise FormatError(where, expected=f"a field of kind {packing.kind}", found=repr(attributes.get("kind")))
@@ -74,7 +74,7 @@ class FieldLayout:
         return cls(packing, attributes, block)
 
     @classmethod
-    def plan(cls, field: str, options: Options, typical: tuple[int, ...]) -> FieldLayout:
+    def plan(cls, field: str, options: PackOptions, typical: tuple[int, ...]) -> FieldLayout:
         """Return the layout of a new field.
 
         Args:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.storage.packed.arrays.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding
+from carlasc.storage.packed.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding
 
 METADATA = "zarr.json"
 _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.arrays.fields import Encoded, FieldLayout, open_field
-from carlasc.storage.packed.arrays.shards import ZarrArray, join_shard, split_shard
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.array_layout import Encoded, FieldLayout, open_field
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.shards import ZarrArray, join_shard, split_shard
+from carlasc.storage.zarr.zarr_metadata import METADATA, group_metadata
 
 BLOCKS = "blocks"  # folder of the tables
 _ASKED_ONE_BY_ONE = 4  # blocks; a caller that asks for more is going to ask for all
@@ -35,7 +35,7 @@ class StoredField:
         field: its name.
     """
 
-    def __init__(self, target: Target, node: str, field: str, options: Options) -> None:
+    def __init__(self, target: Target, node: str, field: str, options: PackOptions) -> None:
         self.target = target
         self.node = node
         self.field = field

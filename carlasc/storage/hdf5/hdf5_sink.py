@@ -15,13 +15,13 @@ from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.durability import sync_tree
 from carlasc.storage.folders.trees import LocalTree
-from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c, in_threads
-from carlasc.storage.packed.arrays.columns import Column, packing_of
-from carlasc.storage.packed.arrays.hdf5_store import CRC, HDF5Array
-from carlasc.storage.packed.arrays.reading import COLUMN, DOCUMENT, FIELD, SEQUENCE, document_node, field_node
+from carlasc.storage.hdf5.hdf5_source import CRC, HDF5Array
+from carlasc.storage.packed.array_reading import COLUMN, DOCUMENT, FIELD, SEQUENCE, document_node, field_node
+from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c, in_threads
+from carlasc.storage.packed.columns import Column, packing_of
 from carlasc.storage.packed.numbers import common_type
 from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
-from carlasc.storage.packed.protocol import STORE, VERSION, FieldWriter, Options, PackedSink, PackedWriter, node_of
+from carlasc.storage.packed.stores import STORE, VERSION, FieldWriter, PackedSink, PackedWriter, PackOptions, node_of
 
 _HEADROOM = 1.125  # a chunk is this much larger than the first frame, so that later frames seldom need a second chunk
 _AHEAD = 16  # chunks that are encoded in parallel
@@ -30,7 +30,9 @@ _AHEAD = 16  # chunks that are encoded in parallel
 class HDF5Sink(PackedSink):
     """Writes a packed HDF5 file, which gets its name when the sink is finished, and not before."""
 
-    def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
+    ) -> None:
         """Start a file; what an interrupted run left is removed.
 
         Raises:
@@ -38,7 +40,7 @@ class HDF5Sink(PackedSink):
             ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
         """
-        options = options or Options()
+        options = options or PackOptions()
         if options.small:
             raise ArgumentError(
                 "small",
@@ -77,7 +79,7 @@ class HDF5Sink(PackedSink):
 class HDF5Writer(PackedWriter):
     """Writes one sequence of a packed HDF5 file."""
 
-    def __init__(self, store: _File, path: str, group: str, options: Options, finished: dict[str, str]) -> None:
+    def __init__(self, store: _File, path: str, group: str, options: PackOptions, finished: dict[str, str]) -> None:
         super().__init__(f"{store.location}/{group}", path)
         self._store = store
         self._group = group
@@ -120,7 +122,7 @@ class HDF5Writer(PackedWriter):
 class _FieldWriter(FieldWriter):
     """Writes the columns of a field."""
 
-    def __init__(self, store: _File, node: str, field: str, options: Options) -> None:
+    def __init__(self, store: _File, node: str, field: str, options: PackOptions) -> None:
         super().__init__(field)
         self.store = store
         self.node = node
