@@ -234,6 +234,7 @@ def _append_sequence(
     if writer is not None:
         for name, data in documents.items():
             writer.write_document(name, data)
+        writer.expect({name: sequence.frames(name).tolist() for name in sequence.fields()}, typical_rows(sequence))
     for name in sorted(sequence.fields()):
         entry, frames = layout.field_named(name), sequence.frames(name).tolist()
         for frame, array in _read_ahead(sequence, name, frames, threads):

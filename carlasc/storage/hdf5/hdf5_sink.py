@@ -4,26 +4,40 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import ArgumentError, FormatError, import_extra
+from carlasc.errors import ArgumentError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.durability import sync_tree
-from carlasc.storage.folders.trees import LocalTree
-from carlasc.storage.hdf5.hdf5_source import CRC, HDF5Array
-from carlasc.storage.packed.array_reading import COLUMN, DOCUMENT, FIELD, SEQUENCE, document_node, field_node
-from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c, in_threads
-from carlasc.storage.packed.columns import Column, packing_of
-from carlasc.storage.packed.numbers import common_type
+from carlasc.storage.hdf5.hdf5_source import CRC
+from carlasc.storage.packed.array_layout import (
+    DOCUMENT,
+    SEQUENCE,
+    FieldLayout,
+    FrameTable,
+    count_elements,
+    document_node,
+    field_node,
+    number_arrays,
+    typical_size,
+)
+from carlasc.storage.packed.chunks import Encoding, crc32c, in_threads
 from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
-from carlasc.storage.packed.stores import STORE, VERSION, FieldWriter, PackedSink, PackedWriter, PackOptions, node_of
+from carlasc.storage.packed.stores import (
+    STORE,
+    VERSION,
+    FieldWriter,
+    PackedSink,
+    PackedWriter,
+    PackOptions,
+    node_of,
+)
 
-_HEADROOM = 1.125  # a chunk is this much larger than the first frame, so that later frames seldom need a second chunk
 _AHEAD = 16  # chunks that are encoded in parallel
 
 
@@ -53,7 +67,7 @@ class HDF5Sink(PackedSink):
         self.options = options
         self.overwrite = overwrite
         refuse_existing(self.path, overwrite)
-        self._file = _File(unfinished(self.path), self.path)
+        self._file = HDF5Output(unfinished(self.path), self.path)
         self._sequences: dict[str, str] = {}
 
     def finished(self, path: str) -> bool:
@@ -79,164 +93,136 @@ class HDF5Sink(PackedSink):
 class HDF5Writer(PackedWriter):
     """Writes one sequence of a packed HDF5 file."""
 
-    def __init__(self, store: _File, path: str, group: str, options: PackOptions, finished: dict[str, str]) -> None:
-        super().__init__(f"{store.location}/{group}", path)
-        self._store = store
+    def __init__(
+        self, output: HDF5Output, path: str, group: str, options: PackOptions, finished: dict[str, str]
+    ) -> None:
+        super().__init__(f"{output.location}/{group}", path)
+        self._output = output
         self._group = group
         self._options = options
         self._finished = finished
+        self._rows: dict[str, int] = {}
+        self._fields: dict[str, HDF5FieldWriter] = {}
+
+    def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
+        """Note how large a typical frame is: chunks are made for it."""
+        self._rows.update(rows or {})
 
     def _start_field(self, field: str) -> FieldWriter:
-        return _FieldWriter(self._store, f"{self._group}/{field_node(field)}", field, self._options)
+        entry = layout.field_named(field)
+
+        def plan(arrays: list[NDArray[Any]]) -> FieldLayout:
+            return FieldLayout.plan(field, self._options, typical_size(entry, arrays, self._rows, self.read_document))
+
+        self._fields[field] = HDF5FieldWriter(self._output, f"{self._group}/{field_node(field)}", field, plan)
+        return self._fields[field]
 
     def close(self) -> None:
         """Write what is held back and mark the sequence as whole."""
-        for writer in self.writers.values():
-            writer.close()
+        for field in self._fields.values():
+            field.close()
         for name, data in self.contents.items():
             attributes = {"type": DOCUMENT, "version": VERSION, "dtype": "uint8", "unit": "bytes", "name": name}
-            self._store.write_small(f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes)
-        self._write_numbers()
-        attributes = {"type": SEQUENCE, "version": VERSION, **self.about(), "complete": True}
-        self._store.write_group(self._group, attributes)
+            self._output.write_small(f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes)
+        layouts = {name: field.layout for name, field in self._fields.items()}
+        frames, counts, columns = count_elements(layouts, {name: one.table for name, one in self._fields.items()})
+        about = {"version": VERSION, "dtype": "int64"}
+        self._output.write_small(f"{self._group}/frames", frames, about | {"type": "carlasc.frames", "unit": "frame"})
+        about |= {"type": "carlasc.counts", "unit": "element", "columns": columns}
+        self._output.write_small(f"{self._group}/counts", counts, about)
+        for name, numbers, attributes in number_arrays(self.read_document):
+            self._output.write_small(f"{self._group}/{name}", numbers, attributes)
+        self._output.write_group(self._group, {"type": SEQUENCE, "version": VERSION, **self.about()})
         self._finished[self.path] = self._group
 
-    def _write_numbers(self) -> None:
-        """Write poses and times as arrays too, for programs that do not read the text files."""
-        for name, document, unit in (("poses", layout.POSES, "m"), ("times", layout.TIMES, "s")):
-            if document not in self.contents:
-                continue
-            with suppress(FormatError):  # not numbers: the text is kept as it is, and its reader reports the error
-                decode = layout.decode_poses if name == "poses" else layout.decode_times
-                numbers = decode(self.contents[document], document)
-                attributes = {
-                    "type": "carlasc.numbers",
-                    "version": VERSION,
-                    "dtype": "float64",
-                    "unit": unit,
-                    "document": document,
-                }
-                self._store.write_small(f"{self._group}/{name}", numbers, attributes)
 
+class HDF5FieldWriter(FieldWriter):
+    """Writes the columns of a field.
 
-class _FieldWriter(FieldWriter):
-    """Writes the columns of a field."""
+    Attributes:
+        table: the frames written so far.
+        layout: where its frames are; known from the first frame on that is not empty.
+    """
 
-    def __init__(self, store: _File, node: str, field: str, options: PackOptions) -> None:
+    layout: FieldLayout
+
+    def __init__(
+        self, output: HDF5Output, node: str, field: str, plan: Callable[[list[NDArray[Any]]], FieldLayout]
+    ) -> None:
         super().__init__(field)
-        self.store = store
-        self.node = node
-        self.packing = packing_of(self.entry, options)
-        is_grid = self.packing.kind == "grid"
-        self.columns = {c.name: _ColumnWriter(store, f"{node}/{c.name}", c, is_grid) for c in self.packing.columns}
+        self.table: FrameTable = {}
+        self._output = output
+        self._node = node
+        self._plan = plan
+        self._planned = False
+        self._columns: dict[str, HDF5ColumnWriter] = {}
 
     def write(self, frame: int, array: NDArray[Any]) -> None:
-        """Append one frame to the columns."""
-        parts = self.packing.split(array)
-        for name, column in self.columns.items():
-            column.append(parts.get(name))
+        """Divide one frame into chunks, which are written with those of other frames."""
+        if not self._planned and array.size:
+            self.layout, self._planned = self._plan([array]), True
+        counts, parts = self.layout.divide(array, limited=False) if self._planned else ({}, {})
+        for name, chunks in parts.items():
+            if name not in self._columns:
+                self._columns[name] = HDF5ColumnWriter(self._output, f"{self._node}/{name}", self.layout, name)
+            self._columns[name].append(frame, chunks)
+        self.table[frame] = counts
 
     def close(self) -> None:
-        entry = self.packing.entry
-        common = {
-            "version": VERSION,
-            "dtype": np.dtype(entry.dtype).name if entry.dtype else "table",
-            "unit": entry.unit,
-        }
-        self.store.write_group(
-            self.node,
-            {"type": FIELD, "field": entry.name, "kind": self.packing.kind, **common, **self.packing.attributes},
+        """Write what is held back, and the group of the field."""
+        if not self._planned:
+            self.layout = self._plan([])
+        for column in self._columns.values():
+            column.close(max(self.table) + 1)
+        self._output.write_group(self._node, dict(self.layout.attributes))
+
+
+class HDF5ColumnWriter:
+    """Writes the chunks of a column, which are encoded several at a time."""
+
+    def __init__(self, output: HDF5Output, node: str, field_layout: FieldLayout, name: str) -> None:
+        column = field_layout.columns[name]
+        self._output = output
+        self._node = node
+        self._encoding = column.encoding
+        self._held: list[tuple[int, int, NDArray[Any]]] = []  # frame, number in the frame, chunk
+        self._checksums: list[int] = []
+        shape, chunk = field_layout.frame_shape(column), field_layout.chunk_shape(column)
+        most = shape if field_layout.is_grid else (*shape[:-1], None)  # of a frame: more than it has room for is rare
+        self._dataset = output.create(
+            node, np.dtype(column.dtype), shape, most, chunk, column.encoding, field_layout.column_attributes(column)
         )
-        attributes = {"type": "carlasc.frames", "version": VERSION, "dtype": "int64", "unit": "frame"}
-        self.store.write_small(f"{self.node}/frames", np.fromiter(self.frames, np.int64), attributes)
-        for column in self.columns.values():
-            column.close()
 
+    def append(self, frame: int, chunks: list[NDArray[Any]]) -> None:
+        """Add a frame's chunks."""
+        self._held += [(frame, number, chunk) for number, chunk in enumerate(chunks)]
+        if len(self._held) >= _AHEAD:
+            self._flush()
 
-class _ColumnWriter:
-    """One array of a field, in chunks that start where a frame starts."""
+    def close(self, frames: int) -> None:
+        """Write what is held back, and the checksums of all chunks; the data set gets room for so many frames."""
+        self._flush()
+        self._dataset.resize(frames, axis=0)
+        about = {"type": "carlasc.checksums", "version": VERSION, "dtype": "uint32"}
+        about["unit"] = "crc32c of a chunk's stored bytes"
+        self._output.write_small(self._node + CRC, np.array(self._checksums, np.uint32), about)
 
-    def __init__(self, store: _File, node: str, column: Column, is_grid: bool) -> None:
-        self.store = store
-        self.node = node
-        self.place = node  # the array's node until it is closed
-        self.column = column
-        self.is_grid = is_grid
-        self.dtype = np.dtype(column.dtype)
-        self.step = column.step or 0  # elements per chunk; 0 until the first frame with any elements
-        self.chunks = 0
-        self.spans: list[tuple[int, int]] = []
-        self._writer: _ChunkWriter | None = None
-        self._shape: tuple[int, ...] | None = None  # of a grid
-
-    def append(self, values: NDArray[Any] | None) -> None:
-        """Add a frame's values; None if it does not need this column."""
-        if values is None or (values.size == 0 and not self.is_grid):
-            self.spans.append((0, 0))
+    def _flush(self) -> None:
+        if not self._held:
             return
-        self._fit_type(values.dtype)
-        if self.is_grid:
-            if self._shape not in (None, values.shape):
-                raise FormatError(
-                    "its array", expected=f"shape {self._shape}, as in earlier frames", found=str(values.shape)
-                )
-            self._shape = values.shape
-            self._put(values[None].astype(self.dtype, copy=False))
-            return
-        count = values.shape[-1]
-        self.step = self.step or _round_up(max(int(count * _HEADROOM), self.column.least))
-        start = self.chunks * self.step
-        for first in range(0, count, self.step):
-            part = values[..., first : first + self.step]
-            chunk = np.zeros((*values.shape[:-1], self.step), self.dtype)
-            chunk[..., : part.shape[-1]] = part
-            self._put(chunk)
-        self.spans.append((start, start + count))
-
-    def close(self) -> None:
-        if self._writer is None:
-            return  # no frame needed it
-        self._writer.close()
-        if self.place != self.node:
-            self.store.move(self.place, self.node)
-        if not self.is_grid:
-            attributes = {"type": "carlasc.offsets", "version": VERSION, "dtype": "int64", "unit": "element"}
-            self.store.write_small(f"{self.node}_offsets", np.array(self.spans, np.int64).reshape(-1, 2), attributes)
-
-    def _put(self, chunk: NDArray[Any]) -> None:
-        if self._writer is None:
-            self._writer = self._create(chunk.shape)
-        self._writer.append(chunk)
-        self.chunks += 1
-
-    def _create(self, chunk: tuple[int, ...]) -> _ChunkWriter:
-        attributes = {"type": COLUMN, "version": VERSION, "dtype": self.dtype.name, "unit": self.column.unit}
-        axis = 0 if self.is_grid else len(chunk) - 1
-        return self.store.create(self.place, self.dtype, chunk, axis, self.column.encoding, attributes)
-
-    def _fit_type(self, dtype: np.dtype[Any]) -> None:
-        """Widen the array if its type does not hold a frame's values: it is written again, chunk by chunk."""
-        wider = common_type(self.dtype, dtype)
-        if wider == self.dtype:
-            return
-        self.dtype = wider
-        if self._writer is None:
-            return
-        self._writer.close()
-        narrow, place = self.store.array(self.place), self.place
-        self.place = f"{self.node}.{wider.name}"
-        self._writer = self._create(narrow.chunk)
-        for number in range(self.chunks):
-            self._writer.append(narrow.read_chunk(number).astype(wider))
-        self.store.remove(place)
+        encoded = in_threads(lambda one: self._encoding.encode(one[2], "hdf5"), self._held)
+        step, shape = self._dataset.chunks[-1], self._dataset.shape
+        needed = (max(number for _, number, _ in self._held) + 1) * step
+        self._dataset.resize((self._held[-1][0] + 1, *shape[1:-1], max(shape[-1], needed)))
+        for (frame, number, _), data in zip(self._held, encoded, strict=True):
+            offset = (frame, *[0] * (len(shape) - 2), number * step)
+            self._dataset.id.write_direct_chunk(offset, data)
+            self._checksums.append(crc32c(data, "hdf5"))
+        self._held = []
+        self._output.check()
 
 
-def _round_up(count: int) -> int:
-    """Round the elements of a chunk up to a multiple of 256."""
-    return -(-count // 256) * 256
-
-
-class _File:
+class HDF5Output:
     """Writes an HDF5 file with h5py; chunks are encoded here, in parallel, as the Blosc filter would encode them."""
 
     def __init__(self, path: Path, place: Path) -> None:
@@ -273,33 +259,28 @@ class _File:
         self,
         node: str,
         dtype: np.dtype[Any],
+        shape: tuple[int, ...],
+        most: tuple[int | None, ...],
         chunk: tuple[int, ...],
-        axis: int,
         encoding: Encoding,
         attributes: dict[str, Any],
-    ) -> _ChunkWriter:
-        """Create a data set that grows along an axis."""
-        empty = tuple(0 if a == axis else n for a, n in enumerate(chunk))
-        most = tuple(None if a == axis else n for a, n in enumerate(chunk))
+    ) -> Any:
+        """Create a data set of no frames yet.
+
+        Args:
+            node: the data set.
+            dtype: type of its elements.
+            shape: shape of a frame.
+            most: the shape that a frame may grow to.
+            chunk: shape of a chunk.
+            encoding: how chunks become bytes.
+            attributes: those of the data set.
+        """
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
-        dataset = self._file.create_dataset(node, empty, dtype, chunks=chunk, maxshape=most, **blosc)
+        dataset = self._file.create_dataset(node, (0, *shape), dtype, chunks=chunk, maxshape=(None, *most), **blosc)
         _write_attributes(dataset, attributes)
         self.check()
-        return _ChunkWriter(self, node, dataset, axis, encoding)
-
-    def array(self, node: str) -> StoredArray:
-        """Return a closed data set."""
-        self._file.flush()
-        self.check()
-        return HDF5Array.from_dataset(
-            LocalTree(self.path.parent), self.path.name, self._file[node], self._file[node + CRC][...]
-        )
-
-    def move(self, node: str, target: str) -> None:
-        """Rename a data set and its checksums."""
-        self.remove(target)
-        for ending in ("", CRC):
-            self._file.move(node + ending, target + ending)
+        return dataset
 
     def remove(self, node: str) -> None:
         """Remove a node; the file uses its space again."""
@@ -313,46 +294,6 @@ class _File:
         self._file.close()
         self._output.close()
         self.check()
-
-
-class _ChunkWriter:
-    """A data set that grows by chunks."""
-
-    def __init__(self, store: _File, node: str, dataset: Any, axis: int, encoding: Encoding) -> None:
-        self.store = store
-        self.node = node
-        self.dataset = dataset
-        self.axis = axis
-        self.encoding = encoding
-        self.checksums: list[int] = []
-        self.held: list[NDArray[Any]] = []
-
-    def append(self, chunk: NDArray[Any]) -> None:
-        self.held.append(chunk)
-        if len(self.held) == _AHEAD:
-            self._flush()
-
-    def close(self) -> None:
-        self._flush()
-        attributes = {
-            "type": "carlasc.checksums",
-            "version": VERSION,
-            "dtype": "uint32",
-            "unit": "crc32c of a chunk's stored bytes",
-        }
-        self.store.write_small(self.node + CRC, np.array(self.checksums, np.uint32), attributes)
-
-    def _flush(self) -> None:
-        encoded = in_threads(lambda chunk: self.encoding.encode(chunk, "hdf5"), self.held)
-        step, shape = self.dataset.chunks[self.axis], list(self.dataset.shape)
-        for data in encoded:
-            start = len(self.checksums) * step
-            shape[self.axis] = start + step
-            self.dataset.resize(shape)
-            self.dataset.id.write_direct_chunk(tuple(start if a == self.axis else 0 for a in range(len(shape))), data)
-            self.checksums.append(crc32c(data, "hdf5"))
-        self.held = []
-        self.store.check()
 
 
 def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:

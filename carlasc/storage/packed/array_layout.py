@@ -1,37 +1,35 @@
-"""Where the frames of a field are in a zarr store of version 2, and how they are encoded and read. See `docs/storage.md#zarr`.
+"""Where the frames of a field are in a store of arrays, zarr or HDF5. See `docs/storage.md#arrays`.
 
-A frame has a place that depends on its number alone, so that any process can write any block of frames.
+A frame has a place that depends on its number alone: frame i of a column is entry i of its array. So any block of frames can be
+written without knowing the others, and found without a table of places.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.array_reading import COLUMN, FIELD, ArrayField, StoredColumn, check_attributes
+from carlasc.storage.files import parse_json
+from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
-from carlasc.storage.packed.stores import PackOptions
-from carlasc.storage.zarr.shards import ZarrArray, encode_chunk
-from carlasc.storage.zarr.zarr_metadata import array_metadata
+from carlasc.storage.packed.stores import VERSION, PackOptions
 
-VERSION = 2  # of the format in docs/storage.md
-SLOTS = 16  # a frame has room for this many typical frames
+SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlasc.column", "carlasc.document"
+_SLOTS = 16  # a frame has room for this many typical frames
 _PCODEC = "pcodec"  # value of the attribute `codec` of points that are packed smaller
 _HEADROOM = 1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
-
-
-@dataclass(frozen=True)
-class Encoded:
-    """A frame of a field as it is stored: its chunks in each column that it needs, and their number of elements."""
-
-    counts: dict[str, int]
-    chunks: dict[str, list[bytes]]
+_CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
+_PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
+FrameTable = dict[int, dict[str, int]]
+"""Frames of a field: the number of elements of each in each column that it needs."""
 
 
 class FieldLayout:
@@ -39,19 +37,25 @@ class FieldLayout:
 
     Attributes:
         packing: how an array becomes columns.
+        attributes: those of the field's group in the store.
         columns: the columns by name, with the wide ones.
+        is_grid: whether the field has one value per voxel.
     """
 
-    def __init__(self, packing: Packing, attributes: Mapping[str, Any], block: int) -> None:
+    def __init__(self, packing: Packing, attributes: Mapping[str, Any]) -> None:
         self.packing = packing
         self.attributes = attributes
-        self.block = block
-        self.columns = {column.name: column for family in packing.columns for column in family.fixed}
+        self.columns = {column.name: column for family in packing.columns for column in family.both}
         self.is_grid = packing.kind == "grid"
 
     @classmethod
-    def read(cls, where: str, field: str, attributes: Mapping[str, Any] | None, block: int) -> FieldLayout:
+    def read(cls, where: str, field: str, attributes: Mapping[str, Any] | None) -> FieldLayout:
         """Return the layout of a field that exists.
+
+        Args:
+            where: the field's group, for errors.
+            field: its name.
+            attributes: those of the group; None if there is no such group.
 
         Raises:
             FormatError: the attributes are not those of this field.
@@ -60,7 +64,12 @@ class FieldLayout:
             raise FormatError(
                 where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
             )
-        check_attributes(attributes, where)
+        scale = attributes.get("scale_m")
+        if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
+            raise FormatError(
+                where, expected="a step of coordinates above 0, up to 1 m", found=repr(scale),
+                advice="the store is damaged",
+            )  # fmt: skip
         options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
@@ -71,7 +80,7 @@ class FieldLayout:
             len(numbers) != 3 if packing.kind == "grid" else isinstance(size, list)
         ):
             raise FormatError(where, expected="the size of its chunks", found=repr(size), advice="the store is damaged")
-        return cls(packing, attributes, block)
+        return cls(packing, attributes)
 
     @classmethod
     def plan(cls, field: str, options: PackOptions, typical: tuple[int, ...]) -> FieldLayout:
@@ -91,44 +100,49 @@ class FieldLayout:
         about = {"type": FIELD, "version": VERSION, "field": entry.name, "kind": packing.kind}
         about |= {"dtype": np.dtype(entry.dtype).name if entry.dtype else "table", "unit": entry.unit}
         codec = {"codec": _PCODEC} if any(column.encoding.codec == _PCODEC for column in packing.columns) else {}
-        return cls(packing, about | size | codec | dict(packing.attributes), options.block)
+        return cls(packing, about | size | codec | dict(packing.attributes))
 
-    def step(self, column: Column) -> int:
-        """Return the number of elements of a chunk."""
+    def frame_shape(self, column: Column) -> tuple[int, ...]:
+        """Return the shape of one entry of a column's array: (X, Y, Z) of a grid, else ([rows,] elements that a frame has room for)."""
+        if self.is_grid:
+            return tuple(self.attributes["shape"])
+        typical, step = self._typical(column), self._step(column)
+        return (*((column.rows,) if column.rows else ()), -(-_SLOTS * typical // step) * step)
+
+    def chunk_shape(self, column: Column) -> tuple[int, ...]:
+        """Return the shape of a chunk of a column's array, which is of one frame."""
+        shape = self.frame_shape(column)
+        return (1, *shape) if self.is_grid else (1, *shape[:-1], self._step(column))
+
+    def column_attributes(self, column: Column) -> dict[str, Any]:
+        """Return the attributes of a column's array."""
+        return {"type": COLUMN, "version": VERSION, "dtype": np.dtype(column.dtype).name, "unit": column.unit}
+
+    def _step(self, column: Column) -> int:
         return column.step or self._typical(column)
-
-    def slots(self, column: Column) -> int:
-        """Return the number of chunks that a frame has room for."""
-        return 1 if self.is_grid else -(-SLOTS * self._typical(column) // self.step(column))
 
     def _typical(self, column: Column) -> int:
         return FEW if column.least == FEW else int(self.attributes["chunk"])
 
-    def metadata(self, column: Column, frames: int) -> dict[str, Any]:
-        """Return the metadata of a column's array with room for some frames, a multiple of the block."""
-        dtype = np.dtype(column.dtype)
-        about = {"type": COLUMN, "version": VERSION, "dtype": dtype.name, "unit": column.unit}
-        if self.is_grid:
-            cells = tuple(self.attributes["shape"])
-            shape, shard, chunk = (frames, *cells), (self.block, *cells), (1, *cells)
-        else:
-            step, room = self.step(column), self.slots(column) * self.step(column)
-            rows = (column.rows,) if column.rows else ()
-            shape, shard, chunk = (*rows, frames * room), (*rows, self.block * room), (*rows, step)
-        return array_metadata(dtype, shape, chunk, column.encoding, about, shard)
+    def check(self, array: StoredArray, column: Column, last: int, most: int, where: str) -> None:
+        """Check that a stored array is that of a column, and has room for what the store says of it.
 
-    def check(self, array: ZarrArray, column: Column, last: int, most: int, where: str) -> None:
-        """Check that a stored array is that of a column, and has room for frame number `last` and for frames of `most` elements.
+        Args:
+            array: the stored array.
+            column: the column that it should be.
+            last: largest number of a frame.
+            most: largest number of elements of a frame.
+            where: what to call the array in errors.
 
         Raises:
-            FormatError: it is another one; names the array `where`.
+            FormatError: it is another array, or too small.
         """
-        slots = (array.per_shard or 0) // self.block
         rest = tuple(self.attributes["shape"]) if self.is_grid else (column.rows,) if column.rows else ()
-        fits = array.dtype == np.dtype(column.dtype) and array.axis == (0 if self.is_grid else len(rest))
-        fits = fits and rest == tuple(n for axis, n in enumerate(array.chunk) if axis != array.axis)
-        fits = fits and slots > 0 and (last + 1) * slots * array.step <= array.shape[array.axis]
-        if not fits or not (self.is_grid or most <= slots * array.step):
+        rest += () if self.is_grid else (array.step,)
+        fits = array.dtype == np.dtype(column.dtype) and array.chunk == (1, *rest)
+        fits = fits and last < array.shape[0] < 2**63 // max(1, array.slots)
+        fits = fits and array.shape[1:] == (rest if self.is_grid else (*rest[:-1], array.shape[-1]))
+        if not fits or not (self.is_grid or most <= array.shape[-1]):
             raise FormatError(
                 where,
                 expected=f"{column.dtype} with room for frame {last}",
@@ -136,11 +150,20 @@ class FieldLayout:
                 advice="the store is damaged",
             )
 
-    def encode(self, array: NDArray[Any]) -> Encoded:
-        """Return a frame as it is stored.
+    def divide(
+        self, array: NDArray[Any], *, limited: bool = True
+    ) -> tuple[dict[str, int], dict[str, list[NDArray[Any]]]]:
+        """Divide a frame into chunks.
+
+        Args:
+            array: the frame's array.
+            limited: whether a frame may not have more elements than the store has room for; if not, its last column grows.
+
+        Returns:
+            The number of elements in each column that the frame needs, and the column's chunks.
 
         Raises:
-            FormatError: it does not fit the field.
+            FormatError: the array does not fit the field.
         """
         self.packing.entry.check(array, "its array")
         if self.is_grid and list(array.shape) != self.attributes["shape"]:
@@ -154,74 +177,122 @@ class FieldLayout:
             values = parts.get(family.name)
             if values is None or not values.size:
                 continue
-            column = self._column_for(family, values)
+            column = self._column_for(family, values, limited)
             counts[column.name] = values.size if self.is_grid else values.shape[-1]
-            chunks[column.name] = self._encode(column, values)
-        return Encoded(counts, chunks)
+            chunks[column.name] = list(self._chunks(column, values))
+        return counts, chunks
 
-    def _column_for(self, family: Column, values: NDArray[Any]) -> Column:
+    def _column_for(self, family: Column, values: NDArray[Any], limited: bool) -> Column:
         """Return the column that takes the values of a frame: the first with a type and a size that hold them."""
-        *narrower, widest = family.fixed
+        *narrower, widest = family.both
         for column in (*(one for one in narrower if np.can_cast(values.dtype, one.dtype)), widest):
-            if self.is_grid or values.shape[-1] <= self.slots(column) * self.step(column):
+            if self.is_grid or values.shape[-1] <= self.frame_shape(column)[-1]:
                 return column
-        most = self.slots(widest) * self.step(widest)
+        if not limited:
+            return widest
         raise FormatError(
             "its array",
-            expected=f"at most {most} elements ({SLOTS} times a typical frame)",
+            expected=f"at most {self.frame_shape(widest)[-1]} elements ({_SLOTS} times a typical frame)",
             found=str(values.shape[-1]),
             advice="leave the frame out, or pack to an .h5 store",
         )
 
-    def _encode(self, column: Column, values: NDArray[Any]) -> list[bytes]:
+    def _chunks(self, column: Column, values: NDArray[Any]) -> Iterator[NDArray[Any]]:
         if self.is_grid:
-            return [encode_chunk(values[None].astype(column.dtype, copy=False), column.encoding)]
-        step, found = self.step(column), []
+            yield values[None].astype(column.dtype, copy=False)
+            return
+        step = self._step(column)
         for first in range(0, values.shape[-1], step):
             part = values[..., first : first + step]
-            chunk = np.zeros((*values.shape[:-1], step), column.dtype)
-            chunk[..., : part.shape[-1]] = part
-            found.append(encode_chunk(chunk, column.encoding))
-        return found
+            chunk = np.zeros((1, *values.shape[:-1], step), column.dtype)
+            chunk[0, ..., : part.shape[-1]] = part
+            yield chunk
 
 
-def open_field(
-    where: str,
-    field_layout: FieldLayout,
-    frames: NDArray[np.int64],
-    counts: Mapping[str, NDArray[np.int64]],
-    array_of: Callable[[str], ZarrArray],
-    *,
-    local: bool,
-) -> ArrayField:
-    """Return a field whose frames can be read.
+def typical_size(
+    entry: layout.Field,
+    arrays: list[NDArray[Any]],
+    rows: Mapping[str, int],
+    read_document: Callable[[str], bytes | None],
+) -> tuple[int, ...]:
+    """Return what decides the chunks of a new field, for `FieldLayout.plan`.
 
     Args:
-        where: its name in errors.
-        field_layout: where its frames are.
-        frames: (n,) numbers of frames, in rising order.
-        counts: (n,) elements of each in each column; -1 in frames that the field does not have.
-        array_of: returns the array of a column.
-        local: whether its bytes are on this machine.
+        entry: the field.
+        arrays: its first frames.
+        rows: the number of elements of a typical frame by field, as a run has announced them.
+        read_document: returns a text file of the sequence, None if there is none.
+
+    Returns:
+        The shape of a grid, or (number of elements of a typical frame,): as announced, else the most of the first frames.
     """
-    exists = np.zeros(len(frames), np.bool_)
-    for column in counts.values():
-        exists |= column >= 0
-    frames = frames[exists]
-    own = {name: column[exists] for name, column in counts.items()}
+    if entry.per == "voxel":
+        return arrays[0].shape
+    announced = rows.get("points") if entry.per == "point" else None
+    announced = rows.get(entry.name) if announced is None else announced
+    if announced is None and entry.per == "vote":
+        announced = _cells(entry.folder, read_document) // _CELLS_PER_VOTE
+    if announced is None:
+        announced = max(map(len, arrays), default=0)
+        announced = 1 << (max(announced, _PICTURE) - 1).bit_length() if entry.kind == "picture" else announced
+    return (announced,)
 
-    def open_columns() -> dict[str, StoredColumn]:
-        found = {}
-        for name, numbers in own.items():
-            if not (numbers > 0).any():
-                continue  # no frame needed it
-            column, array = field_layout.columns[name], array_of(name)
-            field_layout.check(array, column, int(frames[-1]), int(numbers.max()), f"{where}/{name}")
-            slots = (array.per_shard or 0) // field_layout.block
-            found[name] = StoredColumn(column, array, frames * slots, np.maximum(numbers, 0), field_layout.is_grid)
-        return found
 
-    return ArrayField(where, field_layout.packing, frames, open_columns, local)
+def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
+    """Return the number of voxels of a grid, 0 if nothing says it."""
+    data = read_document(layout.params_file(grid))
+    try:
+        return 0 if data is None else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
+    except FormatError:
+        return 0
+
+
+def count_elements(
+    layouts: Mapping[str, FieldLayout], tables: Mapping[str, FrameTable]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
+    """Return the arrays `frames` and `counts` of a sequence, by which it is read.
+
+    Args:
+        layouts: the layout of each field.
+        tables: the frames of each field, which has at least one.
+
+    Returns:
+        The (N,) numbers of all frames in rising order; the (N, C) numbers of elements of each in each column, -1 where a field lacks the
+        frame; and the nodes of the columns.
+    """
+    frames = sorted({frame for table in tables.values() for frame in table})
+    columns: dict[str, list[int]] = {}
+    for name in sorted(tables):
+        table, firsts = tables[name], {family.name for family in layouts[name].packing.columns}
+        for column in layouts[name].columns:
+            counts = [table[frame].get(column, 0) if frame in table else -1 for frame in frames]
+            if max(counts) > 0 or column in firsts:
+                columns[f"{field_node(name)}/{column}"] = counts
+    counts_of = np.array(list(columns.values()), "<i8").reshape(len(columns), len(frames)).T
+    return np.array(frames, "<i8"), np.ascontiguousarray(counts_of), list(columns)
+
+
+def number_arrays(read_document: Callable[[str], bytes | None]) -> Iterator[tuple[str, NDArray[Any], dict[str, Any]]]:
+    """Yield poses and times as arrays too, for programs that do not read the text files: the name, the numbers and the attributes."""
+    for name, document, decode, unit in (
+        ("poses", layout.POSES, layout.decode_poses, "m"),
+        ("times", layout.TIMES, layout.decode_times, "s"),
+    ):
+        data = read_document(document)
+        with suppress(FormatError):  # not numbers: the text is kept as it is, and its reader reports the error
+            if data is not None:
+                about = {"type": "carlasc.numbers", "version": VERSION, "dtype": "float64", "unit": unit}
+                yield name, decode(data, document), about | {"document": document}
+
+
+def field_node(field: str) -> str:
+    """Return the node of a field in its sequence's group."""
+    return f"grids/{field}" if "/" in field else f"scans/{field}"
+
+
+def document_node(name: str) -> str:
+    """Return the node of a text file in its sequence's group."""
+    return f"documents/{name}"
 
 
 def _round_up(count: int) -> int:

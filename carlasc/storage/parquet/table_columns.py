@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.numbers import narrow, quantise
+from carlasc.storage.packed.columns import narrow, quantise
 
 Attributes = Mapping[str, Any]
 Columns = dict[str, NDArray[Any]]

@@ -7,17 +7,16 @@ from typing import Any
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
 from carlasc.storage.durability import rename
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.array_layout import VERSION
 from carlasc.storage.packed.output import remove, replaced
-from carlasc.storage.packed.stores import STORE, PackOptions
+from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.targets import LocalTarget, Target
-from carlasc.storage.zarr.zarr_metadata import METADATA, group_metadata
+from carlasc.storage.zarr.shards import METADATA, group_metadata
 
 _TRIES = 5  # other processes may begin, finish and replace the same store meanwhile
 _OPTIONS = ("block", "lossy_mm", "small")
 
 
-class Root:
+class StoreRoot:
     """The root of a store that is written to, shared by its writers. A new one is created with the first thing that is written.
 
     Attributes:

@@ -6,11 +6,9 @@ Any zarr v3 library reads them. Here, the shards' indices and chunks are read di
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,60 +16,23 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage.files import parse_json
 from carlasc.storage.folders.trees import RemoteTree, Tree
-from carlasc.storage.packed.array_layout import FieldLayout, open_field
-from carlasc.storage.packed.array_reading import (
-    ArrayField,
-    ArraySequence,
-    ArraySource,
-    ArrayStore,
-    check_frames,
-    document_node,
-    field_node,
-)
-from carlasc.storage.packed.version1 import OffsetsSequence
-from carlasc.storage.zarr.shards import ZarrArray
-from carlasc.storage.zarr.zarr_metadata import METADATA
-
-_T = TypeVar("_T")
+from carlasc.storage.packed.array_source import ArraySource, ArrayStore
+from carlasc.storage.zarr.shards import METADATA, ZarrArray
 
 
 class ZarrSource(ArraySource):
     """A packed zarr store: a folder, a URL, or a zip of either."""
-
-    newest = 2
 
     def __init__(self, tree: Tree) -> None:
         """Read the store's metadata.
 
         Raises:
             DependencyError: zarr's codecs are not installed.
-            FormatError: it is another zarr store, unfinished, or of a newer version.
+            FormatError: it is another zarr store, unfinished, or of another version.
         """
         for module in ("numcodecs", "google_crc32c"):
             import_extra(module, "zarr")
         super().__init__(ZarrStore(tree))
-        self.block = (self.store.attributes("") or {}).get("block", 1)
-        if type(self.block) is not int or not 0 < self.block < 2**31:
-            raise FormatError(
-                tree.location,
-                expected="a number of frames in block",
-                found=repr(self.block),
-                advice="the store is damaged",
-            )
-
-    def published_bytes(self) -> dict[str, int]:
-        """Return the bytes that the published files of each field have, from the numbers of elements of the frames."""
-        sizes: Counter[str] = Counter()
-        for sequence in self.sequences().values():
-            if isinstance(sequence, ZarrSequence):
-                sizes["documents"] += sum(len(sequence.read_document(name)) for name in sequence.documents())
-                for field in sorted(sequence.fields()):
-                    sizes[field] += sequence.published_bytes(field)
-        return dict(sizes)
-
-    def _sequence(self, path: str, group: str) -> ArraySequence:
-        kind = OffsetsSequence if self.version == 1 else ZarrSequence
-        return kind(self.store, path, group)
 
 
 class ZarrStore(ArrayStore):
@@ -90,9 +51,10 @@ class ZarrStore(ArrayStore):
     def _sizes(self) -> dict[str, int]:
         return self.tree.sizes() if isinstance(self.tree, RemoteTree) else {}
 
-    def forget(self) -> None:
+    def forget(self) -> bool:
         """Forget the metadata: they are read again."""
         vars(self).pop("_root", None)
+        return True
 
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""
@@ -111,6 +73,15 @@ class ZarrStore(ArrayStore):
             return array.read_chunk(0)[tuple(slice(n) for n in array.shape)]
         except FormatError as error:
             raise error.within(f"{self.location}/{node}") from error
+
+    def read_document(self, node: str) -> bytes:
+        """Return the bytes of a text file, which is a file of the store."""
+        try:
+            return bytes(self.tree.read(node))
+        except MissingDataError as error:
+            raise FormatError(
+                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+            ) from error
 
     def array(self, node: str) -> ZarrArray:
         """Return an array whose chunks can be read."""
@@ -153,90 +124,3 @@ def _mapping(value: Any, where: str, name: str) -> dict[str, Any]:
             where, expected=f"an object in {name}", found=type(value).__name__, advice="the store is damaged"
         )
     return value
-
-
-class ZarrSequence(ArraySequence):
-    """One sequence of a zarr store of version 2: one table says how many elements each frame has in each column."""
-
-    store: ZarrStore
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame."""
-        return self._read_again(lambda: super(ZarrSequence, self).read(field, frame))
-
-    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read several frames: fetched together, decoded in parallel."""
-        numbers = list(frames)
-        return self._read_again(lambda: super(ZarrSequence, self).read_many(field, numbers))
-
-    def read_xyz(
-        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
-    ) -> list[NDArray[np.float32]]:
-        """Read points as they are stored, as planes: the 4th column is not read, and no rows are put together."""
-        numbers = list(frames)
-        return self._read_again(lambda: super(ZarrSequence, self).read_xyz(numbers, spare))
-
-    def _read_again(self, read: Callable[[], _T]) -> _T:
-        """Read once more, with what the store says now, where something does not fit: a store can grow while it is read."""
-        try:
-            return read()
-        except FormatError:
-            self.store.forget()
-            self._readers = {}
-            vars(self).pop("_counts", None)
-            return read()
-
-    @cached_property
-    def _counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
-        """The frames of the sequence, and the number of elements of each in each column; -1 where the field lacks the frame."""
-        try:
-            return self._read_counts()
-        except FormatError:  # what was added to the store since its metadata were read may have replaced them
-            self.store.forget()
-            return self._read_counts()
-
-    def _read_counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
-        where = f"{self.location}/counts"
-        frames = check_frames(self.store.read_small(f"{self.group}/frames").astype(np.int64), where)
-        counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
-        columns = (self.store.attributes(f"{self.group}/counts") or {}).get("columns")
-        columns = columns if isinstance(columns, list) else []
-        if counts.shape != (len(frames), len(columns)) or not all(isinstance(name, str) for name in columns):
-            raise FormatError(
-                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, of rising frames", found="others",
-                advice="the store is damaged",
-            )  # fmt: skip
-        return frames, {column: counts[:, number] for number, column in enumerate(columns)}
-
-    def read_document(self, name: str) -> bytes:
-        """Return a text file's bytes."""
-        self._check_document(name)
-        path = f"{self.group}/{document_node(name)}"
-        try:
-            return bytes(self.store.tree.read(path))
-        except MissingDataError as error:
-            raise FormatError(
-                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
-            ) from error
-
-    def published_bytes(self, field: str) -> int:
-        """Return the bytes of a field's files in the published layout, from the numbers of elements."""
-        return self._field(field).published_bytes()
-
-    def _open_field(self, field: str) -> ArrayField:
-        node = f"{self.group}/{field_node(field)}"
-        where = f"{self.store.location}/{node}"
-        block = (self.store.attributes("") or {}).get("block", 1)
-        found = FieldLayout.read(where, field, self.store.attributes(node), block)
-        if found.is_grid:
-            self._check_grid(field, tuple(found.attributes["shape"]))
-        frames, counts = self._counts
-        own = {name: counts[place] for name in found.columns if (place := f"{field_node(field)}/{name}") in counts}
-        return open_field(
-            where, found, frames, own, lambda name: self.store.array(f"{node}/{name}"), local=self.store.local
-        )
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = super().__getstate__()
-        state.pop("_counts", None)  # a worker reads what it needs
-        return state
