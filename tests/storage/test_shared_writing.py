@@ -282,7 +282,7 @@ def test_finishing_again_changes_nothing_and_without_a_store_it_is_an_error(
         (out / name).write_bytes(data)
     assert finish(LocalTarget(out)).sequences[PATH]["points"] == FRAMES
     assert files_of(out) == reference
-    with pytest.raises(MissingDataError, match="expected a zarr store of version 2"):
+    with pytest.raises(MissingDataError, match="expected a zarr store of version 3"):
         finish(LocalTarget(tmp_path / "nothing"))
 
 
@@ -361,9 +361,13 @@ def test_a_source_names_the_files_that_hold_frames(tmp_path: Path, reference: di
         (tmp_path / "x.zarr" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "x.zarr" / name).write_bytes(data)
     sequence: Sequence = carlasc.open(tmp_path / "x.zarr").sequences()[PATH]
-    shards = f"{PATH}/scans/points/xyz/c/0"
-    assert sequence.files_of("points", [0, 5, 4]) == [f"{shards}/0"]
-    assert sequence.files_of("points", [39, 1]) == [f"{shards}/2", f"{shards}/0", f"{PATH}/scans/points/fourth/c/0"]
+    shards = f"{PATH}/scans/points/xyz/c"
+    assert sequence.files_of("points", [0, 5, 4]) == [f"{shards}/0/0/0"]
+    assert sequence.files_of("points", [39, 1]) == [
+        f"{shards}/2/0/0",
+        f"{shards}/0/0/0",
+        f"{PATH}/scans/points/fourth/c/0/0",
+    ]
     assert sequence.files_of("points", [3]) == []  # an empty scan
     assert set(sequence.files_of("evaluation/counts", [1, 4])) == {
         f"{PATH}/grids/evaluation/counts/{column}/c/0/0/0/0" for column in ("values", "values_wide")

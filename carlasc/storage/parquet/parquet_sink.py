@@ -64,7 +64,7 @@ class ParquetSink(PackedSink):
             )
         refuse_existing(self.path, overwrite)
         self._part = unfinished(self.path)
-        run = to_json({"lossy_mm": self.options.lossy_mm})
+        run = to_json({"version": VERSION, "lossy_mm": self.options.lossy_mm})
         if not (self._part / UNFINISHED_MARK).is_file() or (self._part / UNFINISHED_MARK).read_bytes() != run:
             remove(self._part)
             write_atomic(self._part / UNFINISHED_MARK, run)
@@ -73,7 +73,7 @@ class ParquetSink(PackedSink):
         self._sequences = {
             about["path"]: file.parent.relative_to(self._part).as_posix() for file, about in done.items()
         }
-        self._numbers = {str(about["path"]): int(about.get(NUMBER, 0)) for about in done.values()}
+        self._numbers = {str(about["path"]): int(about[NUMBER]) for about in done.values()}
 
     def finished(self, path: str) -> bool:
         """Whether an earlier run that was interrupted has written this sequence whole."""

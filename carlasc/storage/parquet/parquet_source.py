@@ -26,8 +26,8 @@ from carlasc.storage.parquet.table_columns import table_field
 from carlasc.storage.protocol import Sequence
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
-NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables, which older stores do not have
-FOOTERS = "footers"  # its key with the checksums of the footers of the tables, which older stores do not have
+NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables
+FOOTERS = "footers"  # its key with the checksums of the footers of the tables
 FRAMES = "frames.parquet"  # one row per frame
 DOCUMENTS = "documents.parquet"  # one row per text file
 
@@ -40,7 +40,7 @@ class ParquetSource(PackedSource):
 
         Raises:
             DependencyError: pyarrow is not installed.
-            FormatError: the store is unfinished, or of a newer version.
+            FormatError: the store is unfinished, or of another version.
         """
         import_extra("pyarrow.parquet", "parquet")
         super().__init__(tree.location, parse_json(bytes(tree.read(TABLES_MARK)), tree.where(TABLES_MARK)))
@@ -106,9 +106,8 @@ class ParquetSequence(PackedSequence["_Table"]):
         return data
 
     def _check_footer(self, name: str) -> None:
-        if self._footers is not None:
-            found = self._footers.get(name) if isinstance(self._footers, dict) else None
-            check_footer(self.tree, f"{self.folder}/{name}", found)
+        found = self._footers.get(name) if isinstance(self._footers, dict) else None
+        check_footer(self.tree, f"{self.folder}/{name}", found)
 
     def _open_field(self, field: str) -> _Table:
         self._check_footer(f"{field}.parquet")
