@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError, ConflictError, StorageError
 from carlasc.running.options import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import (
-    Block,
+    FrameBlock,
     Progress,
     blocks_of,
     copy_blocks,
@@ -152,7 +152,7 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
             found="a finished store",
             advice="choose another name, or give `overwrite=True`",
         )
-    blocks: list[Block] = []
+    blocks: list[FrameBlock] = []
     writers: list[ZarrWriter] = []
     for path, sequence in sequences.items():
         writers.append(writer := sink.sequence(path))

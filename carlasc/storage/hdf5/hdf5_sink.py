@@ -26,7 +26,8 @@ from carlasc.storage.packed.array_layout import (
     number_arrays,
     typical_size,
 )
-from carlasc.storage.packed.chunks import Encoding, crc32c, in_threads
+from carlasc.storage.packed.chunks import crc32c, in_threads
+from carlasc.storage.packed.columns import Column
 from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
 from carlasc.storage.packed.stores import (
     STORE,
@@ -187,11 +188,7 @@ class HDF5ColumnWriter:
         self._encoding = column.encoding
         self._held: list[tuple[int, int, NDArray[Any]]] = []  # frame, number in the frame, chunk
         self._checksums: list[int] = []
-        shape, chunk = field_layout.frame_shape(column), field_layout.chunk_shape(column)
-        most = shape if field_layout.is_grid else (*shape[:-1], None)  # of a frame: more than it has room for is rare
-        self._dataset = output.create(
-            node, np.dtype(column.dtype), shape, most, chunk, column.encoding, field_layout.column_attributes(column)
-        )
+        self._dataset = output.create(node, field_layout, column)
 
     def append(self, frame: int, chunks: list[NDArray[Any]]) -> None:
         """Add a frame's chunks."""
@@ -255,30 +252,15 @@ class HDF5Output:
         _write_attributes(dataset, attributes)
         self.check()
 
-    def create(
-        self,
-        node: str,
-        dtype: np.dtype[Any],
-        shape: tuple[int, ...],
-        most: tuple[int | None, ...],
-        chunk: tuple[int, ...],
-        encoding: Encoding,
-        attributes: dict[str, Any],
-    ) -> Any:
-        """Create a data set of no frames yet.
-
-        Args:
-            node: the data set.
-            dtype: type of its elements.
-            shape: shape of a frame.
-            most: the shape that a frame may grow to.
-            chunk: shape of a chunk.
-            encoding: how chunks become bytes.
-            attributes: those of the data set.
-        """
+    def create(self, node: str, field_layout: FieldLayout, column: Column) -> Any:
+        """Create the data set of a column, of no frames yet."""
+        shape, encoding = field_layout.frame_shape(column), column.encoding
+        most = shape if field_layout.is_grid else (*shape[:-1], None)  # a frame of more than it has room for is rare
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
-        dataset = self._file.create_dataset(node, (0, *shape), dtype, chunks=chunk, maxshape=(None, *most), **blosc)
-        _write_attributes(dataset, attributes)
+        dataset = self._file.create_dataset(
+            node, (0, *shape), column.dtype, chunks=field_layout.chunk_shape(column), maxshape=(None, *most), **blosc
+        )
+        _write_attributes(dataset, field_layout.column_attributes(column))
         self.check()
         return dataset
 

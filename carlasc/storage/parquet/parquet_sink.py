@@ -32,9 +32,8 @@ from carlasc.storage.packed.stores import (
     PackOptions,
     node_of,
 )
-from carlasc.storage.parquet.footers import footer_checksums
-from carlasc.storage.parquet.parquet_source import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE
-from carlasc.storage.parquet.table_columns import statistics, table_field
+from carlasc.storage.parquet.parquet_source import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE, footer_checksums
+from carlasc.storage.parquet.table_columns import AXES, column_types, describe, split_columns, statistics
 
 _LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
 _PAGE = 8 << 20  # bytes: one page holds a scan's column
@@ -117,7 +116,7 @@ class ParquetWriter(PackedWriter):
         self._statistics: dict[int, dict[str, Any]] = {}
 
     def _start_field(self, field: str) -> FieldWriter:
-        return _TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
+        return TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Append one frame as a row group.
@@ -182,13 +181,12 @@ def _write_table(table: Any, path: Path) -> None:
     file.check()
 
 
-class _TableWriter(FieldWriter):
+class TableWriter(FieldWriter):
     """Writes one field's file, row group by row group."""
 
     def __init__(self, path: Path, field: str, number: int, options: PackOptions) -> None:
         super().__init__(field)
         self._number = number
-        self.kind = table_field(field)
         self.path = path
         self.scale_m = options.scale_m if field == "points" else None
         self.rows: list[int] = []  # of each frame
@@ -200,7 +198,7 @@ class _TableWriter(FieldWriter):
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)
-        columns = self.kind.split(array, self.attributes)
+        columns = split_columns(self.entry, array, self.attributes)
         count = len(next(iter(columns.values())))
         if count:
             place = (np.full(count, self._number, np.int32), np.full(count, frame, np.int64))
@@ -216,13 +214,13 @@ class _TableWriter(FieldWriter):
             "version": VERSION,
             "field": self.entry.name,
             "unit": self.entry.unit,
-        } | self.kind.describe(array, self.scale_m)
-        types, is_picture = self.kind.columns(self.attributes), self.entry.kind == "picture"
+        } | describe(self.entry, array, self.scale_m)
+        types, is_picture = column_types(self.entry, self.attributes), self.entry.kind == "picture"
         self._schema = pa.schema(
             [("sequence", pa.int32()), ("frame", pa.int64())]
             + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
-        split = {name: "BYTE_STREAM_SPLIT" for name in types if name in self.kind.split_bytes}
+        split = {name: "BYTE_STREAM_SPLIT" for name in types if self.entry.kind == "position" and name in AXES}
         self._file = PatientFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
             self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,

@@ -5,7 +5,6 @@ Parquet's own dictionaries and byte-stream split make them small: values keep th
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,197 +13,92 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
-from carlasc.storage import layout
+from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
 from carlasc.storage.packed.columns import narrow, quantise
 
-Attributes = Mapping[str, Any]
-Columns = dict[str, NDArray[Any]]
+AXES = frozenset("xyz")
+"""Columns of points that are quantised; not quantised, they have Parquet's byte-stream split, for numbers that seldom repeat."""
 
 
-class TableField(ABC):
-    """The columns of one kind of field.
+def describe(entry: Field, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
+    """Return what a reader needs to know besides the columns.
 
-    Attributes:
-        split_bytes: columns with Parquet's byte-stream split, which suits numbers that seldom repeat.
+    Args:
+        entry: the field.
+        array: its first frame.
+        scale_m: step to which coordinates are rounded; None keeps them.
     """
-
-    split_bytes: frozenset[str] = frozenset()
-
-    def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-        """Return what a reader needs to know besides the columns, from the first frame."""
-        return {}
-
-    @abstractmethod
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return the name of each column's type in pyarrow."""
-
-    @abstractmethod
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return a frame's columns."""
-
-    @abstractmethod
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return a frame's array."""
+    if entry.kind == "position" and scale_m:
+        return {"scale_m": scale_m}
+    return {"label_bytes": array.dtype["label"].itemsize} if entry.kind == "votes" else {}
 
 
-class PointsTable(TableField):
-    """`x`, `y`, `z` and `fourth`; quantised coordinates are integers, in steps of `scale_m`."""
-
-    split_bytes = frozenset("xyz")
-
-    def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-        """Return the step of quantised coordinates."""
-        return {"scale_m": scale_m} if scale_m else {}
-
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return one column per axis."""
-        return dict.fromkeys("xyz", "int32" if "scale_m" in attributes else "float32") | {"fourth": "float32"}
-
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return one column per axis."""
-        columns = {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(("x", "y", "z", "fourth"))}
-        if scale := attributes.get("scale_m"):
-            columns |= {name: quantise(columns[name], scale) for name in "xyz"}
-        return columns
-
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return (N, 4) float32 rows."""
-        points = np.empty((len(columns["x"]), 4), np.float32)
-        scale = attributes.get("scale_m")
-        for axis, name in enumerate("xyz"):
-            points[:, axis] = columns[name] if scale is None else columns[name] * scale
-        points[:, 3] = columns["fourth"]
-        return points
+def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
+    """Return the name of each column's type in pyarrow, from what `describe` returned."""
+    match entry.kind:
+        case "position":
+            return {name: "int32" if "scale_m" in attributes and name in AXES else "float32" for name in entry.names}
+        case "picture":
+            return {"jpeg": "binary"}
+        case "votes":
+            return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
+        case "boxes":
+            return {name: BOXES_DTYPE[name].name for name in entry.names}
+        case _:
+            return dict.fromkeys(entry.names, np.dtype(entry.dtype).name)
 
 
-class VectorTable(TableField):
-    """A column per axis: `vx`, `vy`, `vz`."""
+def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Return a frame's columns: those of a table, the columns of (N, K) rows, the values of a grid in C order, or one picture.
 
-    def __init__(self, names: tuple[str, ...]) -> None:
-        self.names = names
-
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return one column per axis."""
-        return dict.fromkeys(self.names, "float32")
-
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return one column per axis."""
-        return {name: np.ascontiguousarray(array[:, k], "<f4") for k, name in enumerate(self.names)}
-
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return (N, 3) float32."""
-        return np.stack([columns[name] for name in self.names], axis=1)
-
-
-class ValuesTable(TableField):
-    """One column of numbers in their published type; the voxels of a grid in C order."""
-
-    def __init__(self, entry: layout.Field) -> None:
-        (self.name,) = entry.names
-        self.dtype = np.dtype(entry.dtype).name
-        self.narrow = entry.kind == "class"
-
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return the one column."""
-        return {self.name: self.dtype}
-
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return the flat values."""
-        return {self.name: np.ascontiguousarray(array, self.dtype).reshape(-1)}
-
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return the flat values; labels in the narrowest type that holds them."""
-        values = columns[self.name]
-        return narrow(values) if self.narrow else values
-
-
-class PictureTable(TableField):
-    """`jpeg`: one row per frame, the bytes of the file."""
-
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return the one column."""
-        return {"jpeg": "binary"}
-
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return one value."""
+    Raises:
+        FormatError: labels of votes are wider than those of the first frame, or coordinates cannot be quantised.
+    """
+    types = column_types(entry, attributes)
+    if entry.kind == "picture":
         picture = np.empty(1, object)
         picture[0] = array.tobytes()
         return {"jpeg": picture}
+    if entry.kind == "votes" and array.dtype["label"].itemsize != attributes["label_bytes"]:
+        raise FormatError(
+            "its labels",
+            expected=f"{attributes['label_bytes']} bytes each, as in the first frame",
+            found=str(array.dtype["label"].itemsize),
+        )
+    if array.dtype.names:
+        return {name: np.ascontiguousarray(array[name]) for name in types}
+    rows, scale = array.reshape(-1, len(types)), attributes.get("scale_m")
+    return {
+        name: quantise(rows[:, k], scale)
+        if scale and name in AXES
+        else np.ascontiguousarray(rows[:, k], np.dtype(entry.dtype).newbyteorder("="))
+        for k, name in enumerate(types)
+    }
 
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return (B,) uint8."""
-        return np.frombuffer(columns["jpeg"][0], np.uint8)
 
-
-class VotesTable(TableField):
-    """`voxel`, `label` and `votes`: the columns of the field's own table."""
-
-    def describe(self, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-        """Return the bytes per label."""
-        return {"label_bytes": array.dtype["label"].itemsize}
-
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return the table's columns."""
-        return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
-
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return the columns of the table."""
-        if array.dtype["label"].itemsize != attributes["label_bytes"]:
-            raise FormatError(
-                "its labels",
-                expected=f"{attributes['label_bytes']} bytes each, as in the first frame",
-                found=str(array.dtype["label"].itemsize),
-            )
-        return {name: np.ascontiguousarray(array[name]) for name in self.columns(attributes)}
-
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return the table."""
-        wide = attributes["label_bytes"] > 1
-        votes = np.empty(len(columns["voxel"]), layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)
+def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> NDArray[Any]:
+    """Return a frame's array: a table, (N, K) rows, (N,) values (classes in the narrowest type that holds them), or a picture's bytes."""
+    first = next(iter(columns.values()))
+    if entry.kind == "picture":
+        return np.frombuffer(first[0], np.uint8)
+    if entry.kind in ("votes", "boxes"):
+        dtype = (
+            BOXES_DTYPE
+            if entry.kind == "boxes"
+            else VOTES_DTYPE
+            if attributes["label_bytes"] == 1
+            else WIDE_VOTES_DTYPE
+        )
+        table = np.empty(len(first), dtype)
         for name, column in columns.items():
-            votes[name] = column
-        return votes
-
-
-class BoxesTable(TableField):
-    """The columns of the field's own table: `track`, `label`, `x`, `y`, `z`, ..."""
-
-    def columns(self, attributes: Attributes) -> dict[str, str]:
-        """Return the table's columns."""
-        return {name: BOXES_DTYPE[name].name for name in BOXES_DTYPE.names or ()}
-
-    def split(self, array: NDArray[Any], attributes: Attributes) -> Columns:
-        """Return the columns of the table."""
-        return {name: np.ascontiguousarray(array[name]) for name in self.columns(attributes)}
-
-    def join(self, columns: Columns, attributes: Attributes) -> NDArray[Any]:
-        """Return the table."""
-        boxes = np.empty(len(columns["track"]), BOXES_DTYPE)
-        for name, column in columns.items():
-            boxes[name] = column
-        return boxes
-
-
-def table_field(name: str) -> TableField:
-    """Return how a field is stored in a table.
-
-    Raises:
-        FormatError: the layout has no such field.
-    """
-    entry = layout.field_named(name)
-    match entry.kind:
-        case "position":
-            return PointsTable()
-        case "vector":
-            return VectorTable(entry.names)
-        case "picture":
-            return PictureTable()
-        case "votes":
-            return VotesTable()
-        case "boxes":
-            return BoxesTable()
-        case _:
-            return ValuesTable(entry)
+            table[name] = column
+        return table
+    if len(columns) == 1:
+        return narrow(first) if entry.kind == "class" else first
+    rows, scale = np.empty((len(first), len(columns)), np.float32), attributes.get("scale_m")
+    for k, (name, column) in enumerate(columns.items()):
+        rows[:, k] = column * scale if scale and name in AXES else column
+    return rows
 
 
 def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
