@@ -99,7 +99,7 @@ def _pcodec(level: int, extra: str) -> Any:
 
 
 class StoredArray:
-    """An array of a store, chunked along one axis, whole along the others.
+    """An array of a store in chunks, which are counted in C order. The array of a column has an entry for each frame along its first axis.
 
     Attributes:
         tree: the tree of files that holds the chunks.
@@ -107,9 +107,8 @@ class StoredArray:
         dtype: type of the elements, little-endian.
         shape: of the whole array.
         chunk: shape of a chunk.
-        axis: the axis that is divided into chunks.
         encoding: how chunks become bytes.
-        attributes: the array's attributes in the store.
+        slots: number of chunks that an entry of the first axis has room for.
     """
 
     extra = "zarr"
@@ -121,23 +120,20 @@ class StoredArray:
         dtype: np.dtype[Any],
         shape: tuple[int, ...],
         chunk: tuple[int, ...],
-        axis: int,
         encoding: Encoding,
-        attributes: dict[str, Any],
     ) -> None:
         self.tree = tree
         self.name = name
         self.dtype = dtype
         self.shape = shape
         self.chunk = chunk
-        self.axis = axis
         self.encoding = encoding
-        self.attributes = attributes
+        self.slots = math.prod(-(-n // step) for n, step in zip(shape[1:], chunk[1:], strict=True))
 
     @property
     def step(self) -> int:
-        """Length of a chunk along the axis."""
-        return self.chunk[self.axis]
+        """Length of a chunk along the last axis."""
+        return self.chunk[-1]
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
         """Return the file, the first byte and the end of each chunk."""

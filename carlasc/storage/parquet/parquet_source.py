@@ -1,10 +1,15 @@
-"""Reading packed stores of Parquet tables: one file per field, one row group per frame."""
+"""Reading packed stores of Parquet tables: one file per field, one row group per frame.
+
+Parquet has checksums of pages and none of its footer, and one wrong bit there makes pyarrow 26 end the process: an exception of C++ that
+nothing catches. So a store says the checksums of its footers, and a footer is compared before pyarrow sees it.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 import os
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,18 +23,20 @@ from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import RemoteTree, Tree
+from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
 from carlasc.storage.packed.output import TABLES_MARK
-from carlasc.storage.packed.protocol import PackedSequence, PackedSource
-from carlasc.storage.packed.tables.columns import table_field
-from carlasc.storage.packed.tables.footers import check_footer
+from carlasc.storage.packed.stores import PackedSequence, PackedSource
+from carlasc.storage.parquet.table_columns import column_types, join_columns
 from carlasc.storage.protocol import Sequence
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
-NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables, which older stores do not have
-FOOTERS = "footers"  # its key with the checksums of the footers of the tables, which older stores do not have
+NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables
+FOOTERS = "footers"  # its key with the checksums of the footers of the tables
 FRAMES = "frames.parquet"  # one row per frame
 DOCUMENTS = "documents.parquet"  # one row per text file
+_END = 8  # bytes: the length of the footer, and "PAR1"
+_MARK = b"PAR1"
+_LONGEST = 1 << 28  # bytes; a sequence of ten thousand frames has some megabytes
 
 
 class ParquetSource(PackedSource):
@@ -40,7 +47,7 @@ class ParquetSource(PackedSource):
 
         Raises:
             DependencyError: pyarrow is not installed.
-            FormatError: the store is unfinished, or of a newer version.
+            FormatError: the store is unfinished, or of another version.
         """
         import_extra("pyarrow.parquet", "parquet")
         super().__init__(tree.location, parse_json(bytes(tree.read(TABLES_MARK)), tree.where(TABLES_MARK)))
@@ -62,7 +69,7 @@ class ParquetSource(PackedSource):
         return dict(sizes) | {"index": sum(file.stat().st_size for file in files) - sizes.total()}
 
 
-class ParquetSequence(PackedSequence["_Table"]):
+class ParquetSequence(PackedSequence["FieldTable"]):
     """One sequence of a store of tables."""
 
     tree: Tree
@@ -106,16 +113,15 @@ class ParquetSequence(PackedSequence["_Table"]):
         return data
 
     def _check_footer(self, name: str) -> None:
-        if self._footers is not None:
-            found = self._footers.get(name) if isinstance(self._footers, dict) else None
-            check_footer(self.tree, f"{self.folder}/{name}", found)
+        found = self._footers.get(name) if isinstance(self._footers, dict) else None
+        check_footer(self.tree, f"{self.folder}/{name}", found)
 
-    def _open_field(self, field: str) -> _Table:
+    def _open_field(self, field: str) -> FieldTable:
         self._check_footer(f"{field}.parquet")
-        return _Table(self.tree, f"{self.folder}/{field}.parquet", field)
+        return FieldTable(self.tree, f"{self.folder}/{field}.parquet", field)
 
 
-class _Table:
+class FieldTable:
     """One field's file: its footer is read once, a row group when its frame is read."""
 
     def __init__(self, tree: Tree, path: str, field: str) -> None:
@@ -126,7 +132,7 @@ class _Table:
         with opened(tree, path) as file:
             self._metadata = file.metadata
             about = parse_json(file.metadata.metadata[b"carlasc"], self.where)
-            self._types = table_field(field).columns(check_attributes(about, self.where))
+            self._types = column_types(layout.field_named(field), check_attributes(about, self.where))
             _check_types(file.schema_arrow, self._types, self.where)
         self.attributes = about
         frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
@@ -142,6 +148,7 @@ class _Table:
         self._groups = dict(zip(frames, zip(groups.tolist(), rows, strict=True), strict=True))
 
     def read(self, frame: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
+        """Read one frame; its values have `shape` if that is given."""
         if frame not in self._groups:
             raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
         rows = self._groups[frame][1]
@@ -154,7 +161,7 @@ class _Table:
         else:
             columns = {name: np.empty(0, "u1" if type_ == "binary" else type_) for name, type_ in self._types.items()}
         with reading(where, "values of the field", "the store is damaged"):
-            array = table_field(self.field).join(columns, self.attributes)
+            array = join_columns(layout.field_named(self.field), columns, self.attributes)
             return array if shape is None else array.reshape(shape)
 
     def _read_group(self, frame: int, bounded: bool) -> dict[str, NDArray[Any]]:
@@ -229,6 +236,52 @@ def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
             advice="the store is damaged",
         )
     return {**about, "label_bytes": label_bytes}
+
+
+def footer_checksum(tree: Tree, path: str) -> int:
+    """Return the CRC-32 of a table's footer, with its length and the mark behind it.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it does not end as a Parquet file does.
+    """
+    end = bytes(tree.read_range(path, -_END, 0))
+    if len(end) != _END or not end.endswith(_MARK):
+        raise FormatError(tree.where(path), expected="a Parquet file", found="another end", advice="is it truncated?")
+    length = int.from_bytes(end[:4], "little")
+    if length > _LONGEST:
+        raise FormatError(tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=str(length))
+    return zlib.crc32(tree.read_range(path, -_END - length, 0))
+
+
+def footer_checksums(folder: Path) -> dict[str, int]:
+    """Return the checksum of each table below a folder on this machine, by its path there."""
+    tree = LocalTree(folder, mapped=False)
+    paths = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.parquet"))
+    return {path: footer_checksum(tree, path) for path in paths}
+
+
+def check_footer(tree: Tree, path: str, expected: object) -> None:
+    """Compare a table's footer with its checksum.
+
+    Raises:
+        FormatError: it is another one.
+    """
+    try:
+        found = footer_checksum(tree, path)
+    except MissingDataError as error:
+        raise FormatError(
+            tree.where(path),
+            expected="the table that the sequence lists",
+            found="none",
+            advice="the store is damaged",
+        ) from error
+    if found != expected:
+        raise FormatError(
+            tree.where(path),
+            problem="the checksum of the footer does not match",
+            advice="the store is corrupted: fetch or pack it again",
+        )
 
 
 def _check_types(schema: Any, types: Mapping[str, str], where: str) -> None:

@@ -1,6 +1,6 @@
 """Reading packed stores in HDF5: groups and chunked data sets, compressed by the Blosc filter.
 
-Any HDF5 reader with hdf5plugin opens them. They are of version 1 of the format. Here, h5py looks up the places of the chunks in the file, once per data set; the chunks
+Any HDF5 reader with hdf5plugin opens them. Here, h5py looks up the places of the chunks in the file, once per data set; the chunks
 themselves are read and decoded directly.
 """
 
@@ -19,9 +19,8 @@ from carlasc.errors import FormatError, import_extra, reading
 from carlasc.storage.arrays import check_ratio
 from carlasc.storage.files import parse_json_value
 from carlasc.storage.folders.trees import RemoteTree, Tree
-from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
-from carlasc.storage.packed.arrays.reading import ArraySequence, ArraySource, ArrayStore
-from carlasc.storage.packed.arrays.version1 import OffsetsSequence
+from carlasc.storage.packed.array_source import ArraySource, ArrayStore
+from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
 
 _BLOSC = 32001  # the filter's registered number
 _GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # those of the filters that HDF5 brings
@@ -38,14 +37,11 @@ class HDF5Source(ArraySource):
 
         Raises:
             DependencyError: h5py or the codecs are not installed.
-            FormatError: it is another HDF5 file, unfinished, or of a newer version.
+            FormatError: it is another HDF5 file, unfinished, or of another version.
         """
         for module in ("h5py", "numcodecs", "google_crc32c"):
             import_extra(module, "hdf5")
         super().__init__(HDF5Store(tree, path))
-
-    def _sequence(self, path: str, group: str) -> ArraySequence:
-        return OffsetsSequence(self.store, path, group)
 
 
 class HDF5Store(ArrayStore):
@@ -72,6 +68,10 @@ class HDF5Store(ArrayStore):
         dataset = self._dataset(file, node)
         check_small(dataset, f"{self.location}: {dataset.name}")
         return np.asarray(dataset[...])
+
+    def read_document(self, node: str) -> bytes:
+        """Return the bytes of a text file, which is a data set of bytes."""
+        return self.read_small(node).tobytes()
 
     def array(self, node: str) -> StoredArray:
         """Return a data set whose chunks can be read."""
@@ -117,53 +117,67 @@ class HDF5Store(ArrayStore):
 
 
 class HDF5Array(StoredArray):
-    """A chunked data set with the Blosc filter, and the place and the checksum of each chunk."""
+    """A chunked data set with the Blosc filter, and the place and the checksum of each chunk that exists."""
 
     extra = "hdf5"
-    _places: NDArray[np.int64]
-    _checksums: NDArray[np.uint32]
+    _path: str
+    _places: dict[int, tuple[int, int]]
+    _checksums: dict[int, int]
 
     @classmethod
     def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]) -> HDF5Array:
         """Look up the places of a data set's chunks.
 
+        Args:
+            tree: the tree of files that holds the HDF5 file.
+            path: the file.
+            dataset: the open data set.
+            checksums: (n,) those of its chunks, in the order of their places in the data set.
+
         Raises:
-            FormatError: it is not chunked, has other filters, or lacks chunks.
+            FormatError: it is not chunked, has other filters, or another number of chunks.
         """
-        shape, chunk = dataset.shape, dataset.chunks
+        where, shape, chunk = f"{tree.where(path)}: {dataset.name}", dataset.shape, dataset.chunks
         if chunk is None or _filters(dataset) != [_BLOSC] or dataset.dtype.kind not in "uif" or checksums.ndim != 1:
             raise FormatError(
-                f"{tree.where(path)}: {dataset.name}",
+                where,
                 expected="a chunked data set with the Blosc filter",
                 found="another",
                 advice="the store is damaged",
             )
-        axis = next((axis for axis in range(len(shape)) if dataset.maxshape[axis] is None), len(shape) - 1)
-        places = np.full((len(checksums), 2), -1, np.int64)
+        array = cls(tree, dataset.name, dataset.dtype, shape, chunk, Encoding())
+        rooms = [-(-n // step) for n, step in zip(shape, chunk, strict=True)]
+        places: dict[int, tuple[int, int]] = {}
 
         def note(info: Any) -> None:
-            number = info.chunk_offset[axis] // chunk[axis]
-            if number < len(places):
-                places[number] = info.byte_offset, info.byte_offset + info.size
+            number = 0
+            for first, step, room in zip(info.chunk_offset, chunk, rooms, strict=True):
+                number = number * room + first // step
+            places[number] = info.byte_offset, info.byte_offset + info.size
 
         dataset.id.chunk_iter(note)
-        if shape[axis] != len(checksums) * chunk[axis] or (places < 0).any():
+        if len(places) != len(checksums):
             raise FormatError(
-                f"{tree.where(path)}: {dataset.name}",
+                where,
                 expected=f"{len(checksums)} chunks",
-                found="others",
+                found=str(len(places)),
                 advice="the store is damaged",
             )
-        attributes = _read_attributes(dataset, f"{tree.where(path)}: {dataset.name}")
-        array = cls(tree, dataset.name, dataset.dtype, shape, chunk, axis, Encoding(), attributes)
-        array._path, array._places, array._checksums = path, places, checksums
+        array._path, array._places = path, places
+        array._checksums = dict(zip(sorted(places), checksums.tolist(), strict=True))
         return array
-
-    _path: str
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
         """Return the places of chunks."""
-        return [(self._path, *self._places[number].tolist()) for number in numbers]
+        for number in numbers:
+            if number not in self._places:
+                raise FormatError(
+                    self.tree.where(self._path),
+                    expected=f"chunk {number} of {self.name}",
+                    found="none",
+                    advice="the store is damaged",
+                )
+        return [(self._path, *self._places[number]) for number in numbers]
 
     def files(self, numbers: Sequence[int]) -> list[str]:
         """Return the one file."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.errors import FormatError
-from carlasc.storage.packed.numbers import common_type, narrow, quantise
+from carlasc.storage.packed.columns import narrow, quantise
 
 
 @pytest.mark.parametrize(
@@ -36,12 +36,6 @@ def test_counts_that_are_not_finite_stay_as_they_are(value: float) -> None:
 def test_an_empty_array_is_narrow() -> None:
     assert narrow(np.empty(0, np.uint32)).dtype == np.uint8
     assert narrow(np.empty(0, np.float32)).dtype == np.uint8
-
-
-def test_the_common_type_is_the_wider_one_or_float() -> None:
-    small, wide, decimal = np.dtype("u1"), np.dtype("<u4"), np.dtype("<f4")
-    assert common_type(small, wide) == common_type(wide, small) == wide
-    assert common_type(decimal, small) == common_type(wide, decimal) == decimal
 
 
 def test_coordinates_are_rounded_to_the_nearest_step() -> None:

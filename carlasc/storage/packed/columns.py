@@ -1,4 +1,4 @@
-"""How a field's frames become columns of arrays, and come back.
+"""How a field's frames become columns of arrays, and come back; numbers in fewer bytes.
 
 Every rule is lossless to the last bit, negative zeros and NaN payloads included, except for `scale_m`, which the user asks for.
 """
@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import layout
-from carlasc.storage.packed.arrays.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
-from carlasc.storage.packed.numbers import narrow, quantise
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
+from carlasc.storage.packed.stores import PackOptions
 
 # Points per chunk: PCodec's bins fit the scene better than in a whole scan, and padding takes bits.
 _PCODEC_STEP = 8192
@@ -36,15 +35,14 @@ class Column:
 
     Attributes:
         name: name of the array.
-        dtype: type of its elements. In version 1, unsigned integers are widened when a later frame needs it.
+        dtype: type of its elements.
         encoding: how its chunks are written.
         unit: unit of its values.
         rows: leading dimension of a (rows, N) column; None for a flat one.
         scratch: whether a decoded frame is copied at once, so that the next frame may be decoded into the same memory.
         step: elements per chunk; None chooses it so that a typical frame fills one chunk.
         least: smallest value chosen for `step`: a first scan of three points must not lead to chunks of three.
-        types: in version 2, the type of the column and that of the column `<name>_wide`, which takes the frames that do not fit the
-            first; empty: `dtype`, and no second column.
+        wide: type of the column `<name>_wide`, which takes the frames that do not fit this one; None: there is no second column.
     """
 
     name: str
@@ -55,16 +53,14 @@ class Column:
     scratch: bool = False
     step: int | None = None
     least: int = LEAST
-    types: tuple[str, ...] = ()
+    wide: str | None = None
 
     @property
-    def fixed(self) -> tuple[Column, ...]:
-        """The columns of version 2, whose types never change: this one, and the wide one if there is one."""
-        first, *wide = self.types or (self.dtype,)
-        return (
-            replace(self, dtype=first),
-            *(replace(self, name=f"{self.name}{WIDE}", dtype=dtype, least=LEAST) for dtype in wide),
-        )
+    def both(self) -> tuple[Column, ...]:
+        """This column, and the wide one if there is one."""
+        if self.wide is None:
+            return (self,)
+        return self, replace(self, name=f"{self.name}{WIDE}", dtype=self.wide, least=LEAST, wide=None)
 
 
 class Packing(ABC):
@@ -80,13 +76,13 @@ class Packing(ABC):
     kind: ClassVar[str]
     columns: tuple[Column, ...]
 
-    def __init__(self, entry: layout.Field, options: Options, attributes: Mapping[str, Any]) -> None:
+    def __init__(self, entry: layout.Field, options: PackOptions, attributes: Mapping[str, Any]) -> None:
         self.entry = entry
         self.attributes = attributes
         self.columns = self._columns(options)
 
     @abstractmethod
-    def _columns(self, options: Options) -> tuple[Column, ...]: ...
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]: ...
 
     @abstractmethod
     def split(self, array: NDArray[Any]) -> Columns:
@@ -108,12 +104,12 @@ class Packing(ABC):
         return [None] * len(counts)
 
 
-class Points(Packing):
+class PointsPacking(Packing):
     """(N, 4) points: `xyz` as (3, N), and `fourth` only in frames where a bit of the 4th column is set."""
 
     kind = "points"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding("pcodec", 8) if options.small else Encoding(shuffle=SHUFFLE)
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
@@ -154,16 +150,16 @@ class Points(Packing):
         return [block[end - count : end] for count, end in zip(counts, ends, strict=True)]
 
 
-class Values(Packing):
-    """A flat array of numbers, as `values` of the narrowest type that holds them all."""
+class ValuesPacking(Packing):
+    """A flat array of numbers, as `values`; classes as bytes where they fit."""
 
     kind = "values"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         incompressible = self.entry.kind == "picture"
         encoding = Encoding(level=1) if incompressible else Encoding(shuffle=SHUFFLE)
-        types = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype,)
-        return (Column("values", "u1", encoding, self.entry.unit, types=types),)
+        dtype, wide = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype, None)
+        return (Column("values", dtype, encoding, self.entry.unit, wide=wide),)
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Narrow the values."""
@@ -175,15 +171,15 @@ class Values(Packing):
         return values if self.entry.kind in ("class", "picture") else values.astype(self.entry.dtype, copy=False)
 
 
-class Flow(Packing):
+class FlowPacking(Packing):
     """(N, 3) vectors as a `palette` (3, K) of the frame's distinct vectors, compared bit by bit, and the `index` of each point's."""
 
     kind = "flow"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
-        return Column("index", "u1", encoding, types=("u1", "<u4")), Column(
-            "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, types=("<f4", "<f4")
+        return Column("index", "u1", encoding, wide="<u4"), Column(
+            "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, wide="<f4"
         )
 
     def split(self, array: NDArray[Any]) -> Columns:
@@ -203,16 +199,15 @@ class Flow(Packing):
         return np.ascontiguousarray(palette.T)[index]
 
 
-class Cells(Packing):
-    """A field with one value per voxel: `values` (F, X, Y, Z), one chunk per frame."""
+class GridPacking(Packing):
+    """A field with one value per voxel, (X, Y, Z): one chunk per frame of `values`."""
 
     kind = "grid"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         shuffle = BITSHUFFLE if self.entry.kind == "count" else NO_SHUFFLE
-        dtype = self.entry.dtype if self.entry.kind == "probability" else "u1"
-        types = _WIDE_CELLS.get(self.entry.dtype, (self.entry.dtype,))
-        return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, types=types),)
+        dtype, wide = _WIDE_CELLS.get(self.entry.dtype, (self.entry.dtype, None))
+        return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, wide=wide),)
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Narrow the values, except probabilities: they are whole numbers in few frames, and float32 would take more space."""
@@ -223,15 +218,15 @@ class Cells(Packing):
         return columns["values"]
 
 
-class Votes(Packing):
+class VotesPacking(Packing):
     """Votes or probabilities by class: the columns of the table, as `voxel`, `label` and `votes`."""
 
     kind = "votes"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         return (
             Column("voxel", "<i4", Encoding(shuffle=SHUFFLE), "index"),
-            Column("label", "u1", Encoding(), "class", types=("u1", "<u2")),
+            Column("label", "u1", Encoding(), "class", wide="<u2"),
             Column("votes", "<u2", Encoding(shuffle=SHUFFLE), self.entry.unit),
         )
 
@@ -254,12 +249,12 @@ class Votes(Packing):
         return votes
 
 
-class BoxTable(Packing):
+class BoxesPacking(Packing):
     """Boxes: the numbers of the table as `geometry` (10, N), and its other columns as they are."""
 
     kind = "boxes"
 
-    def _columns(self, options: Options) -> tuple[Column, ...]:
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
         return (
             Column("geometry", "<f8", encoding, self.entry.unit, rows=len(_GEOMETRY), least=FEW),
@@ -284,19 +279,50 @@ class BoxTable(Packing):
 
 
 def packing_of(
-    entry: layout.Field, options: Options | None = None, attributes: Mapping[str, Any] | None = None
+    entry: layout.Field, options: PackOptions | None = None, attributes: Mapping[str, Any] | None = None
 ) -> Packing:
     """Return how a field is packed: by `options` when it is written, by the store's `attributes` when it is read."""
-    options = options or Options()
+    options = options or PackOptions()
     if attributes is None:
         attributes = {"scale_m": options.scale_m} if entry.kind == "position" and options.lossy_mm else {}
-    kind: Callable[..., Packing] = Cells if entry.per == "voxel" else _BY_KIND.get(entry.kind, Values)
+    kind: Callable[..., Packing] = GridPacking if entry.per == "voxel" else _BY_KIND.get(entry.kind, ValuesPacking)
     return kind(entry, options, attributes)
 
 
 _BY_KIND: dict[layout.Kind, Callable[..., Packing]] = {
-    "position": Points,
-    "vector": Flow,
-    "votes": Votes,
-    "boxes": BoxTable,
+    "position": PointsPacking,
+    "vector": FlowPacking,
+    "votes": VotesPacking,
+    "boxes": BoxesPacking,
 }
+
+
+def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
+    """Return coordinates as whole steps of `scale_m`.
+
+    Raises:
+        FormatError: a coordinate is NaN, infinite, or too large for an int32.
+    """
+    steps = np.rint(metres.astype(np.float64) / scale_m)
+    if not (np.abs(steps) < 2**31).all():  # False for NaN too
+        raise FormatError(
+            "points",
+            expected=f"finite coordinates within {2**31 * scale_m:.0f} m to quantise",
+            found="others",
+            advice="pack them without `lossy_mm`",
+        )
+    return steps.astype(np.int32)
+
+
+def narrow(array: NDArray[Any]) -> NDArray[Any]:
+    """Return whole numbers in the smallest unsigned type that holds them, and other numbers as float32, bit for bit."""
+    if array.dtype.kind == "f":
+        values = np.ascontiguousarray(array, "<f4")
+        with np.errstate(invalid="ignore"):
+            whole = values.astype(np.uint32) if values.size == 0 or values.max() < 2**32 else None  # False for NaN
+        exact = whole is not None and np.array_equal(whole.astype("<f4").view(np.uint32), values.view(np.uint32))
+        if whole is None or not exact:
+            return values
+        array = whole
+    highest = int(array.max()) if array.size else 0
+    return array.astype("u1" if highest < 2**8 else "<u2" if highest < 2**16 else "<u4", copy=False)

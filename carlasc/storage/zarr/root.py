@@ -7,24 +7,23 @@ from typing import Any
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
 from carlasc.storage.durability import rename
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.arrays.fields import VERSION
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
 from carlasc.storage.packed.output import remove, replaced
-from carlasc.storage.packed.protocol import STORE, Options
+from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.shards import METADATA, group_metadata
 
 _TRIES = 5  # other processes may begin, finish and replace the same store meanwhile
 _OPTIONS = ("block", "lossy_mm", "small")
 
 
-class Root:
+class StoreRoot:
     """The root of a store that is written to, shared by its writers. A new one is created with the first thing that is written.
 
     Attributes:
         is_finished: whether a finished store with the same options exists, to which more is added.
     """
 
-    def __init__(self, target: Target, options: Options, overwrite: bool) -> None:
+    def __init__(self, target: Target, options: PackOptions, overwrite: bool) -> None:
         """Check that the store may be written. Nothing is written yet, but a store that is replaced is moved away.
 
         Raises:
@@ -96,17 +95,17 @@ class Root:
         return self.__dict__ | {"_overwrite": False}  # only the process that was told to replaces a store
 
 
-def options_of(options: Options) -> dict[str, Any]:
+def options_of(options: PackOptions) -> dict[str, Any]:
     """Return the options of a store as its root records them."""
     return {name: getattr(options, name) for name in _OPTIONS}
 
 
-def existing_options(target: Target) -> Options | None:
+def existing_options(target: Target) -> PackOptions | None:
     """Return how a store of this version is packed; None if there is none."""
     root = read_root(target)
     if root is None or root.get("type") != STORE or root.get("version") != VERSION:
         return None
-    return Options(**{name: root.get(name, getattr(Options, name)) for name in _OPTIONS})
+    return PackOptions(**{name: root.get(name, getattr(PackOptions, name)) for name in _OPTIONS})
 
 
 def read_root(target: Target) -> dict[str, Any] | None:

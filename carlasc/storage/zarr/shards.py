@@ -1,4 +1,7 @@
-"""The objects of a zarr store: shards of chunks, each with an index of its own (zarr specification v3, "sharding_indexed" and "crc32c")."""
+"""The objects of a zarr store: shards of chunks, each with an index of its own, and the metadata that describe them.
+
+See the zarr specification v3, "sharding_indexed" and "crc32c".
+"""
 
 from __future__ import annotations
 
@@ -12,16 +15,21 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.folders.trees import Tree
-from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
-from carlasc.storage.packed.arrays.zarr_metadata import encoding_of
+from carlasc.storage.packed.array_layout import FieldLayout
+from carlasc.storage.packed.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
+from carlasc.storage.packed.columns import Column
 
+METADATA = "zarr.json"
+_SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}
+_LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
+_CRC = {"name": "crc32c"}
 _CHECKSUM = 4  # bytes
 _RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c
 _ABSENT = 2**64 - 1  # offset and length of a chunk that does not exist
 
 
 class ZarrArray(StoredArray):
-    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, sharded or not.
+    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, in shards along its first axis or in one chunk.
 
     Attributes:
         per_shard: number of chunks of a shard; None if the array is not sharded.
@@ -48,14 +56,10 @@ class ZarrArray(StoredArray):
             if not len(shape) == len(outer) == len(chunk) > 0:
                 raise ValueError(f"shape {shape}, chunks {outer} of {chunk}")
             encoding = encoding_of(codecs)
-            axis = next(
-                (axis for axis in range(len(shape)) if chunk[axis] < outer[axis] or outer[axis] < shape[axis]),
-                0
-                if len(shape) > 2
-                else len(shape) - 1,  # of a single chunk: a grid's frames, or the elements of a column
-            )
-            found = cls(tree, node, dtype, shape, chunk, axis, encoding, metadata.get("attributes", {}))
-            found.per_shard = outer[axis] // chunk[axis] if sharded else None
+            if any(n > limit for n, limit in zip(shape[1:], outer[1:], strict=True)):
+                raise ValueError(f"shape {shape} in shards of {outer}, which divide other axes than the first")
+            found = cls(tree, node, dtype, shape, chunk, encoding)
+            found.per_shard = outer[0] // chunk[0] * found.slots if sharded else None
             found._index_first = sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
         found._indices = {}
         return found
@@ -105,9 +109,7 @@ class ZarrArray(StoredArray):
 
     def file(self, number: int) -> str:
         """Return the path of a shard, or of a chunk of an array without shards."""
-        key = ["0"] * len(self.shape)
-        key[self.axis] = str(number)
-        return f"{self.name}/c/{'/'.join(key)}"
+        return f"{self.name}/c/{'/'.join([str(number), *['0'] * (len(self.shape) - 1)])}"
 
     def _read_indices(self, shards: set[int]) -> None:
         missing = sorted(shards - self._indices.keys())
@@ -218,3 +220,107 @@ def _numbers(values: Any, least: int) -> tuple[int, ...]:
 
 def _with_checksum(data: bytes) -> bytes:
     return data + crc32c(data, "zarr").to_bytes(_CHECKSUM, "little")
+
+
+def group_metadata(attributes: Mapping[str, Any], nodes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the metadata of a group.
+
+    Args:
+        attributes: the group's attributes.
+        nodes: the metadata of all nodes below it, by path, which are then consolidated in it.
+    """
+    metadata: dict[str, Any] = {"attributes": dict(attributes), "zarr_format": 3, "node_type": "group"}
+    if nodes is not None:
+        metadata["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": dict(nodes)}
+    return metadata
+
+
+def array_metadata(
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    chunk: tuple[int, ...],
+    encoding: Encoding,
+    attributes: Mapping[str, Any],
+    shard: tuple[int, ...] | None = None,
+) -> dict[str, Any]:
+    """Return the metadata of an array.
+
+    Args:
+        dtype: type of its elements.
+        shape: its shape.
+        chunk: shape of a chunk.
+        encoding: how a chunk becomes bytes; its crc32c follows.
+        attributes: the array's attributes.
+        shard: shape of a shard; None for an array without shards.
+    """
+    codecs = codecs_of(encoding, dtype)
+    if shard is not None:
+        sharding = {
+            "chunk_shape": list(chunk),
+            "codecs": codecs,
+            "index_codecs": [_LITTLE, _CRC],
+            "index_location": "start",
+        }
+        codecs = [{"name": "sharding_indexed", "configuration": sharding}]
+    return {
+        "attributes": dict(attributes),
+        "shape": list(shape),
+        "data_type": dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(shard or chunk)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": 0.0 if dtype.kind == "f" else 0,
+        "codecs": codecs,
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+    }
+
+
+def codecs_of(encoding: Encoding, dtype: np.dtype[Any]) -> list[dict[str, Any]]:
+    """Return the codecs of a chunk: those of its encoding, and crc32c."""
+    if encoding.codec == "pcodec":
+        return [{"name": "numcodecs.pcodec", "configuration": {"level": encoding.level}}, _CRC]
+    shuffle = next(name for name, number in _SHUFFLES.items() if number == encoding.shuffle)
+    blosc = {
+        "typesize": dtype.itemsize,
+        "cname": "zstd",
+        "clevel": encoding.level,
+        "shuffle": shuffle,
+        "blocksize": BLOCK,
+    }
+    return [_LITTLE if dtype.itemsize > 1 else {"name": "bytes"}, {"name": "blosc", "configuration": blosc}, _CRC]
+
+
+def encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
+    """Return the encoding that the (inner) codecs in an array's metadata describe.
+
+    Raises:
+        ValueError: they are not those of an `Encoding`.
+    """
+    names = [codec["name"] for codec in codecs]
+    if names == ["numcodecs.pcodec", "crc32c"]:
+        return Encoding("pcodec", codecs[0]["configuration"]["level"])
+    if names == ["bytes", "blosc", "crc32c"] and codecs[0].get("configuration", {}).get("endian", "little") == "little":
+        settings = codecs[1]["configuration"]
+        return Encoding("blosc", settings["clevel"], _SHUFFLES[settings["shuffle"]])
+    raise ValueError(f"codecs {', '.join(names)}")
+
+
+def column_metadata(field_layout: FieldLayout, column: Column, block: int, frames: int) -> dict[str, Any]:
+    """Return the metadata of a column's array.
+
+    Args:
+        field_layout: the layout of its field.
+        column: the column.
+        block: number of frames of a shard.
+        frames: number of frames that the array has room for, a multiple of `block`.
+    """
+    shape = field_layout.frame_shape(column)
+    return array_metadata(
+        np.dtype(column.dtype),
+        (frames, *shape),
+        field_layout.chunk_shape(column),
+        column.encoding,
+        field_layout.column_attributes(column),
+        (block, *shape),
+    )

@@ -6,25 +6,29 @@ Everything is derived from the objects that exist, so that finishing may be inte
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError, FormatError, MissingDataError
-from carlasc.storage import layout
 from carlasc.storage.files import parse_json, remove_stale, to_json
-from carlasc.storage.packed.arrays.blocks import Table, block_of, parse_table
-from carlasc.storage.packed.arrays.chunks import SHUFFLE, Encoding, in_threads
-from carlasc.storage.packed.arrays.fields import VERSION, FieldLayout
-from carlasc.storage.packed.arrays.reading import FIELD, SEQUENCE, document_node, field_node
-from carlasc.storage.packed.arrays.shards import encode_chunk
-from carlasc.storage.packed.arrays.zarr_begin import read_root, remove_replaced
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, array_metadata, group_metadata
-from carlasc.storage.packed.protocol import STORE, check_names
+from carlasc.storage.packed.array_layout import (
+    FIELD,
+    SEQUENCE,
+    FieldLayout,
+    FrameTable,
+    count_elements,
+    document_node,
+    field_node,
+    number_arrays,
+)
+from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
+from carlasc.storage.packed.stores import STORE, VERSION, check_names
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.block_tables import block_of, parse_table
+from carlasc.storage.zarr.root import read_root, remove_replaced
+from carlasc.storage.zarr.shards import METADATA, array_metadata, column_metadata, encode_chunk, group_metadata
 
 EXPECTED = "expected.json"  # the frames that a run has announced
 _SMALL = Encoding(shuffle=SHUFFLE)
@@ -46,7 +50,7 @@ class FinishedStore:
 
 
 @dataclass
-class _Nodes:
+class StoreNodes:
     """The metadata of nodes, and the files to write."""
 
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -108,7 +112,7 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
             target.location, expected="a number of frames in block", found=repr(block), advice="the store is damaged"
         )
     groups = _groups(target, paths)
-    result, nodes, sequences = FinishedStore(target.location), _Nodes(), dict[str, str]()
+    result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
     for node, attributes in groups.items():
         if attributes.get("type") == SEQUENCE:
             if not {"path", "split", "name", "coordinates"} <= attributes.keys():
@@ -157,7 +161,7 @@ def _finish_sequence(
     paths: list[str],
     groups: Mapping[str, Mapping[str, Any]],
     block: int,
-    nodes: _Nodes,
+    nodes: StoreNodes,
     result: FinishedStore,
 ) -> None:
     """Add the nodes of a sequence, and count its frames."""
@@ -165,42 +169,37 @@ def _finish_sequence(
     for group, about in groups.items():
         name = about["field"]
         if tables.get(group):
-            fields[name] = FieldLayout.read(f"{target.location}/{group}", name, about, block)
+            fields[name] = FieldLayout.read(f"{target.location}/{group}", name, about)
             nodes.group(group, about)
     found = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
     _count(target, node, attributes["path"], paths, found, result)
-    frames = sorted({frame for table in found.values() for frame in table})
-    columns: dict[str, list[int]] = {}
-    for name, table in found.items():
-        room = -(-(max(table) + 1) // block) * block
-        firsts = {family.name for family in fields[name].packing.columns}
-        for column in fields[name].columns.values():
-            counts = [table[frame].get(column.name, 0) if frame in table else -1 for frame in frames]
-            place = f"{field_node(name)}/{column.name}"
-            if max(counts) > 0:
-                nodes.metadata[f"{node}/{place}"] = fields[name].metadata(column, room)
-            if max(counts) > 0 or column.name in firsts:
-                columns[place] = counts
+    frames, counts, columns = count_elements(fields, found)
+    for place, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
+        kind, _, column = place.rpartition("/")
+        name = kind.partition("/")[2]
+        if most > 0:
+            room = -(-(max(found[name]) + 1) // block) * block
+            nodes.metadata[f"{node}/{place}"] = column_metadata(fields[name], fields[name].columns[column], block, room)
     documents = sorted(
         path.removeprefix(f"{node}/{document_node('')}")
         for path in paths
         if path.startswith(f"{node}/{document_node('')}")
     )
     nodes.group(node, {**attributes, "fields": sorted(found), "documents": documents})
-    numbers = np.array(list(columns.values()), "<i8").reshape(len(columns), len(frames)).T
-    nodes.small(f"{node}/frames", np.array(frames, "<i8"), {"type": "carlasc.frames", "unit": "frame"})
-    nodes.small(
-        f"{node}/counts",
-        np.ascontiguousarray(numbers),
-        {"type": "carlasc.counts", "unit": "element", "columns": list(columns)},
-    )
-    _add_numbers(target, node, documents, nodes)
+    nodes.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
+    nodes.small(f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns})
+
+    def read_document(name: str) -> bytes | None:
+        return bytes(target.tree.read(f"{node}/{document_node(name)}")) if name in documents else None
+
+    for name, numbers, about in number_arrays(read_document):
+        nodes.small(f"{node}/{name}", numbers, about)
 
 
-def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, Table]:
+def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, FrameTable]:
     """Return the frames of each field, by its group."""
     files = [path for path in paths if block_of(path) is not None]
-    tables: dict[str, Table] = {}
+    tables: dict[str, FrameTable] = {}
     for path, data in zip(files, target.tree.read_many(files), strict=True):
         group = path.rpartition("/")[0].rpartition("/")[0]
         tables.setdefault(group, {}).update(parse_table(bytes(data), target.tree.where(path)))
@@ -208,7 +207,7 @@ def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, Table]:
 
 
 def _count(
-    target: Target, node: str, path: str, paths: list[str], tables: Mapping[str, Table], result: FinishedStore
+    target: Target, node: str, path: str, paths: list[str], tables: Mapping[str, FrameTable], result: FinishedStore
 ) -> None:
     """Count the frames of a sequence, and those that were announced and are missing."""
     result.sequences[path] = {name: len(table) for name, table in tables.items()}
@@ -260,15 +259,3 @@ def _missing(result: FinishedStore) -> ConflictError:
         found=f"{count} of {name} missing in {path or 'its sequence'}{more}",
         advice="run the same command again, or give `incomplete=True`",
     )
-
-
-def _add_numbers(target: Target, node: str, documents: list[str], nodes: _Nodes) -> None:
-    """Write poses and times as arrays too, for programs that do not read the text files."""
-    for name, document, unit in (("poses", layout.POSES, "m"), ("times", layout.TIMES, "s")):
-        if document in documents:
-            data = bytes(target.tree.read(f"{node}/{document_node(document)}"))
-            with suppress(FormatError):  # not numbers: the text is kept as it is, and its reader reports the error
-                numbers = (
-                    layout.decode_poses(data, document) if name == "poses" else layout.decode_times(data, document)
-                )
-                nodes.small(f"{node}/{name}", numbers, {"type": "carlasc.numbers", "unit": unit, "document": document})

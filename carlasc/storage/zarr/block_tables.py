@@ -8,23 +8,51 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.arrays.fields import Encoded, FieldLayout, open_field
-from carlasc.storage.packed.arrays.shards import ZarrArray, join_shard, split_shard
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.array_fields import ArrayField
+from carlasc.storage.packed.array_layout import FieldLayout, FrameTable
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.shards import (
+    METADATA,
+    ZarrArray,
+    column_metadata,
+    encode_chunk,
+    group_metadata,
+    join_shard,
+    split_shard,
+)
 
 BLOCKS = "blocks"  # folder of the tables
 _ASKED_ONE_BY_ONE = 4  # blocks; a caller that asks for more is going to ask for all
 _FRESH_S = 1.0  # "does not exist" is not answered from a listing older than this
-Table = dict[int, dict[str, int]]
-"""The frames of a block: the number of elements of each in each column that it needs."""
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """A frame of a field as it is stored: its chunks in each column that it needs, and their number of elements."""
+
+    counts: dict[str, int]
+    chunks: dict[str, list[bytes]]
+
+
+def encode_frame(field_layout: FieldLayout, array: NDArray[np.generic]) -> EncodedFrame:
+    """Return a frame as it is stored.
+
+    Raises:
+        FormatError: it does not fit the field.
+    """
+    counts, chunks = field_layout.divide(array)
+    encodings = {name: field_layout.columns[name].encoding for name in chunks}
+    return EncodedFrame(
+        counts, {name: [encode_chunk(chunk, encodings[name]) for chunk in parts] for name, parts in chunks.items()}
+    )
 
 
 class StoredField:
@@ -35,14 +63,14 @@ class StoredField:
         field: its name.
     """
 
-    def __init__(self, target: Target, node: str, field: str, options: Options) -> None:
+    def __init__(self, target: Target, node: str, field: str, options: PackOptions) -> None:
         self.target = target
         self.node = node
         self.field = field
         self.options = options
         self.where = f"{target.location}/{node}"
         self._layout: FieldLayout | None = None
-        self._tables: dict[int, Table | None] = {}
+        self._tables: dict[int, FrameTable | None] = {}
         self._listed_s: float | None = None
         self._denied: set[int] = set()
         self._asked = 0
@@ -55,7 +83,7 @@ class StoredField:
                 metadata = parse_json(bytes(self.target.tree.read(path)), self.target.tree.where(path))
             except MissingDataError:
                 return None
-            self._layout = FieldLayout.read(self.where, self.field, metadata.get("attributes"), self.options.block)
+            self._layout = FieldLayout.read(self.where, self.field, metadata.get("attributes"))
         return self._layout
 
     def create(self, typical: Callable[[], tuple[int, ...]]) -> FieldLayout:
@@ -117,7 +145,7 @@ class StoredField:
         self._listed_s = time.monotonic()
         self._denied = set()
 
-    def table(self, block: int) -> Table | None:
+    def table(self, block: int) -> FrameTable | None:
         """Return what the table of a block says now; None if the block does not exist."""
         path = table_path(self.node, block)
         try:
@@ -125,7 +153,7 @@ class StoredField:
         except MissingDataError:
             return None
 
-    def _parse(self, data: bytes | memoryview, path: str) -> Table | None:
+    def _parse(self, data: bytes | memoryview, path: str) -> FrameTable | None:
         """Return a table; None for an empty file, which a power failure can leave: the block is then made again."""
         return parse_table(bytes(data), self.target.tree.where(path)) if data else None
 
@@ -142,25 +170,27 @@ class StoredField:
             return None
         counts = {name: np.array([needed.get(name, 0)]) for name in found.columns}
         local = isinstance(self.target, LocalTarget)
-        field = open_field(
+        field = ArrayField(
             self.where, found, np.array([frame]), counts, lambda name: self._array(found, name, block), local=local
         )
         return field.read([frame])[0]
 
     def _array(self, found: FieldLayout, name: str, block: int) -> ZarrArray:
-        metadata = found.metadata(found.columns[name], (block + 1) * self.options.block)
+        size = self.options.block
+        metadata = column_metadata(found, found.columns[name], size, (block + 1) * size)
         return ZarrArray.from_metadata(self.target.tree, f"{self.node}/{name}", metadata)
 
-    def columns(self, block: int, frames: Mapping[int, Encoded]) -> list[str]:
+    def columns(self, block: int, frames: Mapping[int, EncodedFrame]) -> list[str]:
         """Return the columns whose object changes when frames are written to a block: those that they need, or needed before."""
         before = self._tables.get(block) or {}
         needed = {name for frame, encoded in frames.items() for name in (*encoded.chunks, *before.get(frame, {}))}
         return sorted(needed)
 
-    def put_column(self, name: str, block: int, frames: Mapping[int, Encoded]) -> None:
+    def put_column(self, name: str, block: int, frames: Mapping[int, EncodedFrame]) -> None:
         """Write the object of one column of a block: frames that it has already are kept, or replaced by those given."""
         found = self._known_layout()
-        array, slots = self._array(found, name, block), found.slots(found.columns[name])
+        array = self._array(found, name, block)
+        slots = array.slots
         path, room = array.file(block), array.per_shard or 1
         places = {frame: frame % self.options.block * slots for frame in frames}
         new = {places[f] + k: chunk for f, e in frames.items() for k, chunk in enumerate(e.chunks.get(name, ()))}
@@ -173,7 +203,7 @@ class StoredField:
             self.target.put(path, merged)
             there = bytes(self.target.tree.read(path))  # another process may have replaced it meanwhile
 
-    def put_table(self, block: int, frames: Mapping[int, Encoded]) -> None:
+    def put_table(self, block: int, frames: Mapping[int, EncodedFrame]) -> None:
         """Write the table of a block, once its objects are whole: with the frames that it has already."""
         path, ours = table_path(self.node, block), {frame: encoded.counts for frame, encoded in frames.items()}
         if not self.target.put(path, format_table(ours), create=True):
@@ -205,12 +235,12 @@ def block_of(path: str) -> int | None:
     return int(stem) if is_table else None
 
 
-def format_table(table: Table) -> bytes:
+def format_table(table: FrameTable) -> bytes:
     """Return the bytes of a table: {"frames": {"17": {"xyz": 120800}, ...}}, frames and columns in order."""
     return to_json({"frames": {str(frame): dict(sorted(table[frame].items())) for frame in sorted(table)}})
 
 
-def parse_table(data: bytes, where: str) -> Table:
+def parse_table(data: bytes, where: str) -> FrameTable:
     """Read a table.
 
     Raises:

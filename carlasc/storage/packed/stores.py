@@ -18,12 +18,12 @@ from carlasc.storage.packed.output import unfinished_error
 from carlasc.storage.protocol import Sequence, Source, identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
 
-VERSION = 1  # of the format in docs/storage.md; zarr stores have a newer one
+VERSION = 3  # of the format in docs/storage.md, the same for all packed stores
 STORE = "carlasc.store"
 
 
 @dataclass(frozen=True)
-class Options:
+class PackOptions:
     """How a store is packed.
 
     Attributes:
@@ -55,25 +55,20 @@ class PackedSource(Source):
     """A packed store.
 
     Attributes:
-        version: version of the store's format.
         nodes: the group (or folder) of each sequence in the store, by the sequence's path.
         lossy_mm: step to which coordinates of points were rounded, millimetres; None if every bit was kept.
-        newest: the newest version that this class reads.
     """
 
-    version: int
     nodes: Mapping[str, str]
-    newest: int = VERSION
 
     def __init__(self, location: str, root: Mapping[str, Any] | None) -> None:
         """Check the attributes of the store's root.
 
         Raises:
-            FormatError: it is something else, unfinished, or of a newer version, or a name in it leads out of the store.
+            FormatError: it is something else, unfinished, or of another version, or a name in it leads out of the store.
         """
         self.location = location
-        self.nodes = _check_root(root, location, self.newest)
-        self.version = (root or {}).get("version", VERSION)
+        self.nodes = _check_root(root, location)
         lossy = (root or {}).get("lossy_mm")
         self.lossy_mm = float(lossy) if isinstance(lossy, int | float) and lossy else None
 
@@ -86,18 +81,20 @@ class PackedSource(Source):
         """Return the bytes that each field takes in the store; "documents" for the text files, "index" for all the rest."""
 
 
-def _check_root(root: Mapping[str, Any] | None, where: str, newest: int) -> Mapping[str, str]:
+def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]:
     if root is None or root.get("type") != STORE:
         raise FormatError(where, expected="a store packed by carlasc", found=f"one without the type {STORE}")
-    version = root.get("version", VERSION)
+    version = root.get("version", 1)
     if isinstance(version, bool) or not isinstance(version, int | np.integer) or version < 1:
         raise FormatError(where, expected="a version above 0", found=repr(version), advice="the store is damaged")
-    if version > newest:
+    if version != VERSION:
         raise FormatError(
             where,
-            expected=f"a store of version {newest} or older",
+            expected=f"a store of version {VERSION}",
             found=f"version {version}",
-            advice="upgrade carlasc to read it",
+            advice="upgrade carlasc to read it"
+            if version > VERSION
+            else "it was packed by an earlier, unreleased version of carlasc: pack it again",
         )
     if not root.get("complete"):
         raise unfinished_error(where)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -13,26 +12,23 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from carlasc.core.grids import Coordinates, GridSpec
+from carlasc.core.grids import Coordinates
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.arrays.blocks import StoredField
-from carlasc.storage.packed.arrays.chunks import in_threads
-from carlasc.storage.packed.arrays.fields import VERSION, Encoded
-from carlasc.storage.packed.arrays.reading import SEQUENCE, document_node, field_node
-from carlasc.storage.packed.arrays.zarr_begin import Root, existing_options
-from carlasc.storage.packed.arrays.zarr_finish import EXPECTED, finish, format_expected, parse_expected
-from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
-from carlasc.storage.packed.arrays.zarr_store import ZarrSource
-from carlasc.storage.packed.protocol import Options, check_names, node_of
+from carlasc.storage.files import to_json
+from carlasc.storage.packed.array_layout import SEQUENCE, document_node, field_node, typical_size
+from carlasc.storage.packed.chunks import in_threads
+from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of
 from carlasc.storage.protocol import identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame
+from carlasc.storage.zarr.root import StoreRoot, existing_options
+from carlasc.storage.zarr.shards import METADATA, group_metadata
+from carlasc.storage.zarr.zarr_finish import EXPECTED, finish, format_expected, parse_expected
+from carlasc.storage.zarr.zarr_source import ZarrSource
 
 _PUTS = 16  # objects that are written side by side
-_CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
-_PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
 _T = TypeVar("_T")
 
 
@@ -46,7 +42,7 @@ class ZarrSink(Sink):
     is_readable = True
 
     def __init__(
-        self, out: str | os.PathLike[str] | Target, options: Options | None = None, overwrite: bool = False
+        self, out: str | os.PathLike[str] | Target, options: PackOptions | None = None, overwrite: bool = False
     ) -> None:
         """Start a store, or join one that is being written, or was interrupted, with the same options.
 
@@ -66,10 +62,10 @@ class ZarrSink(Sink):
             import_extra(module, "zarr")
         self.target = out if isinstance(out, Target) else LocalTarget(Path(out))
         self.location = self.target.location
-        self.options = options or (Options() if overwrite else existing_options(self.target)) or Options()
+        self.options = options or (PackOptions() if overwrite else existing_options(self.target)) or PackOptions()
         if self.options.small:
             import_extra("pcodec", "zarr")
-        self._root = Root(self.target, self.options, overwrite)
+        self._root = StoreRoot(self.target, self.options, overwrite)
         self.is_finished = self._root.is_finished
 
     def sequence(self, path: str) -> ZarrWriter:
@@ -103,7 +99,7 @@ class ZarrWriter(SequenceWriter):
 
     concurrent = True
 
-    def __init__(self, target: Target, group: str, path: str, options: Options, root: Root) -> None:
+    def __init__(self, target: Target, group: str, path: str, options: PackOptions, root: StoreRoot) -> None:
         self.target = target
         self.group = group
         self.path = path
@@ -116,7 +112,7 @@ class ZarrWriter(SequenceWriter):
         self._begun = False
         self._keeps = True
         self._fields: dict[str, StoredField] = {}
-        self._held: dict[str, dict[int, Encoded]] = {}  # of one block
+        self._held: dict[str, dict[int, EncodedFrame]] = {}  # of one block
 
     def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
         """Record what a run is going to write: the store cannot be finished without it by accident."""
@@ -209,7 +205,7 @@ class ZarrWriter(SequenceWriter):
             self._fields[field] = StoredField(self.target, f"{self.group}/{field_node(field)}", field, self.options)
         return self._fields[field]
 
-    def _encode(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> dict[str, dict[int, Encoded]]:
+    def _encode(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> dict[str, dict[int, EncodedFrame]]:
         """Encode frames, in parallel in threads; new fields are created."""
         self._start()
         items = [(field, frame, array) for frame, fields in frames.items() for field, array in fields.items()]
@@ -218,41 +214,24 @@ class ZarrWriter(SequenceWriter):
             with _naming(self.location, name, frame):
                 layout.field_named(name).check(array, "its array")
             arrays.setdefault(name, []).append(array)
-        layouts = {name: self._field(name).create(partial(self._typical, name, arrays[name])) for name in arrays}
+        layouts = {
+            name: self._field(name).create(
+                partial(typical_size, layout.field_named(name), found, self._rows, self.read_document)
+            )
+            for name, found in arrays.items()
+        }
 
-        def encode(item: tuple[str, int, NDArray[Any]]) -> Encoded:
+        def encode(item: tuple[str, int, NDArray[Any]]) -> EncodedFrame:
             name, frame, array = item
             with _naming(self.location, name, frame):
-                return layouts[name].encode(array)
+                return encode_frame(layouts[name], array)
 
-        found: dict[str, dict[int, Encoded]] = {}
+        result: dict[str, dict[int, EncodedFrame]] = {}
         for (name, frame, _), encoded in zip(items, in_threads(encode, items), strict=True):
-            found.setdefault(name, {})[frame] = encoded
-        return found
+            result.setdefault(name, {})[frame] = encoded
+        return result
 
-    def _typical(self, name: str, arrays: list[NDArray[Any]]) -> tuple[int, ...]:
-        """Return the shape of a grid, or the number of elements of a typical frame: as announced, else the most of the first frames."""
-        entry = layout.field_named(name)
-        if entry.per == "voxel":
-            return arrays[0].shape
-        rows = self._rows.get("points") if entry.per == "point" else None
-        rows = self._rows.get(name) if rows is None else rows
-        if rows is None and entry.per == "vote":
-            rows = self._cells(entry.folder) // _CELLS_PER_VOTE
-        if rows is None:
-            rows = max(map(len, arrays))
-            rows = 1 << (max(rows, _PICTURE) - 1).bit_length() if entry.kind == "picture" else rows
-        return (rows,)
-
-    def _cells(self, grid: str) -> int:
-        """Return the number of voxels of a grid, 0 if nothing says it."""
-        data = self.read_document(layout.params_file(grid))
-        try:
-            return 0 if data is None else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
-        except FormatError:
-            return 0
-
-    def _put(self, block: int, encoded: Mapping[str, Mapping[int, Encoded]]) -> None:
+    def _put(self, block: int, encoded: Mapping[str, Mapping[int, EncodedFrame]]) -> None:
         """Write the objects of a block, then the tables which say that they are whole, that of the field that is given last at the end."""
         fields = {name: self._field(name) for name in encoded}
         objects = [(name, column) for name, field in fields.items() for column in field.columns(block, encoded[name])]

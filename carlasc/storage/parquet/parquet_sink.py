@@ -23,18 +23,17 @@ from carlasc.storage.packed.output import (
     remove,
     unfinished,
 )
-from carlasc.storage.packed.protocol import (
+from carlasc.storage.packed.stores import (
     STORE,
     VERSION,
     FieldWriter,
-    Options,
     PackedSink,
     PackedWriter,
+    PackOptions,
     node_of,
 )
-from carlasc.storage.packed.tables.columns import statistics, table_field
-from carlasc.storage.packed.tables.footers import footer_checksums
-from carlasc.storage.packed.tables.reading import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE
+from carlasc.storage.parquet.parquet_source import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE, footer_checksums
+from carlasc.storage.parquet.table_columns import AXES, column_types, describe, split_columns, statistics
 
 _LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
 _PAGE = 8 << 20  # bytes: one page holds a scan's column
@@ -43,7 +42,9 @@ _PAGE = 8 << 20  # bytes: one page holds a scan's column
 class ParquetSink(PackedSink):
     """Writes a folder of packed Parquet tables, which gets its name when the sink is closed, and not before."""
 
-    def __init__(self, path: str | os.PathLike[str], options: Options | None = None, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
+    ) -> None:
         """Start a store, or continue one whose packing was interrupted: its finished sequences are kept.
 
         Raises:
@@ -54,7 +55,7 @@ class ParquetSink(PackedSink):
         import_extra("pyarrow.parquet", "parquet")
         self.path = Path(path)
         self.location = str(path)
-        self.options = options or Options()
+        self.options = options or PackOptions()
         self.overwrite = overwrite
         if self.options.small:
             raise ArgumentError(
@@ -62,7 +63,7 @@ class ParquetSink(PackedSink):
             )
         refuse_existing(self.path, overwrite)
         self._part = unfinished(self.path)
-        run = to_json({"lossy_mm": self.options.lossy_mm})
+        run = to_json({"version": VERSION, "lossy_mm": self.options.lossy_mm})
         if not (self._part / UNFINISHED_MARK).is_file() or (self._part / UNFINISHED_MARK).read_bytes() != run:
             remove(self._part)
             write_atomic(self._part / UNFINISHED_MARK, run)
@@ -71,7 +72,7 @@ class ParquetSink(PackedSink):
         self._sequences = {
             about["path"]: file.parent.relative_to(self._part).as_posix() for file, about in done.items()
         }
-        self._numbers = {str(about["path"]): int(about.get(NUMBER, 0)) for about in done.values()}
+        self._numbers = {str(about["path"]): int(about[NUMBER]) for about in done.values()}
 
     def finished(self, path: str) -> bool:
         """Whether an earlier run that was interrupted has written this sequence whole."""
@@ -104,7 +105,7 @@ class ParquetWriter(PackedWriter):
     """Writes one sequence of a store of tables."""
 
     def __init__(
-        self, root: Path, path: str, folder: str, number: int, options: Options, finished: dict[str, str]
+        self, root: Path, path: str, folder: str, number: int, options: PackOptions, finished: dict[str, str]
     ) -> None:
         super().__init__(str(root / folder), path)
         self._folder = root / folder
@@ -115,7 +116,7 @@ class ParquetWriter(PackedWriter):
         self._statistics: dict[int, dict[str, Any]] = {}
 
     def _start_field(self, field: str) -> FieldWriter:
-        return _TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
+        return TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Append one frame as a row group.
@@ -180,13 +181,12 @@ def _write_table(table: Any, path: Path) -> None:
     file.check()
 
 
-class _TableWriter(FieldWriter):
+class TableWriter(FieldWriter):
     """Writes one field's file, row group by row group."""
 
-    def __init__(self, path: Path, field: str, number: int, options: Options) -> None:
+    def __init__(self, path: Path, field: str, number: int, options: PackOptions) -> None:
         super().__init__(field)
         self._number = number
-        self.kind = table_field(field)
         self.path = path
         self.scale_m = options.scale_m if field == "points" else None
         self.rows: list[int] = []  # of each frame
@@ -198,7 +198,7 @@ class _TableWriter(FieldWriter):
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)
-        columns = self.kind.split(array, self.attributes)
+        columns = split_columns(self.entry, array, self.attributes)
         count = len(next(iter(columns.values())))
         if count:
             place = (np.full(count, self._number, np.int32), np.full(count, frame, np.int64))
@@ -214,13 +214,13 @@ class _TableWriter(FieldWriter):
             "version": VERSION,
             "field": self.entry.name,
             "unit": self.entry.unit,
-        } | self.kind.describe(array, self.scale_m)
-        types, is_picture = self.kind.columns(self.attributes), self.entry.kind == "picture"
+        } | describe(self.entry, array, self.scale_m)
+        types, is_picture = column_types(self.entry, self.attributes), self.entry.kind == "picture"
         self._schema = pa.schema(
             [("sequence", pa.int32()), ("frame", pa.int64())]
             + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
-        split = {name: "BYTE_STREAM_SPLIT" for name in types if name in self.kind.split_bytes}
+        split = {name: "BYTE_STREAM_SPLIT" for name in types if self.entry.kind == "position" and name in AXES}
         self._file = PatientFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
             self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
