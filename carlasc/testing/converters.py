@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import carlasc
+from carlasc import storage
 from carlasc.converting import Converter, convert, load_converter
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, relative_to, transform_points
@@ -67,7 +67,7 @@ class ConverterContract:
             workers=1,
         )
         assert result.failures == ()
-        (sequence,) = carlasc.open(out).sequences().values()
+        (sequence,) = storage.open(out).sequences().values()
         return sequence
 
     @pytest.fixture(scope="class")
@@ -86,7 +86,7 @@ class ConverterContract:
 
     @pytest.fixture
     def sequence(self, out: Path) -> Sequence:
-        (sequence,) = carlasc.open(out).sequences().values()
+        (sequence,) = storage.open(out).sequences().values()
         return sequence
 
     def test_every_point_is_kept_in_its_place(self, sequence: Sequence) -> None:
