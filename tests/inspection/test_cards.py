@@ -21,7 +21,7 @@ from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc.captures.lidar import Lidar
+from carlasc.captures.settings import Lidar
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError

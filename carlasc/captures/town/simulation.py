@@ -11,8 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from carlasc.captures.lidar import Lidar
-from carlasc.captures.settings import TrafficLevel
+from carlasc.captures.settings import Lidar, TrafficLevel
 from carlasc.captures.town.simulated import SimulatedCapture
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
@@ -51,7 +50,7 @@ class SimulationResult:
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _SimulationSettings:
     """The settings of a capture, as simulation.json holds them."""
 
     seed: int
@@ -110,7 +109,7 @@ def simulate(
         count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev
     )
     check_shared(os.fspath(out), count_workers(workers))
-    settings = _Settings(seed, traffic, sensors, bev, lidar or Lidar())
+    settings = _SimulationSettings(seed, traffic, sensors, bev, lidar or Lidar())
     check_dependencies(bev)
     writer = CaptureWriter(out)
     writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc simulate")
