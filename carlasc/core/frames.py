@@ -1,4 +1,4 @@
-"""Which frames: a half-open range of frame numbers."""
+"""Which frames: a half-open range of frame numbers; and their times in seconds, told from counts of smaller units."""
 
 from __future__ import annotations
 

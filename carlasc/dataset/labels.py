@@ -1,4 +1,4 @@
-"""Class ids as samples hold them: mapped by one lookup table, with errors that name the file and the id."""
+"""The fields of a sample that come from labels and grids: mapped class ids, which voxels are known, and how certain they are."""
 
 from __future__ import annotations
 
