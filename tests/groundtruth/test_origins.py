@@ -11,8 +11,7 @@ from carlasc.converting import LayoutOptions, Sensor, convert
 from carlasc.core import GridSpec, runs_of_origins, sorted_by_origin, translation
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.merging import PreparedScan
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.running import Run
 from carlasc.testing import SimulatedDrive, Thing

@@ -98,7 +98,8 @@ def show(root: Path, attempt: Attempt) -> None:
 def draw(root: Path, attempt: Attempt) -> None:
     """Draw a picture of the first frame."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
-        attempt(lambda: carlasc.render(root, Path(out) / "a.png", size=(96, 64), still=True))
+        camera, style = carlasc.CameraOptions(still=True), carlasc.StyleOptions(size=(96, 64))
+        attempt(lambda: carlasc.render(root, Path(out) / "a.png", camera=camera, style=style))
 
 
 def pack_again(root: Path, attempt: Attempt) -> None:
@@ -235,7 +236,7 @@ def regrid_again(root: Path, attempt: Attempt) -> None:
 
 def tracks_in(root: Path, attempt: Attempt) -> None:
     """Read the tracks of actors that regrid keeps, which a run that goes on takes for damaged rather than stop."""
-    from carlasc.groundtruth.from_scans.actors import Actors
+    from carlasc.motion.tracks import MovingActors
 
     for file in sorted(root.rglob("*.npz")):
-        attempt(Actors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))
+        attempt(MovingActors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))
