@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -121,20 +119,3 @@ def test_a_public_functions_arguments_and_result_are_no_any(report: dict[str, li
         if text.startswith("def "):
             assert not text.endswith("-> Any"), line
             assert " Any," not in text.replace("**", ""), line
-
-
-def test_what_type_checkers_see_is_what_python_finds() -> None:
-    tree = ast.parse(Path(carlasc.__file__).read_text())
-    (typed,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    seen: dict[str, set[str]] = {}
-    for node in typed.body:
-        assert isinstance(node, ast.ImportFrom)
-        for alias in node.names:
-            assert alias.name == alias.asname  # exported again
-            seen.setdefault((node.module or "").removeprefix("carlasc").lstrip("."), set()).add(alias.name)
-    homes = {room: set(names) for room, names in vars(carlasc)["_HOMES"].items()}
-    rooms = set(vars(carlasc)["_ROOMS"])
-    assert seen.pop("") == rooms
-    assert seen == homes
-    for name in carlasc.__all__:
-        assert getattr(carlasc, name) is not None

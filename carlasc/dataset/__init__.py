@@ -1,8 +1,5 @@
 """`Dataset`: samples for training, from any Source."""
 
-from carlasc.dataset.labels import RemapLike
-from carlasc.dataset.samples import EVIDENCE_FIELDS, FIELDS, Dataset, collate
-from carlasc.dataset.sampling import ShardSampler
-from carlasc.dataset.transforms import Flip, Sample
+import lazy_loader
 
-__all__ = ["EVIDENCE_FIELDS", "FIELDS", "Dataset", "Flip", "RemapLike", "Sample", "ShardSampler", "collate"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,6 +3,8 @@
 See `docs/howto/source.md` and `docs/howto/converter.md` for examples.
 """
 
+import lazy_loader
+
 from carlasc.errors import DependencyError
 
 try:
@@ -14,19 +16,4 @@ pytest.register_assert_rewrite(
     "carlasc.testing.contracts", "carlasc.testing.converters"
 )  # failures show the values that were compared
 
-from carlasc.testing.contracts import SinkContract, SourceContract  # noqa: E402
-from carlasc.testing.converters import ConverterContract  # noqa: E402
-from carlasc.testing.data import published_bytes, write_dataset  # noqa: E402
-from carlasc.testing.drives import KINDS, DriveScan, SimulatedDrive, Thing  # noqa: E402
-
-__all__ = [
-    "KINDS",
-    "ConverterContract",
-    "DriveScan",
-    "SimulatedDrive",
-    "SinkContract",
-    "SourceContract",
-    "Thing",
-    "published_bytes",
-    "write_dataset",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -4,17 +4,7 @@ import numpy as np
 import pytest
 from helpers.datasets.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
-from carlasc.converting import (
-    Cloud,
-    Sensor,
-    Trajectory,
-    VoxelContent,
-    mirror_boxes,
-    mirror_grid,
-    mirror_points,
-    mirror_poses,
-    mirror_spec,
-)
+from carlasc.converting import Cloud, Sensor, Trajectory, VoxelContent
 from carlasc.converting.assembling import Motion, Rig, assemble
 from carlasc.converting.places import check_outside
 from carlasc.converting.plans import begin, choose_recordings, plan_recording
@@ -22,6 +12,7 @@ from carlasc.converting.scans import Block, FrameJob, convert_block, make_fields
 from carlasc.converting.target import Target
 from carlasc.converting.trajectory import frame_times, jitter, read_trajectory, scan_poses
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
+from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.storage import Metadata, layout

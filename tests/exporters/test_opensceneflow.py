@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers.datasets.exported import files_and_bytes, read_index
 
-from carlasc.converting import export, mirror_boxes, mirror_points, mirror_poses
+from carlasc.converting import export
+from carlasc.core.axes import mirror_boxes, mirror_points, mirror_poses
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, rotate_vectors, transform_points
 from carlasc.errors import FormatError, MissingDataError

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting import FrameExporter, TargetFrame, is_same, mirror_points, resample_to, resampling_notes
+from carlasc.converting import FrameExporter, TargetFrame, is_same, resample_to, resampling_notes
+from carlasc.core.axes import mirror_points
 from carlasc.core.benchmarks import IGNORED
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting import VOXEL_FILES, Files, FrameExporter, mirror_grid, mirror_poses, mirror_spec
+from carlasc.converting import VOXEL_FILES, Files, FrameExporter
+from carlasc.core.axes import mirror_grid, mirror_poses, mirror_spec
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import MissingDataError

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from carlasc import storage
-from carlasc.converting import Exported, Files, TargetFrame, mirror_poses
+from carlasc.converting import Exported, Files, TargetFrame
+from carlasc.core.axes import mirror_poses
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.geometry import quaternions_of, translation
 from carlasc.core.grids import GridSpec

@@ -15,15 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting import (
-    Exported,
-    Files,
-    SequenceExporter,
-    SequenceFile,
-    mirror_boxes,
-    mirror_points,
-    mirror_poses,
-)
+from carlasc.converting import Exported, Files, SequenceExporter, SequenceFile
+from carlasc.core.axes import mirror_boxes, mirror_points, mirror_poses
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.tables import SEMANTICKITTI

@@ -1,0 +1,9 @@
+from .contracts import SinkContract as SinkContract
+from .contracts import SourceContract as SourceContract
+from .converters import ConverterContract as ConverterContract
+from .data import published_bytes as published_bytes
+from .data import write_dataset as write_dataset
+from .drives import KINDS as KINDS
+from .drives import DriveScan as DriveScan
+from .drives import SimulatedDrive as SimulatedDrive
+from .drives import Thing as Thing
