@@ -40,7 +40,7 @@ class LayoutFlags(Flags):
         ),
     ] = "left"
     flow: Annotated[
-        carlasc.converting.Flow,
+        carlasc.converting.FlowSource,
         typer.Option(
             help="auto: the velocity of each actor, from its tracked boxes or else from its points. none: no flow."
         ),

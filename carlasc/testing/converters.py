@@ -14,9 +14,11 @@ import pytest
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.converting import Converter, convert, load_converter
+from carlasc.converting import Converter, LayoutOptions, convert, load_converter
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, relative_to, transform_points
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 from carlasc.storage import Sequence
 from carlasc.testing.drives import KINDS, SimulatedDrive, world_T_sensor
 
@@ -59,12 +61,11 @@ class ConverterContract:
             self.converter,
             source,
             out,
-            axes="left" if axes == "left" else "right",
-            classes=classes,
-            grids="none",
+            layout=LayoutOptions(axes="left" if axes == "left" else "right", classes=classes),
+            poses=PoseOptions(force="poses" not in self.keeps),
+            grids=None,
             options=self.options,
-            force="poses" not in self.keeps,
-            workers=1,
+            run=Run(workers=1),
         )
         assert result.failures == ()
         (sequence,) = carlasc.open(out).sequences().values()

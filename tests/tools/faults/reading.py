@@ -118,7 +118,7 @@ def export_again(root: Path, attempt: Attempt) -> None:
     """Export a data set to each of the formats."""
     for name in exporter_names():
         with tempfile.TemporaryDirectory(dir=root.parent) as out:
-            attempt(lambda name=name, out=out: carlasc.export(name, root, out, workers=1))
+            attempt(lambda name=name, out=out: carlasc.export(name, root, out, run=Run(workers=1)))
 
 
 def regrid_captures(root: Path, attempt: Attempt) -> None:
@@ -163,7 +163,7 @@ def conversion_of(converter: str) -> Callable[[Path, Attempt], None]:
 
     def read(root: Path, attempt: Attempt) -> None:
         with tempfile.TemporaryDirectory(dir=root.parent) as out:
-            attempt(lambda: convert(converter, root, out, grids="none", workers=1))
+            attempt(lambda: convert(converter, root, out, grids=None, run=Run(workers=1)))
 
     return read
 

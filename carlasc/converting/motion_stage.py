@@ -13,31 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.actors import Velocity
-from carlasc.converting.assembling import Motion, Rig, assemble
-from carlasc.converting.nearby import labels_nearby
-from carlasc.converting.outcomes import Fields, Outcome, written_in_worker
-from carlasc.converting.protocol import FrameHandle
-from carlasc.converting.scans import make_fields
-from carlasc.converting.target import Target
+from carlasc.converting.assembling import read_scan
+from carlasc.converting.scan_stage import ConvertedFrame, Fields, FrameBlock, FrameJob, make_fields
 from carlasc.core.axes import mirror_boxes, mirror_points
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
+from carlasc.core.grids import most_frequent
 from carlasc.core.scans import Scan
 from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
-from carlasc.storage.sinks import SequenceWriter
 
 _FAR_M = 100.0  # objects farther away than this are not filled in
+_CELLS_M = (0.25, 0.5, 1.0)  # how near labelled points must be: the smallest cell that has any decides
+_GROUND_CELLS_M = (0.5, 1.0, 2.0)  # in the plane: on the ground, the rings of two scans may be metres apart
+_HALF = 1 << 14  # cells to each side of the origin
 
 
 @dataclass(frozen=True)
-class FinishJob:
+class MotionJob(FrameJob):
     """A frame to finish.
 
     Attributes:
-        handle: the frame.
         first_T_scan: (4, 4) its pose.
-        motion: the motion of the vehicle around it.
         velocities: velocity of each moving actor, where actors are numbered.
         tracks: the tracks of boxes at the frame, with classes of the target; None where the data set has no boxes.
         boxes: the annotated boxes of the frame, right-handed, in the frame of the scan; None where it was not annotated.
@@ -45,64 +42,36 @@ class FinishJob:
         labelled: whether its points have labels in the data set. Those that an interrupted run made from boxes are made again.
     """
 
-    handle: FrameHandle
-    first_T_scan: Transform
-    motion: Motion | None = None
+    first_T_scan: Transform = field(kw_only=True)
     velocities: Mapping[int, Velocity] = field(default_factory=dict)
     tracks: tuple[Track, ...] | None = None
     boxes: Boxes | None = None
-    nearby: tuple[FinishJob, ...] = ()
+    nearby: tuple[MotionJob, ...] = ()
     labelled: bool = True
 
 
 @dataclass(frozen=True)
-class FinishBlock:
-    """Several frames that a worker finishes in one task.
+class MotionBlock(FrameBlock[MotionJob]):
+    """Several frames to finish; `flow` says whether flow is written."""
 
-    Attributes:
-        jobs: the frames.
-        target: how they are written.
-        writer: where they are written.
-        rig: the sensors.
-        flow: whether flow is written.
-    """
-
-    jobs: tuple[FinishJob, ...]
-    target: Target
-    writer: SequenceWriter
-    rig: Rig
     flow: bool = True
 
-
-def finish_block(block: FinishBlock) -> list[Outcome]:
-    """Finish several frames, and write them if the writer can be used in workers."""
-    return written_in_worker(block.writer, [_finish(job, block) for job in block.jobs])
-
-
-def fail_finish_block(block: FinishBlock, message: str) -> list[Outcome]:
-    """Return the outcomes of a block that no worker could finish."""
-    return [Outcome(job.handle.number, failure=message) for job in block.jobs]
+    def make(self, job: MotionJob, frame: ConvertedFrame) -> Fields:
+        """Return what the motion of actors adds to a frame."""
+        return _by_instances(job, self) if job.tracks is None else _by_boxes(job, self)
 
 
-def _finish(job: FinishJob, block: FinishBlock) -> Outcome:
-    outcome = Outcome(job.handle.number)
-    add = _by_instances if job.tracks is None else _by_boxes
-    outcome.take(lambda: add(job, block))
-    return outcome
-
-
-def _read_back(job: FinishJob, block: FinishBlock, *names: str) -> Fields:
+def _read_back(job: MotionJob, block: MotionBlock, *names: str) -> Fields:
     """Return fields of a frame as they were written, only those that exist; labels only if they are of the data set."""
     number, writer = job.handle.number, block.writer
     wanted = [name for name in names if job.labelled or name != "labels"]
     written = {name: writer.read(name, number) for name in wanted if writer.has(name, number)}
     if writer.has("points", number) and all(array is not None for array in written.values()):
         return {name: array for name, array in written.items() if array is not None}
-    scan = assemble(job.handle.read(), block.rig, job.motion, job.handle.location)
-    return make_fields(scan, block.target, job.handle.location)
+    return make_fields(read_scan(job.handle, block.rig, job.motion), block.target, job.handle.location)
 
 
-def _by_instances(job: FinishJob, block: FinishBlock) -> Fields:
+def _by_instances(job: MotionJob, block: MotionBlock) -> Fields:
     """Return the flow of a scan whose points have numbers: the velocity of each point's actor, zero for all other points."""
     written = _read_back(job, block, "instances") if block.flow else {}
     if "instances" not in written:
@@ -115,7 +84,7 @@ def _by_instances(job: FinishJob, block: FinishBlock) -> Fields:
     return {"flow": mirror_points(flow) if block.target.mirrored else flow}
 
 
-def _by_boxes(job: FinishJob, block: FinishBlock) -> Fields:
+def _by_boxes(job: MotionJob, block: MotionBlock) -> Fields:
     """Return labels, instances, boxes and flow of a scan whose objects have boxes. Labels and instances of the data set are kept."""
     assert job.tracks is not None
     written = _read_back(job, block, "points", "labels", "instances")
@@ -162,7 +131,7 @@ def _labels_of(
 
 
 def _labelled_nearby(
-    job: FinishJob, block: FinishBlock
+    job: MotionJob, block: MotionBlock
 ) -> list[tuple[NDArray[np.float64], NDArray[np.unsignedinteger]]]:
     """Return points, in the frame of the scan of a job, and class ids of the labelled frames around it."""
     found = []
@@ -175,7 +144,7 @@ def _labelled_nearby(
     return found
 
 
-def _boxes_of(job: FinishJob, tracks: Sequence[Track]) -> Boxes:
+def _boxes_of(job: MotionJob, tracks: Sequence[Track]) -> Boxes:
     """Return the annotated boxes of a frame, and those of tracks that extend to it although nobody annotated them there."""
     number = job.handle.number
     there = set() if job.boxes is None else set(job.boxes.tracks.tolist())
@@ -193,3 +162,57 @@ def _boxes_of(job: FinishJob, tracks: Sequence[Track]) -> Boxes:
         np.zeros(len(filled), np.bool_),
     )
     return more if job.boxes is None else job.boxes.joined(more)
+
+
+def labels_nearby(
+    points: NDArray[np.floating],
+    ground: NDArray[np.bool_],
+    labelled: Sequence[tuple[NDArray[np.floating], NDArray[np.unsignedinteger]]],
+    classes: ClassTable,
+) -> NDArray[np.uint32]:
+    """Return the class that most labelled points near each point have.
+
+    Points on the ground get classes of the ground, others get other classes. Classes of what can move are not taken over: it may have
+    moved since.
+
+    Args:
+        points: (N, 3) metres, in a frame whose z points up.
+        ground: (N,) whether they are on the ground.
+        labelled: (M, 3) points in the same frame and (M,) class ids of each labelled scan.
+        classes: table of the ids.
+
+    Returns:
+        (N,) class ids, 0 where no labelled point is near.
+    """
+    found = np.zeros(len(points), np.uint32)
+    if not labelled:
+        return found
+    places = np.concatenate([own for own, _ in labelled])
+    labels = np.concatenate([own for _, own in labelled]).astype(np.int64)
+    on_ground = np.isin(labels, sorted(classes.ground))
+    fixed = (labels > 0) & ~np.isin(labels, sorted(classes.movable | classes.moving)) & ~on_ground
+    for own, source, sizes, axes in (
+        (ground, on_ground, _GROUND_CELLS_M, 2),
+        (~ground, fixed, _CELLS_M, 3),
+    ):
+        for size in sizes:
+            open_ = np.flatnonzero(own & (found == 0))
+            if len(open_) and source.any():
+                found[open_] = _by_cells(points[open_, :axes], places[source, :axes], labels[source], size)
+    return found
+
+
+def _by_cells(
+    points: NDArray[np.floating], places: NDArray[np.floating], labels: NDArray[np.int64], size: float
+) -> NDArray[np.uint32]:
+    """Return the most frequent label in the cell of each point, the lowest of several; 0 where the cell is empty."""
+    keys, winners = most_frequent(_cells(places, size), labels)
+    wanted = _cells(points, size)
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[rows] == wanted, winners[rows], 0).astype(np.uint32)
+
+
+def _cells(places: NDArray[np.floating], size: float) -> NDArray[np.int64]:
+    """Return one number per cell, below 2 ** 45. Cells beyond 4 km or more count as the last one."""
+    index = np.clip(np.floor(places / size), -_HALF, _HALF - 1).astype(np.int64) + _HALF
+    return index @ ((2 * _HALF) ** np.arange(index.shape[1]))

@@ -1,38 +1,78 @@
-"""What a conversion writes: in which axes, and in which classes."""
+"""How the sequences of a conversion are written: what the caller says of it, and what that means for the ids and the axes of a data set."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.converting.protocol import Converter
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.errors import FormatError
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.storage.metadata import Axes
 
+FlowSource = Literal["auto", "none"]
 _IDS = np.iinfo(np.uint16).max + 1
 _UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
 _MAX_LISTED = 8
 
 
 @dataclass(frozen=True)
-class Target:
-    """How frames are written.
+class LayoutOptions:
+    """How a conversion writes sequences.
+
+    Attributes:
+        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids.
+        axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
+        flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
+            the actor's points, if they are numbered; "none" writes no flow.
+        allow_unknown: treat class ids that the table does not have as unlabelled.
+
+    Raises:
+        ArgumentError: unknown axes, or an unknown source of flow.
+    """
+
+    classes: str = "carla"
+    axes: Axes = "left"
+    flow: FlowSource = "auto"
+    allow_unknown: bool = False
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("axes", get_args(Axes)), ("flow", get_args(FlowSource))):
+            if getattr(self, name) not in allowed:
+                raise ArgumentError(name, expected=f"one of {', '.join(allowed)}", found=repr(getattr(self, name)))
+
+    def of(self, converter: type[Converter]) -> AxesAndClasses:
+        """Return the axes and the classes in which the data of a converter are written.
+
+        Raises:
+            ArgumentError: `classes` is neither "carla" nor the name of the converter's class table.
+        """
+        allowed = ("carla", converter.classes.name)
+        if self.classes not in allowed:
+            raise ArgumentError("classes", expected=f"one of {', '.join(allowed)}", found=repr(self.classes))
+        remap = converter.to_carla if self.classes == "carla" else None
+        return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
+
+
+@dataclass(frozen=True)
+class AxesAndClasses:
+    """The axes and the classes in which frames of a data set are written.
 
     Attributes:
         source: class table of the ids that are read.
         remap: maps them to other ids; None keeps them.
         mirrored: whether y is mirrored, from right-handed axes to CarlaSC's left-handed ones.
         allow_unknown: whether ids that the table does not have become unlabelled.
-        voxels: whether the data set's own voxel grids are written.
     """
 
     source: ClassTable
     remap: Remap | None
     mirrored: bool
     allow_unknown: bool = False
-    voxels: bool = False
 
     @property
     def classes(self) -> ClassTable:

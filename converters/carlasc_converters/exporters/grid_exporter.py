@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +17,16 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 
+GridName = Annotated[
+    str | None,
+    "Grid that is exported. Default: the one with exactly the voxels of the other data set, else the one of the smallest voxels.",
+]
+Predictions = Annotated[bool, "The grids are the output of a network, without counts: all of their voxels are known."]
 _CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
 
 
 class GridExporter(FrameExporter):
     """Writes voxel grids of a given geometry, in classes of a given table.
-
-    Args:
-        grid: name of the grid that is exported. None takes the one that has exactly the voxels that are written, else the one of the
-            smallest voxels.
-        predictions: whether the grids are the output of a network, in which all voxels are known.
 
     Attributes:
         target: geometry of the grids that are written, in the frame that `frame_of` returns.
@@ -42,7 +42,7 @@ class GridExporter(FrameExporter):
     free: ClassVar[int]
     slug: ClassVar[str]
 
-    def __init__(self, grid: str | None = None, *, predictions: bool = False) -> None:
+    def __init__(self, grid: GridName = None, *, predictions: Predictions = False) -> None:
         self.grid, self.predictions = grid, predictions
 
     def frame_of(self, sequence: storage.Sequence) -> TargetFrame:

@@ -22,6 +22,7 @@ from carlasc.converting import export
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.metrics import evaluate
+from carlasc.running import Run
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.files import to_json
 
@@ -38,7 +39,7 @@ def source(tmp_path_factory):
 @pytest.fixture(scope="module")
 def occ3d(source, tmp_path_factory):
     out = tmp_path_factory.mktemp("occ3d")
-    return out, export("occ3d", source, out, workers=1)
+    return out, export("occ3d", source, out, run=Run(workers=1))
 
 
 def test_occ3d_has_things_where_they_are_from_the_ground_below_the_sensor(occ3d):
@@ -93,7 +94,7 @@ def test_clouds_without_rays_are_not_sent_to_regrid_which_refuses_them(source, t
     (poses,) = (tmp_path / "tiles").rglob("poses.txt")
     metadata = {"format": 2, "axes": "left", "classes": "carla", "rays": False}
     poses.with_name("carlasc.json").write_text(json.dumps(metadata))
-    notes = " ".join(export("occ3d", tmp_path / "tiles", tmp_path / "out", workers=1).notes)
+    notes = " ".join(export("occ3d", tmp_path / "tiles", tmp_path / "out", run=Run(workers=1)).notes)
     assert "the grid small covers 3 % of the volume" in notes
     assert "regrid" not in notes
 
@@ -105,15 +106,15 @@ def test_occ3d_is_scored_as_its_source_is(source, occ3d):
 
 
 def test_scenes_of_earlier_exports_stay_in_the_annotations(source, tmp_path):
-    export("occ3d", source, tmp_path / "out", workers=1)
+    export("occ3d", source, tmp_path / "out", run=Run(workers=1))
     other = write_scene(tmp_path / "other", path="Train/Town01_Light/cartesian")
-    export("occ3d", other, tmp_path / "out", workers=1)
+    export("occ3d", other, tmp_path / "out", run=Run(workers=1))
     annotations = json.loads((tmp_path / "out" / "annotations.json").read_text())
     assert (annotations["train_split"], annotations["val_split"]) == (["Town01_Light"], [NAME])
     assert set(annotations["scene_infos"]) == {"Town01_Light", NAME}
     (tmp_path / "out" / "annotations.json").write_text("damaged")
     with pytest.raises(FormatError, match="annotations.json: expected JSON"):
-        export("occ3d", other, tmp_path / "out", workers=1)
+        export("occ3d", other, tmp_path / "out", run=Run(workers=1))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def test_scenes_of_earlier_exports_stay_in_the_annotations(source, tmp_path):
 )
 def test_the_height_of_the_sensor_is_taken_from_where_it_is_known(tmp_path, metadata, options, height):
     write_scene(tmp_path / "in", frames=1, metadata=metadata)
-    result = export("occ3d", tmp_path / "in", tmp_path / "out", workers=1, **options)
+    result = export("occ3d", tmp_path / "in", tmp_path / "out", options=options, run=Run(workers=1))
     _, arrays = read_occ3d(tmp_path / "out", NAME)
     (array,) = arrays.values()
     assert array["semantics"][occ3d_cell(5.1, -3.1, -1.1 + height)] == 4
@@ -138,14 +139,14 @@ def test_the_height_of_the_sensor_is_taken_from_where_it_is_known(tmp_path, meta
 
 def test_right_handed_data_are_not_mirrored(tmp_path):
     write_scene(tmp_path / "in", frames=1, metadata={"axes": "right"})
-    export("occ3d", tmp_path / "in", tmp_path / "out", workers=1)
+    export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     _, arrays = read_occ3d(tmp_path / "out", NAME)
     (array,) = arrays.values()
     assert array["semantics"][occ3d_cell(5.1, 3.1, 0.7)] == 4
 
 
 def test_openoccupancy_has_the_axes_of_the_lidar_of_nuscenes(source, tmp_path):
-    export("openoccupancy", source, tmp_path, workers=1)
+    export("openoccupancy", source, tmp_path, run=Run(workers=1))
     (scene,) = tmp_path.glob("scene_*")
     files = sorted((scene / "occupancy").glob("*.npy"))
     assert len(files) == 6
@@ -161,7 +162,7 @@ def test_openoccupancy_has_the_axes_of_the_lidar_of_nuscenes(source, tmp_path):
 
 
 def test_sscbench_has_raw_ids_and_a_byte_for_each_invalid_voxel(source, tmp_path):
-    result = export("sscbench", source, tmp_path, workers=1)
+    result = export("sscbench", source, tmp_path, run=Run(workers=1))
     folder = tmp_path / "data_2d_raw" / "2013_05_28_drive_0000_sync" / "voxels"
     assert result.made == 2
     assert sorted(path.name for path in folder.glob("*.label")) == ["000000.label", "000005.label"]
@@ -183,19 +184,19 @@ def test_sscbench_has_raw_ids_and_a_byte_for_each_invalid_voxel(source, tmp_path
 
 
 def test_sscbench_takes_as_many_frames_as_asked_for(source, tmp_path):
-    assert export("sscbench", source, tmp_path, every="2", workers=1).made == 3
+    assert export("sscbench", source, tmp_path, options={"every": "2"}, run=Run(workers=1)).made == 3
     with pytest.raises(ArgumentError, match="every: expected 1 or more, found 0"):
-        export("sscbench", source, tmp_path, every=0, workers=1)
+        export("sscbench", source, tmp_path, options={"every": 0}, run=Run(workers=1))
     with pytest.raises(ArgumentError, match="every: expected a whole number, found 'often'"):
-        export("sscbench", source, tmp_path, every="often", workers=1)
+        export("sscbench", source, tmp_path, options={"every": "often"}, run=Run(workers=1))
     with pytest.raises(ConflictError, match="every=2"):
-        export("sscbench", source, tmp_path, every=3, workers=1)
+        export("sscbench", source, tmp_path, options={"every": 3}, run=Run(workers=1))
 
 
 def test_a_sequence_without_a_frame_to_export_is_named(tmp_path):
     write_scene(tmp_path / "in", frames=2)
     (tmp_path / "in" / PATH / "small" / "000000.label").unlink()
-    result = export("sscbench", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("sscbench", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert result.made == 0
     assert any(note.endswith("Town07_Light/cartesian has no frame to export") for note in result.notes)
 
@@ -203,7 +204,7 @@ def test_a_sequence_without_a_frame_to_export_is_named(tmp_path):
 def test_sscbench_keeps_the_numbers_of_kitti_360(tmp_path):
     for name in ("KITTI360_0001", "Town07_Light"):
         write_scene(tmp_path / "in", frames=1, path=f"Train/{name}/cartesian")
-    result = export("sscbench", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("sscbench", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert sorted(result.sequences.values()) == [
         f"data_2d_raw/2013_05_28_drive_{number}_sync" for number in ("0000", "0001")
     ]
@@ -225,7 +226,7 @@ def test_the_exact_grid_is_exported_voxel_for_voxel(tmp_path, name):
     writer.write_document("whole/params.json", to_json(exact.to_params()))
     writer.write("whole/labels", 0, labels)
     writer.write("whole/counts", 0, counts.astype(np.float32))
-    result = export(name, tmp_path / "in", tmp_path / "out", workers=1)
+    result = export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert not result.notes
     mirrored, known = labels[:, ::-1], counts[:, ::-1]
     if name == "occ3d":
@@ -248,13 +249,13 @@ def test_the_exact_grid_is_exported_voxel_for_voxel(tmp_path, name):
 
 @pytest.mark.parametrize("name", GRID_FORMATS)
 def test_an_interrupted_export_gives_the_same_bytes(source, tmp_path, name):
-    export(name, source, tmp_path / "whole", workers=1)
-    export(name, source, tmp_path / "parts", workers=1)
+    export(name, source, tmp_path / "whole", run=Run(workers=1))
+    export(name, source, tmp_path / "parts", run=Run(workers=1))
     whole = files_and_bytes(tmp_path / "whole")
     frames = [path for path in whole if path.endswith((".npz", ".npy", ".label"))]
     for path in frames[1:]:
         (tmp_path / "parts" / path).unlink()
-    result = export(name, source, tmp_path / "parts", workers=1)
+    result = export(name, source, tmp_path / "parts", run=Run(workers=1))
     assert (result.made, result.skipped) == (len(frames) - 1, 1)
     assert files_and_bytes(tmp_path / "parts") == whole
 
@@ -263,7 +264,7 @@ def test_an_interrupted_export_gives_the_same_bytes(source, tmp_path, name):
 def test_a_frame_that_fails_does_not_stop_the_others(source, tmp_path, name):
     write_scene(tmp_path / "in", frames=6)
     (tmp_path / "in" / PATH / "small" / "000005.label").write_bytes(b"short")
-    result = export(name, tmp_path / "in", tmp_path / "out", workers=1)
+    result = export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert [failure.frame for failure in result.failures] == [5]
     assert "000005.label" in result.failures[0].message
     assert result.made == (1 if name == "sscbench" else 5)
@@ -276,32 +277,32 @@ def test_a_frame_that_fails_does_not_stop_the_others(source, tmp_path, name):
 def test_predictions_need_no_counts(tmp_path, name):
     write_scene(tmp_path / "in", frames=1, counts=False)
     with pytest.raises(MissingDataError, match="small: expected counts, .*`predictions=True`"):
-        export(name, tmp_path / "in", tmp_path / "out", workers=1)
+        export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert not (tmp_path / "out").exists()
-    assert export(name, tmp_path / "in", tmp_path / "out", predictions=True, workers=1).made == 1
+    assert export(name, tmp_path / "in", tmp_path / "out", options={"predictions": True}, run=Run(workers=1)).made == 1
 
 
 @pytest.mark.parametrize("name", GRID_FORMATS)
 def test_what_cannot_be_exported_is_named_in_one_line(tmp_path, name):
     write_scene(tmp_path / "in", frames=1)
     with pytest.raises(MissingDataError, match="expected the grid fine, found small"):
-        export(name, tmp_path / "in", tmp_path / "out", grid="fine", workers=1)
-    with pytest.raises(ArgumentError, match="option: expected one of grid, .*, found nonsense"):
-        export(name, tmp_path / "in", tmp_path / "out", nonsense=1, workers=1)
+        export(name, tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
+    with pytest.raises(ArgumentError, match="options: expected one of grid, .*, found nonsense"):
+        export(name, tmp_path / "in", tmp_path / "out", options={"nonsense": 1}, run=Run(workers=1))
     writer = FolderSink(tmp_path / "in").sequence(PATH)
     round_ = GridSpec("cylindrical", (4, 4, 2), (0.0, -3.0, -2.0), (8.0, 3.0, 0.5))
     writer.write_document("round/params.json", to_json(round_.to_params()))
     writer.write("round/labels", 0, np.zeros(round_.size, np.uint32))
     with pytest.raises(ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"):
-        export(name, tmp_path / "in", tmp_path / "out", grid="round", workers=1)
+        export(name, tmp_path / "in", tmp_path / "out", options={"grid": "round"}, run=Run(workers=1))
     scans = FolderSink(tmp_path / "scans").sequence(PATH)
     scans.write("points", 0, np.ones((1, 4), np.float32))
     with pytest.raises(MissingDataError, match="expected a Cartesian grid, found none: make one: `carlasc regrid`"):
-        export(name, tmp_path / "scans", tmp_path / "out", workers=1)
+        export(name, tmp_path / "scans", tmp_path / "out", run=Run(workers=1))
     table = {"name": "lab", "names": {"0": "free", "1": "road"}, "colors": {"0": [0, 0, 0], "1": [1, 1, 1]}}
     (tmp_path / "in" / PATH / layout.METADATA).write_bytes(to_json({"classes": table}))
     with pytest.raises(FormatError, match="expected classes with a map: carla, .*, found lab"):
-        export(name, tmp_path / "in", tmp_path / "out", workers=1)
+        export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 
 
@@ -319,7 +320,7 @@ def test_class_tables_have_maps(tmp_path, classes, ids, semantics):
     labels = np.resize(np.array(ids, np.uint32), SPEC.size[0])[:, None, None] * np.ones(SPEC.size, np.uint32)
     labels = np.repeat(labels[::2], 2, axis=0)  # alike in both voxels of one of the target
     FolderSink(tmp_path / "in").sequence(PATH).write("small/labels", 0, labels)
-    export("occ3d", tmp_path / "in", tmp_path / "out", workers=1)
+    export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     (array,) = read_occ3d(tmp_path / "out", NAME)[1].values()
     inside = array["semantics"][:, 100, 4][array["mask_lidar"][:, 100, 4] == 1]
     assert set(inside.tolist()) == set(semantics)
@@ -331,6 +332,6 @@ def test_an_id_beyond_the_table_fails_its_frame(tmp_path):
     labels = np.zeros(SPEC.size, np.uint32)
     labels[40, 3, 4] = 24
     writer.write("small/labels", 1, labels)
-    result = export("occ3d", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert [failure.frame for failure in result.failures] == [1]
     assert "small of frame 1: expected class ids of carla, found 24 (1 times)" in result.failures[0].message
