@@ -86,7 +86,7 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
     try:
         yield
     except _UsageError as error:
-        path = "carlasc" if error.ctx is None else error.ctx.command_path
+        path = f"carlasc {command.name}" if error.ctx is None else error.ctx.command_path
         text = " ".join(error.format_message().split()).rstrip(".")
         fail(f"{text[:1].lower()}{text[1:]}: see `{path} --help`", WRONG_USAGE)
     except CarlascError as error:

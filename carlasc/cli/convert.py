@@ -70,11 +70,11 @@ def _print_list(wanted: bool) -> None:
 
 
 def convert(
+    options: DeclaredOptions,
     layout: LayoutFlags,
     poses: PoseFlags,
     making: GroundTruthFlags,
     run: RunFlags,
-    options: DeclaredOptions,
     name: Annotated[
         str,
         typer.Argument(

@@ -31,8 +31,8 @@ def _print_list(wanted: bool) -> None:
 
 
 def export(
-    run: RunFlags,
     options: DeclaredOptions,
+    run: RunFlags,
     name: Annotated[
         str,
         typer.Argument(

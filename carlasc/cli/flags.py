@@ -92,7 +92,7 @@ def _parameters(group: type[Flags]) -> Iterator[inspect.Parameter]:
         info = copy.copy(info)
         info.rich_help_panel = group.heading or None
         default = inspect.Parameter.empty if field.default is MISSING else field.default
-        annotation = Annotated[kind, info]  # type: ignore[valid-type]
+        annotation = Annotated[kind, info]
         yield inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
@@ -120,7 +120,7 @@ def _declared(option: OptionDeclaration) -> inspect.Parameter:
         rich_help_panel="Options of this data set",
         show_default=False,
     )
-    kind: Any = Literal[option.choices] if option.choices else option.type  # type: ignore[valid-type]
+    kind: Any = Literal[option.choices] if option.choices else option.type
     annotation = Annotated[kind | None, info]
     name = f"{_DECLARED}{option.name}"
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
@@ -133,6 +133,8 @@ def _shown(default: object) -> str:
 @dataclass(frozen=True)
 class WorkFlags(Flags):
     """How work is spread."""
+
+    heading: ClassVar[str] = "How the work is spread"
 
     workers: Annotated[
         int | None, typer.Option(help="Processes that work side by side; if not given, one per core.", min=1)

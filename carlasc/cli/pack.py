@@ -39,7 +39,7 @@ def pack(
         echo(f"{result.out}: part {run.part} is packed; the last part finishes the store")
 
 
-def _print(result: carlasc.storage.PackResult) -> None:
+def _print(result: carlasc.storage.packing.PackResult) -> None:
     from rich.table import Table
 
     echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")

@@ -1,5 +1,6 @@
 from .colors import ClassColors as ClassColors
 from .colors import Entry as Entry
+from .colors import PaletteName as PaletteName
 from .colors import colorblind_palette as colorblind_palette
 from .rendering.cameras import Viewpoint as Viewpoint
 from .rendering.drawings import Drawing as Drawing
@@ -7,6 +8,7 @@ from .rendering.drawings import error_drawing as error_drawing
 from .rendering.drawings import flow_drawing as flow_drawing
 from .rendering.drawings import grid_drawing as grid_drawing
 from .rendering.drawings import scan_drawing as scan_drawing
+from .rendering.evidence import GridColor as GridColor
 from .rendering.pictures import Panel as Panel
 from .rendering.pictures import draw_panels as draw_panels
 from .rendering.pictures import render_comparison as render_comparison
@@ -14,6 +16,7 @@ from .rendering.pictures import render_grid as render_grid
 from .rendering.pictures import render_scan as render_scan
 from .rendering.run import RenderResult as RenderResult
 from .rendering.run import render as render
+from .rendering.styles import StyleName as StyleName
 from .scene import FrameContent as FrameContent
 from .scene import GridPanel as GridPanel
 from .scene import Scene as Scene
