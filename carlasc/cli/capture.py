@@ -11,6 +11,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json, progress_bar
 from carlasc.cli.flags import Flags
+from carlasc.core.choices import TrafficLevel
 
 OutArgument = Annotated[
     str, place_argument("Folder of the sequence, or its URL: the capture is written to OUT/raw.", "OUT")
@@ -26,7 +27,7 @@ class SensorFlags(Flags):
     sensors: Annotated[int, typer.Option(help="Number of LiDARs. The first is the ego sensor.", min=1)] = 20
     seed: Annotated[int, typer.Option(help="Seed of all random choices: traffic, sensor positions, noise.", min=0)] = 0
     traffic: Annotated[
-        carlasc.captures.TrafficLevel,
+        TrafficLevel,
         typer.Option(help="Amount of traffic: 25, 50 or 100 moving vehicles, and as many pedestrians."),
     ] = "medium"
     channels: Annotated[int, typer.Option(help="Number of channels of each LiDAR.", min=1)] = 64

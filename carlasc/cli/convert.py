@@ -20,6 +20,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
+from carlasc.core.choices import Axes, FlowSource, SplitName
 from carlasc.errors import ArgumentError
 
 
@@ -34,13 +35,13 @@ class LayoutFlags(Flags):
         ),
     ] = "carla"
     axes: Annotated[
-        carlasc.storage.Axes,
+        Axes,
         typer.Option(
             help="left: y is mirrored into CarlaSC's left-handed axes. right: right-handed, as in the data set."
         ),
     ] = "left"
     flow: Annotated[
-        carlasc.converting.FlowSource,
+        FlowSource,
         typer.Option(
             help="auto: the velocity of each actor, from its tracked boxes or else from its points. none: no flow."
         ),
@@ -87,7 +88,7 @@ def convert(
         str | None,
         typer.Option(help="Names of sequences or the last parts of them, separated by commas: 00,08. Default: all."),
     ] = None,
-    split: Annotated[carlasc.converting.SplitName, typer.Option(help="Only sequences of this split.")] = "all",
+    split: Annotated[SplitName, typer.Option(help="Only sequences of this split.")] = "all",
     grids: Annotated[
         Literal["scans", "voxels", "none"],
         typer.Option(

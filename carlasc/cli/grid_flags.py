@@ -11,6 +11,7 @@ import typer
 import carlasc
 from carlasc.cli.common import parse_numbers
 from carlasc.cli.flags import Flags
+from carlasc.core.choices import Complete, Coordinates, Dynamic, VoteRule
 from carlasc.errors import ArgumentError
 
 Preset = Literal["coarse", "fine", "cylindrical"]
@@ -31,9 +32,7 @@ class GridFlags(Flags):
         None
     )
     preset: Annotated[Preset | None, typer.Option(help="A grid of the published data set.")] = None
-    coordinates: Annotated[
-        carlasc.core.Coordinates | None, typer.Option(help="Coordinates of the grid; default: cartesian.")
-    ] = None
+    coordinates: Annotated[Coordinates | None, typer.Option(help="Coordinates of the grid; default: cartesian.")] = None
     bounds: Annotated[
         str | None,
         typer.Option(
@@ -92,7 +91,7 @@ class VoteFlags(Flags):
     heading: ClassVar[str] = "Votes"
 
     rule: Annotated[
-        carlasc.groundtruth.VoteRule | None,
+        VoteRule | None,
         typer.Option(
             "--voting",
             help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures);"
@@ -156,7 +155,7 @@ class WindowFlags(Flags):
         typer.Option(help="First and last scan to merge, relative to each frame, in frames; default: -30:30."),
     ] = None
     dynamic: Annotated[
-        carlasc.groundtruth.Dynamic | None,
+        Dynamic | None,
         typer.Option(
             help="What happens to moving points. align: complete each actor from all scans (default); current: use those of the frame"
             " itself; drop: use none; tube: leave them where they were seen, as in SemanticKITTI."
@@ -192,7 +191,7 @@ class ScanFlags(WindowFlags):
         int | None, typer.Option(help="Merge every N-th scan of the window; default: 1.", metavar="N")
     ] = None
     complete: Annotated[
-        carlasc.groundtruth.Complete | None,
+        Complete | None,
         typer.Option(
             help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown; mirror: a side is taken from the"
             " other side (default); body: and what is still missing from the usual shape of vehicles."
