@@ -57,10 +57,12 @@ class LayoutFlags(Flags):
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
     """Return the options of the converter that the arguments name, if they name one."""
+    named = [argument for argument in arguments if not argument.startswith("-")]
+    if not named:  # of which the library need not be loaded
+        return ()
     known = set(carlasc.converting.converter_names())
-    name = next((argument for argument in arguments if argument in known), None)
-    load = carlasc.converting.load_converter
-    return () if name is None else carlasc.converting.option_declarations(load(name))
+    name = next((argument for argument in named if argument in known), None)
+    return () if name is None else carlasc.converting.option_declarations(carlasc.converting.load_converter(name))
 
 
 def _print_list(wanted: bool) -> None:
