@@ -38,6 +38,7 @@ from .inspection import info as info
 from .inspection import report as report
 from .inspection import stats as stats
 from .inspection import validate as validate
+from .metrics import Scoring as Scoring
 from .metrics import evaluate as evaluate
 from .metrics import scores as scores
 from .running import Run as Run
@@ -49,7 +50,9 @@ from .storage import finish as finish
 from .storage import open as open
 from .storage import pack as pack
 from .storage import unpack as unpack
+from .viewing import CameraOptions as CameraOptions
 from .viewing import Scene as Scene
+from .viewing import StyleOptions as StyleOptions
 from .viewing import render as render
 from .viewing import view as view
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
@@ -22,6 +22,7 @@ from carlasc.cli.common import (
     report_failures,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
+from carlasc.core.choices import Voxels
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
@@ -50,9 +51,7 @@ class ScoringFlags(Flags):
 
     heading: ClassVar[str] = "Part of the grid"
 
-    voxels: Annotated[
-        carlasc.metrics.Voxels, typer.Option(help="Voxels that count: those that the truth evaluated, or all.")
-    ] = "known"
+    voxels: Annotated[Voxels, typer.Option(help="Voxels that count: those that the truth evaluated, or all.")] = "known"
     near_m: Annotated[
         float, typer.Option("--near", help="Score only voxels at this distance from the sensor or farther, metres.")
     ] = 0.0
@@ -63,7 +62,7 @@ class ScoringFlags(Flags):
         float, typer.Option(help="Score only voxels in this angle about the forward axis, degrees.", min=1, max=360)
     ] = 360.0
     by: Annotated[
-        list[Literal["distance", "height", "visibility", "motion"]] | None,
+        list[BreakdownName] | None,
         typer.Option(help="Also score parts of the grid; may be given several times."),
     ] = None
     rays: Annotated[

@@ -88,6 +88,7 @@ def _parameters(group: type[Flags]) -> Iterator[inspect.Parameter]:
         if _is_group(hint):
             yield from _parameters(hint)
             continue
+        kind: Any
         kind, info = get_args(hint)
         info = copy.copy(info)
         info.rich_help_panel = group.heading or None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import typer
 
@@ -12,6 +12,7 @@ import carlasc
 from carlasc.cli.common import Json, echo, file_option, places_argument, print_json
 from carlasc.cli.flags import Flags, WorkFlags
 from carlasc.cli.view import SceneFlags, describe_frames
+from carlasc.core.choices import GridColor, PaletteName, StyleName, ViewName
 from carlasc.errors import ArgumentError
 
 
@@ -22,7 +23,7 @@ class CameraFlags(Flags):
     heading: ClassVar[str] = "Camera"
 
     view: Annotated[
-        Literal["perspective", "bev", "both"],
+        ViewName,
         typer.Option(help="From behind and above, from straight above (bird's-eye view), or both."),
     ] = "perspective"
     viewpoint: Annotated[
@@ -49,7 +50,7 @@ class StyleFlags(Flags):
     heading: ClassVar[str] = "Style"
 
     style: Annotated[
-        carlasc.viewing.StyleName,
+        StyleName,
         typer.Option(help="paper: 300 dpi, type of 8 points, and the legend in a file of its own (NAME.legend.png)."),
     ] = "screen"
     size: Annotated[
@@ -89,7 +90,7 @@ class ContentFlags(Flags):
         typer.Option(help="grid, scan, flow, truth, errors; several, separated by commas, are drawn side by side."),
     ] = None
     color: Annotated[
-        carlasc.viewing.GridColor,
+        GridColor,
         typer.Option(help="What the colours of the grid mean: classes, or one of the kinds of evidence."),
     ] = "class"
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes around actors.")] = False
@@ -116,7 +117,7 @@ def render(
         typer.Option("--grid-of", help="Draw panels of several SOURCES, or of the frames of one, with captions."),
     ] = False,
     palette: Annotated[
-        carlasc.viewing.PaletteName,
+        PaletteName,
         typer.Option(help="Colours of the class table, colours for colour-blind readers, or colours by height."),
     ] = "class",
     fps: Annotated[

@@ -20,6 +20,7 @@ from carlasc.cli.common import (
     progress_bar,
 )
 from carlasc.cli.flags import Flags
+from carlasc.core.choices import PaletteName
 from carlasc.errors import ArgumentError
 
 
@@ -48,7 +49,7 @@ class SceneFlags(Flags):
         str | None, typer.Option(help="Class table of the labels in SOURCE, if its metadata do not say it.")
     ] = None
 
-    def scene(self, source: str, palette: carlasc.viewing.PaletteName) -> carlasc.Scene:
+    def scene(self, source: str, palette: PaletteName) -> carlasc.Scene:
         """Return the scene of a source."""
         return carlasc.Scene(source, **vars(self), palette=palette)
 

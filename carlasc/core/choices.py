@@ -25,3 +25,21 @@ SplitName = Literal["train", "val", "test", "all"]
 
 FlowSource = Literal["auto", "none"]
 """Whether converted sequences get scene flow."""
+
+Voxels = Literal["known", "all"]
+"""Which voxels are scored."""
+
+BreakdownName = Literal["distance", "height", "visibility", "motion"]
+"""What a score can be broken down by."""
+
+ViewName = Literal["perspective", "bev", "both"]
+"""Where the pictures of a scene are taken from."""
+
+StyleName = Literal["screen", "paper"]
+"""What a picture is made for."""
+
+PaletteName = Literal["class", "colorblind", "height"]
+"""The colours of classes, or colours by height."""
+
+GridColor = Literal["class", "confidence", "views", "votes", "inferred"]
+"""What the colours of a grid mean: its classes, or one of the kinds of evidence (see `docs/format.md#evidence`)."""

@@ -30,7 +30,11 @@ def main(converter: str, source: Path, out: Path, chosen: list[int]) -> None:
         scene = Scene(source=sequence.location, frames=(frame, frame + 1))
         for what in ("scan,grid", "flow"):
             picture = out / f"{sequence.name}_{frame:06d}_{what.replace(',', '_')}.png"
-            print(carlasc.render(scene, picture, what=what, size=(1600, 700), overwrite=True).out)
+            print(
+                carlasc.render(
+                    scene, picture, what=what, style=carlasc.StyleOptions(size=(1600, 700)), overwrite=True
+                ).out
+            )
 
 
 if __name__ == "__main__":

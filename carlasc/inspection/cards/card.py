@@ -194,7 +194,7 @@ def _describe(facts: Facts) -> str:
 
 def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:
     """Draw a grid and a scan; return (file, what it shows) of each picture, and notes on those that could not be drawn."""
-    from carlasc.viewing import Scene, render
+    from carlasc.viewing import Scene, StyleOptions, render
 
     drawn, notes = [], []
     with_content = {
@@ -214,7 +214,7 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
             scene = Scene(
                 sequence, frames=(frame, frame + 1), grid=None if what == "scan" else next(iter(sequence.grids))
             )
-            result = render(scene, target, what=what, size=_SIZE, overwrite=overwrite)
+            result = render(scene, target, what=what, style=StyleOptions(size=_SIZE), overwrite=overwrite)
         except (DependencyError, MissingDataError) as error:
             notes.append(f"no picture of a {what}: {error}")
             continue

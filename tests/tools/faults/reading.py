@@ -98,7 +98,8 @@ def show(root: Path, attempt: Attempt) -> None:
 def draw(root: Path, attempt: Attempt) -> None:
     """Draw a picture of the first frame."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
-        attempt(lambda: carlasc.render(root, Path(out) / "a.png", size=(96, 64), still=True))
+        camera, style = carlasc.CameraOptions(still=True), carlasc.StyleOptions(size=(96, 64))
+        attempt(lambda: carlasc.render(root, Path(out) / "a.png", camera=camera, style=style))
 
 
 def pack_again(root: Path, attempt: Attempt) -> None:

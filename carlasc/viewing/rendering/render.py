@@ -20,15 +20,19 @@ from carlasc.storage import Source
 from carlasc.viewing.colors import merge_legends
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.rendering.boxes import check_boxes
-from carlasc.viewing.rendering.cameras import Viewpoint
+from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
 from carlasc.viewing.rendering.encoding import FILMS, STILLS, encodable_size, is_film, write_pictures
 from carlasc.viewing.rendering.evidence import GridColor, check_color
-from carlasc.viewing.rendering.frames import FrameRenderer, scan_extent_in, view_of_drive, views_named
-from carlasc.viewing.rendering.pages import check_size
-from carlasc.viewing.rendering.panels import Cell, PictureRenderer, caption_panels, columns_of, plan_cells
-from carlasc.viewing.rendering.pictures import View
-from carlasc.viewing.rendering.styles import Style, StyleName, style_of
-from carlasc.viewing.rendering.texts import draw_legend
+from carlasc.viewing.rendering.pages import draw_legend
+from carlasc.viewing.rendering.panels import (
+    Cell,
+    FrameRenderer,
+    PictureRenderer,
+    caption_panels,
+    columns_of,
+    plan_cells,
+)
+from carlasc.viewing.rendering.styles import StyleOptions
 from carlasc.viewing.scene import Scene, SceneReader, as_scene
 from carlasc.viewing.targets import check_target
 
@@ -72,26 +76,15 @@ def render(
     out: str | os.PathLike[str] | None = None,
     *,
     what: str | None = None,
-    view: str = "perspective",
     color: GridColor = "class",
     boxes: bool = False,
-    style: StyleName = "screen",
-    size: tuple[int, int] | str | None = None,
-    dpi: float | None = None,
-    captions: Sequence[str] = (),
-    columns: int | None = None,
-    legend: bool = True,
-    ego: bool = True,
-    viewpoint: Viewpoint | None = None,
-    orbit: bool = False,
-    still: bool = False,
+    camera: CameraOptions = CameraOptions(),  # noqa: B008 (frozen)
+    style: StyleOptions = StyleOptions(),  # noqa: B008 (frozen)
     fps: float | None = None,
     overwrite: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> RenderResult:
     """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). No screen and no GPU are needed.
-
-    The camera follows the ego vehicle, because grids and scans are in the frame of its sensor; with `still` it does not move.
 
     A list of scenes is drawn as panels of one size, from the same camera, with captions: a PNG has a panel for each frame of each
     scene, a film one for each scene.
@@ -102,26 +95,16 @@ def render(
             A scene without `frames` gives a picture of the first frame, or a film of all frames.
         what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by side. None draws the grid,
             with a ground truth also the truth and the errors; or the scan if there is no grid.
-        view: "perspective", "bev" (bird's-eye view) or "both".
         color: what the colours of the grid mean: "class"; or "confidence" (the probability that a voxel is occupied), "views" (the
             scans that saw it), "votes", or "inferred" (where the knowledge comes from): see `docs/format.md#evidence`.
         boxes: whether boxes around actors are drawn: those of the field `boxes`, or else the tightest ones around the points of each
             actor of `instances`.
-        style: "screen"; or "paper": PNG with 300 pixels per inch, type of 8 points, and the legend in a file of its own,
-            `<name>.legend.png`.
-        size: (width, height) of the picture in pixels, or a text such as "8.8cm x 5cm" or "3.5in x 2in". None takes 1280 x 720
-            pixels, or 8.8 x 5 cm on paper.
-        dpi: pixels per inch, which a PNG says in its metadata. None takes 300 on paper and for a size with a unit.
-        captions: for a list of scenes: a text for each panel, after its letter. Empty names what differs between the panels.
-        columns: for a list of scenes: number of panels in a row. None takes the frames of one scene, or what fits best.
-        legend: whether the picture has a legend.
-        ego: whether a plain car is drawn at the sensor.
-        viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
-        orbit: whether the camera circles the scene once: while the frames follow each other, or around a single frame.
-        still: whether the camera stays in one place of the world while the vehicle drives; needs poses.
+        camera: from where the scene is seen. By default the camera follows the ego vehicle, behind and above it, because grids and
+            scans are in the frame of its sensor.
+        style: size, legend, captions and type; for a screen or for a paper.
         fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
         overwrite: whether an existing file is replaced.
-        run: how the work is spread over the pictures of a film, and who is told of its progress.
+        run: how the pictures are spread over processes, and who is told of the progress.
 
     Returns:
         What was drawn, and the file that it is in.
@@ -135,23 +118,14 @@ def render(
         DependencyError: a package is missing; the message names the extra.
     """
     started = time.monotonic()
-    layout = style_of(style, size, dpi)
-    check_size(layout.size)
     together = not isinstance(source, _ONE)
     scenes = [as_scene(source)] if isinstance(source, _ONE) else [as_scene(one) for one in source]
-    _check_together(scenes, captions, columns, together=together)
-    views, readers = views_named(view), [scene.open(what) for scene in scenes]
-    several = any(scene.frames is not None and len(r.frames) > 1 for scene, r in zip(scenes, readers, strict=True))
-    film = is_film(Path(out)) if out is not None else orbit or (several and not together)
-    if orbit or not film:
-        readers = [
-            replace(reader, frames=reader.frames[:1]) if scene.frames is None else reader
-            for scene, reader in zip(scenes, readers, strict=True)
-        ]
+    _check_together(scenes, style, together=together)
+    readers, film = _open_scenes(scenes, what, out, orbit=camera.orbit, together=together)
     target = _name_after(readers[0], film) if out is None else Path(out)
     check_target(target, STILLS + FILMS, overwrite)
-    legend_file = layout.legend_file(target) if legend and layout.legend_apart else None
-    _check_kind(target, readers[0] if not together else None, layout, film=film, orbit=orbit)
+    _check_kind(target, None if together else readers[0], style, film=film, orbit=camera.orbit)
+    legend_file = style.sheet.legend_file(target) if style.legend and style.sheet.legend_apart else None
     if legend_file is not None:
         check_target(legend_file, STILLS, overwrite)
     for reader in readers:
@@ -159,33 +133,31 @@ def render(
         if boxes:
             check_boxes(reader.data)
 
-    layout = replace(layout, size=encodable_size(target, layout.size))
-    renderers = [_prepare(r, views, ego=ego, color=color, boxes=boxes, orbit=orbit, still=still) for r in readers]
+    renderers = [FrameRenderer.of(reader, camera, ego=style.ego, color=color, boxes=boxes) for reader in readers]
     pictures = plan_cells(renderers, film)
-    entries = (
-        merge_legends(cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells) if legend else []
-    )
-    captioned = caption_panels(pictures[0], captions, film) if together else ()
+    shown = [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells] if style.legend else []
+    entries = merge_legends(shown)
+    sheet = replace(style.sheet, size=encodable_size(target, style.sheet.size))
     drawer = PictureRenderer(
-        layout,
-        [] if layout.legend_apart else entries,
-        captioned,
-        columns or (columns_of(pictures[0]) if together else None),
+        sheet,
+        [] if sheet.legend_apart else entries,
+        caption_panels(pictures[0], style.captions, film) if together else (),
+        style.columns or (columns_of(pictures[0]) if together else None),
     )
-    tasks = _plan(drawer, pictures, viewpoint or Viewpoint(), orbit=orbit)
+    shots = _plan_shots(drawer, pictures, camera)
     if fps is None:
-        fps = _ORBIT_FPS if orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(_render_task, tasks, run)) as drawn:
-        write_pictures(target, _reported(drawn, len(tasks), run.progress), fps, layout.dpi)
-    if legend_file is not None and entries and layout.font_size is not None:
-        write_pictures(legend_file, [draw_legend(entries, layout.font_size, layout.size[0])], fps, layout.dpi)
+        fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
+    with closing(run_all(_take, shots, run)) as drawn:
+        write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
+    if legend_file is not None and entries and sheet.font_size is not None:
+        write_pictures(legend_file, [draw_legend(entries, sheet.font_size, sheet.size[0])], fps, sheet.dpi)
     return RenderResult(
         target,
         ", ".join(dict.fromkeys(reader.path for reader in readers)),
         readers[0].contents,
         tuple(sorted({cell.frame for cells in pictures for cell in cells})),
-        len(tasks),
-        layout.size,
+        len(shots),
+        sheet.size,
         readers[0].table.name,
         time.monotonic() - started,
         tuple(_notes_of(readers, pictures)),
@@ -193,29 +165,31 @@ def render(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    drawer: PictureRenderer
-    cells: list[Cell]
-    viewpoint: Viewpoint
-
-
-def _render_task(task: _Task) -> NDArray[np.uint8]:
-    return task.drawer.render(task.cells, task.viewpoint)
-
-
-def _check_together(scenes: Sequence[Scene], captions: Sequence[str], columns: int | None, *, together: bool) -> None:
-    """Raise ArgumentError for arguments that have no meaning with this number of scenes."""
+def _check_together(scenes: Sequence[Scene], style: StyleOptions, *, together: bool) -> None:
+    """Raise ArgumentError for a style that has no meaning with this number of scenes."""
     if not scenes:
         raise ArgumentError("source", expected="at least one source", found="none")
-    if not together and (captions or columns is not None):
-        name = "captions" if captions else "columns"
+    if not together and (style.captions or style.columns is not None):
+        name = "captions" if style.captions else "columns"
         raise ArgumentError(name, expected="several sources or frames in one picture", found="one")
-    if columns is not None and columns < 1:
-        raise ArgumentError("columns", expected="1 or more", found=str(columns))
 
 
-def _check_kind(target: Path, alone: SceneReader | None, style: Style, *, film: bool, orbit: bool) -> None:
+def _open_scenes(
+    scenes: Sequence[Scene], what: str | None, out: str | os.PathLike[str] | None, *, orbit: bool, together: bool
+) -> tuple[list[SceneReader], bool]:
+    """Return readers of the frames that are drawn, and whether a film is made of them."""
+    readers = [scene.open(what) for scene in scenes]
+    several = any(scene.frames is not None and len(r.frames) > 1 for scene, r in zip(scenes, readers, strict=True))
+    film = is_film(Path(out)) if out is not None else orbit or (several and not together)
+    if orbit or not film:
+        readers = [
+            replace(reader, frames=reader.frames[:1]) if scene.frames is None else reader
+            for scene, reader in zip(scenes, readers, strict=True)
+        ]
+    return readers, film
+
+
+def _check_kind(target: Path, alone: SceneReader | None, style: StyleOptions, *, film: bool, orbit: bool) -> None:
     """Raise ArgumentError if a still picture cannot hold what is asked for, or a film has the style of paper.
 
     `alone` is the reader if each of its frames is a picture of its own, or None.
@@ -226,43 +200,31 @@ def _check_kind(target: Path, alone: SceneReader | None, style: Style, *, film: 
         raise ArgumentError("out", expected="a single frame for a PNG", found=found, advice=advice)
     if orbit and not film:
         raise ArgumentError("orbit", expected="a film", found=target.name, advice=advice)
-    if style.legend_apart and film:
+    if style.name == "paper" and film:
         raise ArgumentError("style", expected="screen for a film", found=style.name, advice="name a .png")
 
 
-def _notes_of(readers: Sequence[SceneReader], pictures: list[list[Cell]]) -> dict[str, None]:
-    """Return what readers chose and, for a single picture, which parts are empty; each note once, in order."""
-    notes = [note for reader in readers for note in reader.notes]
-    for cell in pictures[0] if len(pictures) == 1 else []:
-        drawings = ((content, cell.renderer.draw(content, cell.frame)) for content in cell.renderer.reader.contents)
-        notes += [f"{content}: {drawing.note}" for content, drawing in drawings if drawing.note]
-    return dict.fromkeys(notes)
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """One picture: what is drawn, and from where."""
+
+    drawer: PictureRenderer
+    cells: list[Cell]
+    viewpoint: Viewpoint
 
 
-def _prepare(
-    reader: SceneReader,
-    views: tuple[View, ...],
-    *,
-    ego: bool,
-    color: GridColor,
-    boxes: bool,
-    orbit: bool,
-    still: bool,
-) -> FrameRenderer:
-    """Return a renderer whose extent and fixed view are the same in all frames."""
-    extent = scan_extent_in(reader)
-    fixed_view = view_of_drive(reader, extent) if still else None
-    return FrameRenderer(reader, views, extent, ego, color, boxes, fixed_view, orbit)
-
-
-def _plan(drawer: PictureRenderer, pictures: list[list[Cell]], viewpoint: Viewpoint, *, orbit: bool) -> list[_Task]:
+def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions) -> list[_Shot]:
     """Return which frames are seen from where in each picture."""
-    if not orbit:
-        return [_Task(drawer, cells, viewpoint) for cells in pictures]
+    if not camera.orbit:
+        return [_Shot(drawer, cells, camera.viewpoint) for cells in pictures]
     if len(pictures) == 1:
         pictures = pictures * ORBIT_PICTURES
     angles = 2 * np.pi * np.arange(len(pictures)) / len(pictures)
-    return [_Task(drawer, cells, viewpoint.turned(float(a))) for cells, a in zip(pictures, angles, strict=True)]
+    return [_Shot(drawer, cells, camera.viewpoint.turned(float(a))) for cells, a in zip(pictures, angles, strict=True)]
+
+
+def _take(shot: _Shot) -> NDArray[np.uint8]:
+    return shot.drawer.render(shot.cells, shot.viewpoint)
 
 
 def _reported(
@@ -280,3 +242,12 @@ def _name_after(reader: SceneReader, film: bool) -> Path:
     what = "" if reader.contents == ("grid",) else f"_{'_'.join(reader.contents)}"
     numbers = f"{first:06d}" if first == last else f"{first:06d}-{last:06d}"
     return Path(f"{reader.data.sequence.name or 'carlasc'}{what}_{numbers}.{'mp4' if film else 'png'}")
+
+
+def _notes_of(readers: Sequence[SceneReader], pictures: list[list[Cell]]) -> dict[str, None]:
+    """Return what readers chose and, for a single picture, which parts are empty; each note once, in order."""
+    notes = [note for reader in readers for note in reader.notes]
+    for cell in pictures[0] if len(pictures) == 1 else []:
+        drawings = ((content, cell.renderer.draw(content, cell.frame)) for content in cell.renderer.reader.contents)
+        notes += [f"{content}: {drawing.note}" for content, drawing in drawings if drawing.note]
+    return dict.fromkeys(notes)
