@@ -13,6 +13,7 @@ from . import testing as testing
 from . import viewing as viewing
 from .captures import record as record
 from .captures import simulate as simulate
+from .converting import LayoutOptions as LayoutOptions
 from .converting import convert as convert
 from .converting import export as export
 from .core import Boxes as Boxes

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import carlasc
-from carlasc.groundtruth import FromScans
+from carlasc.groundtruth import FromScans, GridOptions
 from carlasc.viewing import Scene
 
 WINDOW = (-30, 30)
@@ -19,7 +19,7 @@ WINDOW = (-30, 30)
 
 def main(converter: str, source: Path, out: Path, chosen: list[int]) -> None:
     """Convert a data set, and draw frames of its first recording."""
-    result = carlasc.convert(converter, source, out / "data", observe=FromScans(window=WINDOW))
+    result = carlasc.convert(converter, source, out / "data", grids=GridOptions(observe=FromScans(window=WINDOW)))
     for note in result.notes:
         print(f"note: {note}")
     for failure in result.failures:
