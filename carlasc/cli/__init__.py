@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 
 from carlasc.cli.common import CommandGroup, echo
 from carlasc.cli.late_help import load_help
-from carlasc.first_use import note_compiling
+from carlasc.core.first_use import note_compiling
 
 _COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
     "demo",

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.protocol import Converter, Recording, Trajectory
+from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
-from carlasc.core.times import check_seconds
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.misfit import describe_misfit
