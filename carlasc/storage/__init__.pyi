@@ -1,6 +1,5 @@
 from .caching import Cache as Cache
 from .downloads import download as download
-from .finishing import finish as finish
 from .folders.folder import FolderSink as FolderSink
 from .folders.folder import FolderSource as FolderSource
 from .metadata import Axes as Axes
@@ -13,3 +12,4 @@ from .protocol import Source as Source
 from .sinks import SequenceWriter as SequenceWriter
 from .sinks import Sink as Sink
 from .unpacking import unpack as unpack
+from .zarr.zarr_finish import finish as finish

@@ -18,7 +18,7 @@ from helpers.servers.object_store import (
     options_for,
     s3_server,
 )
-from storage.test_shared_writing import FRAMES, PATH, arrays_of, start_sink, write_block
+from storage.test_block_tables import FRAMES, PATH, arrays_of, start_sink, write_block
 
 import carlasc
 from carlasc import Run

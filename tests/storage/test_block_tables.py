@@ -106,7 +106,7 @@ WHOLE_RUN = """
 import sys
 from pathlib import Path
 sys.path[:0] = sys.argv[2:]
-from storage.test_shared_writing import start, write_block
+from storage.test_block_tables import start, write_block
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.targets import LocalTarget
 out = Path(sys.argv[1])
