@@ -51,10 +51,7 @@ def capture(
     with progress_bar("capture") as progress:
         result = captures.record(
             out,
-            host=host,
-            port=port,
-            traffic_port=traffic_port,
-            timeout_s=timeout_s,
+            server=captures.ServerOptions(host, port, traffic_port, timeout_s),
             town=town,
             count=count,
             sensors=sensors,
