@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -164,8 +164,12 @@ def convert(
 
     Run it again to continue where it stopped: frames that exist are skipped.
     """
+    from carlasc.converting import LayoutOptions
     from carlasc.converting import convert as convert_recordings
     from carlasc.groundtruth import Voting
+    from carlasc.groundtruth.options import GridOptions
+    from carlasc.motion import PoseOptions
+    from carlasc.running import Run
 
     observe = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
     asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, observe))
@@ -177,7 +181,10 @@ def convert(
             expected="--bounds or --grids none with it, because the height of grids is found from the ground of all sequences",
             found="neither",
         )
-    spec = parse_grid_or_published(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
+    made: GridOptions | Literal["voxels"] | None = "voxels" if grids is Grids.voxels else None
+    if grids is Grids.scans:
+        spec = parse_grid_or_published(res, size, preset, coordinates, bounds)
+        made = GridOptions(spec, observe, None if rule is None else Voting(rule.value), follow_ground=bounds is None)
     with progress_bar(f"convert {name}") as progress, engine(cluster, workers) as executor:
         result = convert_recordings(
             name,
@@ -185,22 +192,11 @@ def convert(
             out,
             sequences=None if sequences is None else sequences.split(","),
             split=split.value,
-            classes=classes,
-            axes=axes.value,
-            grids=grids.value,
-            spec=spec,
-            observe=observe,
-            voting=None if rule is None else Voting(rule.value),
-            follow_ground=bounds is None,
-            poses=poses.value,
-            flow=flow.value,
-            allow_unknown=allow_unknown,
-            force=force,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
+            layout=LayoutOptions(classes, axes.value, flow.value, allow_unknown),
+            poses=PoseOptions(poses.value, force),
+            grids=made,
             options=parse_options(option),
+            run=Run(workers, executor, parse_part(part), progress),
         )
     if json:
         print_json(result)

@@ -138,8 +138,8 @@ def evaluate(
     Benchmarks differ in the voxels that count, in the classes, and in the classes of the mean: scores by different conventions cannot be
     compared. Intersections and unions are summed over all frames before they are divided.
     """
+    from carlasc.metrics import Scoring, evaluate_by_all_conventions
     from carlasc.metrics import evaluate as score
-    from carlasc.metrics import evaluate_by_all_conventions
 
     if plot is not None:
         from carlasc.inspection.charts import check_plot
@@ -157,19 +157,19 @@ def evaluate(
         _print_conventions(found, as_json)
         return
 
-    common |= {"convention": convention, "voxels": voxels}
-    common["region"] = None if (near_m, far_m, fov) == (0.0, None, 360.0) else _Region(near_m, far_m, fov)
+    region = None if (near_m, far_m, fov) == (0.0, None, 360.0) else _Region(near_m, far_m, fov)
+    common["convention"] = convention
     with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
-        parts = [part.value for part in by or ()]
-        result = score(
-            source, truth, by=parts, rays=rays, name=name, run=Run(workers or 1, executor, progress=progress), **common
+        scoring, run = (
+            Scoring(voxels, region, [part.value for part in by or ()], rays),
+            Run(workers or 1, executor, progress=progress),
         )
+        result = score(source, truth, scoring=scoring, name=name, run=run, **common)
     other = None
     if compare is not None:
         with progress_bar("Scoring the other") as progress, engine(cluster, workers) as executor:
-            other = score(
-                compare, truth, name=Path(compare).name, run=Run(workers or 1, executor, progress=progress), **common
-            )
+            scoring, run = Scoring(voxels, region), Run(workers or 1, executor, progress=progress)
+            other = score(compare, truth, scoring=scoring, name=Path(compare).name, run=run, **common)
     if per_frame is not None:
         from carlasc.storage.files import write_output
 

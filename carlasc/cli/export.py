@@ -26,11 +26,11 @@ from carlasc.cli.common import (
 
 def _print_list(wanted: bool) -> None:
     if wanted:
-        from carlasc.converting import exporter_names, load_exporter, option_names
+        from carlasc.converting import exporter_names, load_exporter, option_declarations
 
         for name in exporter_names():
             exporter = load_exporter(name)
-            options = ", ".join(option_names(exporter))
+            options = ", ".join(option.name for option in option_declarations(exporter))
             echo(f"{name}: {exporter.title}" + (f" (options: {options})" if options else ""))
         raise typer.Exit
 
@@ -73,6 +73,7 @@ def export(
     Run it again to continue where it stopped: frames that exist are skipped.
     """
     from carlasc.converting import export as export_sequences
+    from carlasc.running import Run
 
     options: dict[str, Any] = {**parse_options(option)}
     options |= {} if grid is None else {"grid": grid}
@@ -84,11 +85,8 @@ def export(
             out,
             sequences=None if sequences is None else sequences.split(","),
             overwrite=overwrite,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
-            **options,
+            options=options,
+            run=Run(workers, executor, parse_part(part), progress),
         )
     if json:
         print_json(result)

@@ -139,6 +139,15 @@ def render(
         )
         for source in sources
     ]
+    camera = viewing.CameraOptions(
+        view=view,
+        viewpoint=viewing.Viewpoint() if viewpoint is None else viewing.Viewpoint.parse(viewpoint),
+        orbit=orbit,
+        still=still,
+    )
+    look = viewing.StyleOptions(
+        name=style, size=size, dpi=dpi, captions=captions or (), columns=columns, legend=legend, ego=ego
+    )
     if len(scenes) > 1 and not grid_of:
         raise ArgumentError("SOURCE", expected="one", found=str(len(scenes)), advice="draw several with --grid-of")
     with progress_bar("Rendering", "pictures") as progress, engine(cluster, workers) as executor:
@@ -146,19 +155,10 @@ def render(
             scenes if grid_of else scenes[0],
             out,
             what=what,
-            view=view,
             color=color,
             boxes=boxes,
-            style=style,
-            size=size,
-            dpi=dpi,
-            captions=captions or (),
-            columns=columns,
-            legend=legend,
-            ego=ego,
-            viewpoint=None if viewpoint is None else viewing.Viewpoint.parse(viewpoint),
-            orbit=orbit,
-            still=still,
+            camera=camera,
+            style=look,
             fps=fps,
             run=Run(workers=workers, executor=executor, progress=progress),
             overwrite=overwrite,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.assembling import Rig, assemble
+from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.protocol import Converter, Recording, Trajectory
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
@@ -16,11 +16,11 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
+from carlasc.motion.options import PoseOptions
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence
 
-PoseSource = Literal["file", "kiss-icp", "auto"]
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
@@ -47,20 +47,23 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
     return check_seconds(np.asarray(times[:frames], np.float64), recording.location)
 
 
-def read_trajectory(
-    recording: Recording, times: NDArray[np.float64], pose_source: PoseSource, *, force: bool
-) -> Trajectory | None:
+def read_trajectory(recording: Recording, times: NDArray[np.float64], options: PoseOptions) -> Trajectory | None:
     """Return the poses of the vehicle at their own times, from the recording's files; None if they are to be estimated.
 
     Poses without times of their own are those of the frames.
+
+    Args:
+        recording: the recording.
+        times: (F,) seconds by frame number.
+        options: where poses come from.
 
     Raises:
         MissingDataError: the file of poses does not exist, and they are not to be estimated.
         FormatError: a frame has no pose, or there is one pose for all of them.
     """
-    trajectory = None if pose_source == KISS_ICP else recording.poses(force=force)
+    trajectory = None if options.source == KISS_ICP else recording.poses(force=options.force)
     if trajectory is None:
-        if pose_source == FILE:
+        if options.source == FILE:
             raise MissingDataError(
                 recording.location, expected="a file of poses", found="none", advice=f"copy it, or {_ESTIMATE}"
             )
@@ -125,11 +128,18 @@ def estimate_poses(
     Points of sensors that are not corrected for motion are corrected by the estimate, if their times are known. Scans that cannot be
     read are skipped: their conversion reports them. So are scans with too few points.
 
+    Args:
+        recording: its scans.
+        converter: says which points belong to the vehicle, and which are too far away.
+        times: (F,) seconds by frame number.
+        step: is called for each frame.
+
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
 
     Raises:
-        MissingDataError: no scan can be read.
+        CarlascError: no scan can be read: the error of the first one.
+        MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
     from carlasc.motion import odometry
@@ -137,13 +147,15 @@ def estimate_poses(
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
     found: list[int] = []
     read_at: list[float] = []  # times of the frames that were read
+    errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[odometry.UsableScan]:
         for handle in recording.frames:
             step()
             try:
-                scan = assemble(handle.read(), rig, None, handle.location)
-            except (CarlascError, OSError):
+                scan = read_scan(handle, rig, None)
+            except (CarlascError, OSError) as error:
+                errors.append(error)
                 continue
             used = odometry.usable_points(scan.points)
             if np.count_nonzero(used) < odometry.MIN_POINTS:
@@ -155,6 +167,8 @@ def estimate_poses(
 
     nearest, farthest = odometry_range(converter)
     poses = list(odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest))
+    if len(errors) == len(recording.frames):
+        raise errors[0]
     return fill_gaps(found, np.array(poses), recording)
 
 
@@ -192,14 +206,14 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
     Raises:
         FormatError: they do not; says which mistake the poses look like, and what to do.
     """
-    scans = _Scans(recording, converter)
+    scans = _RecordedScans(recording, converter)
     frames = [handle.number for handle in recording.frames]
 
     def structure(index: int) -> NDArray[np.float64]:
         try:
             return static_structure(scans, frames[index])
-        except (FormatError, MissingDataError):
-            return np.empty((0, 3))
+        except (CarlascError, OSError):
+            return np.empty((0, 3))  # its conversion reports it
 
     diagnosis = diagnose_poses(structure, poses[frames])
     expected = "poses under which the scans overlap"
@@ -225,7 +239,7 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
     return f"{found}: {advice}, or {_ESTIMATE}"
 
 
-class _Scans(Sequence):
+class _RecordedScans(Sequence):
     """A recording's scans as a sequence, in their own axes and classes, for functions that read sequences."""
 
     def __init__(self, recording: Recording, converter: type[Converter]) -> None:
@@ -244,8 +258,7 @@ class _Scans(Sequence):
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         if self._last[0] != frame:
-            handle = self._handles[frame]
-            scan = assemble(handle.read(), self._rig, None, handle.location)
+            scan = read_scan(self._handles[frame], self._rig, None)
             self._last = frame, {"points": scan.points} | ({} if scan.labels is None else {"labels": scan.labels})
         if field not in self._last[1]:
             raise MissingDataError(self.location, expected=field, found="none")

@@ -19,7 +19,7 @@ from PIL import Image
 import carlasc
 from carlasc import Grid, GridSpec, Run
 from carlasc.captures import TownDrive
-from carlasc.converting import convert
+from carlasc.converting import FlowSource, LayoutOptions, convert
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, count_votes, regrid
@@ -36,7 +36,7 @@ VEHICLE = CARLA.id_of("Vehicle")
 RUNS = {  # name: rule for what moves, and whether flow is estimated by the converter
     "tube": ("tube", "none"),
     "align, by instances": ("align", "none"),
-    "align, by instances and their estimated flow": ("align", "instances"),
+    "align, by instances and their estimated flow": ("align", "auto"),
 }
 
 
@@ -83,8 +83,16 @@ def main(out: Path) -> None:
     lines = [f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle |", "|---|---|" + "---:|" * 7]
     with tempfile.TemporaryDirectory() as place:
         write_kitti(Path(place) / "in", drive, FRAMES, voxels_every=0)
-        for flow in ("none", "instances"):
-            convert("kitti", Path(place) / "in", Path(place) / flow, grids="none", flow=flow, workers=2)  # type: ignore[arg-type]
+        flows: tuple[FlowSource, ...] = ("none", "auto")
+        for flow in flows:
+            convert(
+                "kitti",
+                Path(place) / "in",
+                Path(place) / flow,
+                layout=LayoutOptions(flow=flow),
+                grids=None,
+                run=Run(workers=2),
+            )
         clock("conversion")
         truths = {frame: reference(drive, frame) for frame in JUDGED}
         clock("reference")
