@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, progress_bar, report_failures
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 
 def card(

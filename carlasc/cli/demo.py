@@ -14,7 +14,7 @@ import typer
 from carlasc.cli.common import FAILED, Workers, echo, file_argument, progress_bar
 from carlasc.cli.stats import print_statistics
 from carlasc.cli.validate import print_result
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 
 def demo(

@@ -24,7 +24,7 @@ from carlasc.cli.common import (
     progress_bar,
     report_failures,
 )
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation

@@ -20,7 +20,7 @@ from carlasc.cli.common import (
     print_json,
     progress_bar,
 )
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
     from carlasc.storage.packing import PackResult

@@ -30,7 +30,7 @@ from carlasc.cli.scene_options import (
     describe_frames,
 )
 from carlasc.errors import ArgumentError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 
 def render(

@@ -38,7 +38,7 @@ from carlasc.cli.grid_options import (
     SizeOption,
     parse_grid_or_published,
 )
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
     from carlasc.captures import SimulationResult

@@ -20,7 +20,7 @@ from carlasc.cli.common import (
     progress_bar,
     report_failures,
 )
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
     from carlasc.core import ClassTable

@@ -18,7 +18,7 @@ from carlasc.cli.common import (
     print_json,
     progress_bar,
 )
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 
 def unpack(

@@ -31,7 +31,7 @@ from carlasc.cli.grid_options import (
     scans_of,
 )
 from carlasc.errors import ArgumentError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
