@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import TrafficLevel as TrafficLevel  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError
-
-TrafficLevel = Literal["light", "medium", "heavy"]
-"""How much traffic a town has."""
 
 TRAFFIC: Mapping[TrafficLevel, int] = {"light": 25, "medium": 50, "heavy": 100}
 """Number of moving vehicles per level of traffic, and of pedestrians."""

@@ -11,8 +11,8 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
-from carlasc.viewing.choosing import list_fields
 from carlasc.viewing.colors import AFTER_CLASSES, Entry
+from carlasc.viewing.finding import list_fields
 from carlasc.viewing.remapping import RemappedSequence
 from carlasc.viewing.rendering.drawings import Drawing
 from carlasc.viewing.rendering.meshes import QuadMesh, box, join

@@ -10,7 +10,7 @@ from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folders.folder import FolderSink
 from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
-from carlasc.viewing.rendering.evidence import evidence_legend
+from carlasc.viewing.rendering.drawings import evidence_legend
 
 pytest.importorskip("embreex")
 

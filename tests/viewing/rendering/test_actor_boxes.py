@@ -13,7 +13,7 @@ from carlasc.core.geometry import rotation_z
 from carlasc.core.scans import Scan
 from carlasc.storage.folders.folder import FolderSink
 from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
-from carlasc.viewing.rendering.boxes import box_edges, tight_boxes
+from carlasc.viewing.rendering.actor_boxes import box_edges, tight_boxes
 
 pytest.importorskip("embreex")
 
