@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""

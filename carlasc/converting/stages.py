@@ -25,8 +25,8 @@ from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_ra
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage.metadata import Metadata
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for

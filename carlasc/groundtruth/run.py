@@ -18,8 +18,8 @@ from carlasc.groundtruth.from_scans.sequences import scan_sequences
 from carlasc.groundtruth.inputs import GridPlan, SequenceInput
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.work import FrameFailure, SequenceJob, Work
-from carlasc.running.options import Run
 from carlasc.running.processes import one_pool
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.folders.trees import is_url

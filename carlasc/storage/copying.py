@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.folders.trees import is_url
 from carlasc.storage.protocol import Sequence, Source

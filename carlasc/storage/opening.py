@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.running.parts import Part
+from carlasc.running.spreading import Part
 from carlasc.storage.caching import Cache, CachedTree
 from carlasc.storage.folders.folder import FolderSink, FolderSource
 from carlasc.storage.folders.hub import HUB

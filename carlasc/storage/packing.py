@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import (
     FrameBlock,

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage.folders.hub import HUB
 from carlasc.storage.folders.names import leads_outside
 from carlasc.storage.folders.requests import Request, exists_error, fail

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from carlasc.errors import ConflictError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage.copying import blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
 from carlasc.storage.folders.folder import FolderSink
 from carlasc.storage.folders.trees import is_url

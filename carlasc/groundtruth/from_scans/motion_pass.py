@@ -35,8 +35,8 @@ from carlasc.motion import (
     tracks_from_boxes,
 )
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.folders.folder import FolderSequence
 
