@@ -189,7 +189,7 @@ def test_captures_and_finer_grids_have_reports_too(tmp_path):
 
 def test_the_report_is_the_same_in_a_store(street, made, tmp_path):
     pytest.importorskip("h5py")
-    from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
+    from carlasc.storage.hdf5.hdf5_sink import HDF5Sink
 
     with HDF5Sink(tmp_path / "made.h5") as sink:
         make(street, sink)

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 import carlasc
 from carlasc import Run
-from carlasc.captures.lidar import Lidar
+from carlasc.captures.settings import Lidar
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
@@ -513,10 +513,10 @@ def test_data_that_were_converted_from_another_simulator_are_synthetic(tmp_path:
 
 @pytest.mark.needs("pyarrow")
 def test_rounded_coordinates_are_said(town: Path, tmp_path: Path) -> None:
-    from carlasc.storage.packed.protocol import Options
-    from carlasc.storage.packed.tables.writing import ParquetSink
+    from carlasc.storage.packed.stores import PackOptions
+    from carlasc.storage.parquet.parquet_sink import ParquetSink
 
-    with ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
+    with ParquetSink(tmp_path / "x.parquet", PackOptions(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
         writer.write("points", 0, np.ones((3, 4), np.float32))
     carlasc.card(tmp_path / "x.parquet", **SAID, pictures=False)
     text = (tmp_path / "x.parquet" / "README.md").read_text()

@@ -20,7 +20,7 @@ from carlasc.inspection.cards.tables import tables_of
 from carlasc.running.options import Run
 from carlasc.storage import as_source
 from carlasc.storage.files import parse_json, write_output
-from carlasc.storage.packed.tables.reading import ParquetSource
+from carlasc.storage.parquet.parquet_source import ParquetSource
 from carlasc.storage.protocol import Source
 
 README, CROISSANT, PICTURES = "README.md", "croissant.json", "images"

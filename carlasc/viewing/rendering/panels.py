@@ -14,19 +14,21 @@ from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
 from carlasc.viewing.remapping import RemappedSequence
-from carlasc.viewing.rendering.boxes import BOX, boxes_in, with_boxes
+from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
 from carlasc.viewing.rendering.drawings import (
     Drawing,
     Extent,
+    GridColor,
     error_drawing,
+    evidence_drawing,
+    evidence_legend,
     flow_drawing,
     grid_drawing,
     grid_extent,
     scan_drawing,
     scan_extent,
 )
-from carlasc.viewing.rendering.evidence import GridColor, evidence_drawing, evidence_legend
 from carlasc.viewing.rendering.pictures import Panel, draw_panels
 from carlasc.viewing.rendering.styles import Sheet
 from carlasc.viewing.scene import SceneReader

@@ -19,10 +19,10 @@ from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
 from carlasc.viewing.colors import merge_legends
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.rendering.boxes import check_boxes
+from carlasc.viewing.rendering.actor_boxes import check_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
+from carlasc.viewing.rendering.drawings import GridColor, check_color
 from carlasc.viewing.rendering.encoding import FILMS, STILLS, encodable_size, is_film, write_pictures
-from carlasc.viewing.rendering.evidence import GridColor, check_color
 from carlasc.viewing.rendering.pages import draw_legend
 from carlasc.viewing.rendering.panels import (
     Cell,
