@@ -5,8 +5,12 @@ import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+from entered import cases, count_case
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
+MOST_FILES, DEEPEST = 44, 16  # of the package, that one frame of `regrid` from scans enters: see tests/tools/entered.py
 
 
 def rooms():
@@ -72,3 +76,10 @@ def test_converters_and_examples_use_no_private_name():
     for path in [*(ROOT / "converters").rglob("*.py"), *(ROOT / "examples").rglob("*.py")]:
         private = re.findall(r"from carlasc[\w.]* import .*\b_\w+", path.read_text())
         assert not private, f"{path.relative_to(ROOT)}: {private}"
+
+
+@pytest.mark.needs("trimesh", "embreex")
+def test_one_frame_from_scans_passes_through_few_files(tmp_path):
+    found = count_case(cases(tmp_path)["regrid from scans"])
+    assert len(found.files) <= MOST_FILES, sorted(found.files)
+    assert found.depth <= DEEPEST, found.deepest
