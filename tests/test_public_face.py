@@ -37,7 +37,7 @@ GOOD = {
         for path, sequence in source.sequences().items():
             voxels: int = sequence.grid("evaluation", 0).labels.size
         spec = GridSpec.published().with_resolution([0.2])
-        result = carlasc.regrid("CarlaSC", spec, workers=1)
+        result = carlasc.regrid("CarlaSC", spec, run=carlasc.Run(workers=1))
         made: int = result.made
         carlasc.render("CarlaSC", "scene.png")
         """,

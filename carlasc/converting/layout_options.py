@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter
+from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.metadata import Axes
 
-FlowSource = Literal["auto", "none"]
 _IDS = np.iinfo(np.uint16).max + 1
 _UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
 _MAX_LISTED = 8

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.converting.actors import Velocity
 from carlasc.converting.assembling import read_scan
-from carlasc.converting.scan_stage import ConvertedFrame, Fields, FrameBlock, FrameJob, make_fields
+from carlasc.converting.scan_stage import ConvertedFrame, Fields, FrameJob, StageBlock, make_fields
 from carlasc.core.axes import mirror_boxes, mirror_points
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
@@ -51,7 +51,7 @@ class MotionJob(FrameJob):
 
 
 @dataclass(frozen=True)
-class MotionBlock(FrameBlock[MotionJob]):
+class MotionBlock(StageBlock[MotionJob]):
     """Several frames to finish; `flow` says whether flow is written."""
 
     flow: bool = True

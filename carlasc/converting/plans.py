@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from carlasc.converting.trajectory import (
 )
 from carlasc.core.axes import mirror_poses, mirror_spec
 from carlasc.core.boxes import Boxes
+from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
 from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError
@@ -37,7 +37,6 @@ from carlasc.storage.metadata import Metadata
 from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
 from carlasc.storage.sinks import SequenceWriter, Sink
 
-SplitName = Literal["train", "val", "test", "all"]
 _AROUND_S = 1.0  # of the trajectory that a frame needs: longer than a sweep
 
 

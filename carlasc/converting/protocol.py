@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform, check_rigid, slerp
 from carlasc.core.grids import GridSpec
-from carlasc.core.times import check_seconds
 from carlasc.errors import FormatError
 
 Split = Literal["Train", "Val", "Test"]

@@ -70,7 +70,7 @@ Job = TypeVar("Job", bound=FrameJob)
 
 
 @dataclass(frozen=True)
-class FrameBlock(ABC, Generic[Job]):
+class StageBlock(ABC, Generic[Job]):
     """Several frames that a worker converts in one task. Each stage has a kind of its own.
 
     Attributes:
@@ -139,7 +139,7 @@ class ScanJob(FrameJob):
 
 
 @dataclass(frozen=True)
-class ScanBlock(FrameBlock[ScanJob]):
+class ScanBlock(StageBlock[ScanJob]):
     """Several frames to read.
 
     Attributes:

@@ -20,7 +20,7 @@ from carlasc.converting.motion_stage import MotionBlock, MotionJob
 from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
 from carlasc.converting.protocol import Converter, FrameHandle
 from carlasc.converting.results import Failure, StepCounter
-from carlasc.converting.scan_stage import ConvertedFrame, FrameBlock, ScanBlock, ScanJob, in_blocks, write_frames
+from carlasc.converting.scan_stage import ConvertedFrame, ScanBlock, ScanJob, StageBlock, in_blocks, write_frames
 from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_range
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
@@ -144,16 +144,16 @@ class Conversion:
         for pose in follow_scans(scans(), min_range_m=nearest, max_range_m=farthest):
             yield waiting.popleft(), pose
 
-    def _work(self, blocks: Sequence[FrameBlock[Any]]) -> Iterator[ConvertedFrame]:
+    def _work(self, blocks: Sequence[StageBlock[Any]]) -> Iterator[ConvertedFrame]:
         """Yield the frames of blocks after they were converted; what workers cannot write is written here."""
-        run = partial(run_all, FrameBlock.convert, run=self.run_options)
+        run = partial(run_all, StageBlock.convert, run=self.run_options)
 
-        def one_by_one(block: FrameBlock[Any], message: str) -> list[ConvertedFrame]:
+        def one_by_one(block: StageBlock[Any], message: str) -> list[ConvertedFrame]:
             """Work on the frames of a lost block again, each alone: one of them may have killed the workers."""
             if len(block.jobs) == 1 or self.plan.writer.block > 1:
                 return block.fail(message)
             singles = [replace(block, jobs=(job,)) for job in block.jobs]
-            return [frame for frames in run(singles, lost=FrameBlock.fail) for frame in frames]
+            return [frame for frames in run(singles, lost=StageBlock.fail) for frame in frames]
 
         with closing(run(blocks, lost=one_by_one)) as results:
             for frames in results:

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.protocol import Converter, Recording, Trajectory
+from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
-from carlasc.core.times import check_seconds
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.misfit import describe_misfit
-from carlasc.inspection.structure import static_structure
+from carlasc.inspection.structure import structure_of
 from carlasc.motion.options import PoseOptions
 from carlasc.storage import layout
-from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence
 
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
@@ -206,16 +203,16 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
     Raises:
         FormatError: they do not; says which mistake the poses look like, and what to do.
     """
-    scans = _RecordedScans(recording, converter)
-    frames = [handle.number for handle in recording.frames]
+    rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
 
     def structure(index: int) -> NDArray[np.float64]:
         try:
-            return static_structure(scans, frames[index])
+            scan = read_scan(recording.frames[index], rig, None)
         except (CarlascError, OSError):
             return np.empty((0, 3))  # its conversion reports it
+        return structure_of(scan.points[:, :3], scan.labels, None, converter.classes)
 
-    diagnosis = diagnose_poses(structure, poses[frames])
+    diagnosis = diagnose_poses(structure, poses[[handle.number for handle in recording.frames]])
     expected = "poses under which the scans overlap"
     if diagnosis.correction is not None:
         raise FormatError(
@@ -237,35 +234,3 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
         return None
     found, advice = describe_misfit(diagnosis.misfit)
     return f"{found}: {advice}, or {_ESTIMATE}"
-
-
-class _RecordedScans(Sequence):
-    """A recording's scans as a sequence, in their own axes and classes, for functions that read sequences."""
-
-    def __init__(self, recording: Recording, converter: type[Converter]) -> None:
-        self.recording, self.path, self.location = recording, "", recording.location
-        self.split, self.name, self.coordinates = recording.split, recording.name, "cartesian"
-        self.metadata = Metadata("right", converter.classes)
-        self._handles = {handle.number: handle for handle in recording.frames}
-        self._rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
-        self._last: tuple[int, dict[str, NDArray[Any]]] = (-1, {})
-
-    def fields(self) -> frozenset[str]:
-        return frozenset(("points", "labels") if self.recording.has_labels else ("points",))
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        return np.array(list(self._handles), np.int64) if field in self.fields() else np.empty(0, np.int64)
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        if self._last[0] != frame:
-            scan = read_scan(self._handles[frame], self._rig, None)
-            self._last = frame, {"points": scan.points} | ({} if scan.labels is None else {"labels": scan.labels})
-        if field not in self._last[1]:
-            raise MissingDataError(self.location, expected=field, found="none")
-        return self._last[1][field]
-
-    def documents(self) -> tuple[str, ...]:
-        return ()
-
-    def read_document(self, name: str) -> bytes:
-        raise MissingDataError(f"{self.location}/{name}", expected="a file", found="a recording of another data set")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.raw import Capture, Recording, find_captures
+from carlasc.captures.raw import Capture, SensorRecording, find_captures
 from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput, choose_frames
@@ -53,7 +53,7 @@ class CaptureFrame(FrameInput):
         votes = count_votes(self._observations(ego), plan.spec, self.capture.classes, rule=plan.rule, free_step_m=step)
         return FrameData(fields, votes.to_grid(), votes)
 
-    def _observations(self, ego: Recording) -> Iterator[Observation]:
+    def _observations(self, ego: SensorRecording) -> Iterator[Observation]:
         for sensor in self.sensors:
             recording = ego if sensor == self.sensors[0] else self.capture.read(sensor, self.source_frame)
             ego_T_sensor = relative_to(ego.world_T_sensor, recording.world_T_sensor)

@@ -8,8 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from carlasc.captures.names import RAW
-from carlasc.captures.raw import Capture, find_captures
+from carlasc.captures.raw import RAW, Capture, find_captures
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError

@@ -22,8 +22,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, remap_named
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size
-from carlasc_converters.files import opening, read_text
-from carlasc_converters.npz import read_arrays
+from carlasc_converters.files import opening, read_arrays, read_text
 from carlasc_converters.ply import PlyVertices
 
 _TAGS: tuple[tuple[str, Color], ...] = (  # tags of CARLA 0.9.14 and later, in order, and CarlaOcc's Rock

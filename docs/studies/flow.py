@@ -15,7 +15,7 @@ from clock import Clock
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.captures import Drive
+from carlasc.captures import TownDrive
 from carlasc.converting import convert
 from carlasc.core.tables import CARLA
 from carlasc.running import Run
@@ -36,7 +36,7 @@ ROWS = {  # name: class, speeds in m/s, numbers of points
 
 def compare(seed: int) -> NDArray[np.float64]:
     """Return (S, 4) of a drive's sightings of moving actors: class, true speed, number of points, end-point error."""
-    drive, found = Drive(seed, "heavy"), []
+    drive, found = TownDrive(seed, "heavy"), []
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         truth = write_kitti(root / "in", drive, FRAMES, voxels_every=0)

@@ -18,7 +18,7 @@ from PIL import Image
 
 import carlasc
 from carlasc import Grid, GridSpec, Run
-from carlasc.captures import Drive
+from carlasc.captures import TownDrive
 from carlasc.converting import FlowSource, LayoutOptions, convert
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
@@ -40,7 +40,7 @@ RUNS = {  # name: rule for what moves, and whether flow is estimated by the conv
 }
 
 
-def reference(drive: Drive, frame: int) -> dict[str, Grid]:
+def reference(drive: TownDrive, frame: int) -> dict[str, Grid]:
     """Return what 60 sensors see at the instant of a frame, in each grid of the ego sensor."""
     grid_T_world = invert(drive.sensor_poses(frame, 1)[0])
     seen = drive.reference_observations(frame, 60)
@@ -79,7 +79,7 @@ def row(name: str, run: str, total: TruthScore) -> str:
 
 def main(out: Path) -> None:
     """Convert, make grids by each rule, score them, draw one scene."""
-    drive, clock = Drive(SEED, "heavy"), Clock()
+    drive, clock = TownDrive(SEED, "heavy"), Clock()
     lines = [f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle |", "|---|---|" + "---:|" * 7]
     with tempfile.TemporaryDirectory() as place:
         write_kitti(Path(place) / "in", drive, FRAMES, voxels_every=0)

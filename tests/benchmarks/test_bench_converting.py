@@ -10,7 +10,7 @@ import pytest
 from helpers.datasets.kitti import write_kitti
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
-from carlasc.captures import Drive, Lidar
+from carlasc.captures import Lidar, TownDrive
 from carlasc.converting import LayoutOptions, convert
 from carlasc.motion import PoseOptions
 from carlasc.motion.paths import estimate_path
@@ -58,7 +58,9 @@ def test_bench_convert(benchmark, source, tmp_path):
 @pytest.fixture(scope="module")
 def traffic(tmp_path_factory):
     root = tmp_path_factory.mktemp("traffic")
-    write_kitti(root, Drive(4, "heavy", Lidar(channels=64, points=POINTS)), range(240, 240 + FRAMES), voxels_every=0)
+    write_kitti(
+        root, TownDrive(4, "heavy", Lidar(channels=64, points=POINTS)), range(240, 240 + FRAMES), voxels_every=0
+    )
     return root
 
 

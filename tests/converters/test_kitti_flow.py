@@ -5,7 +5,7 @@ import pytest
 from helpers.datasets.kitti import write_kitti
 
 import carlasc
-from carlasc.captures import Drive
+from carlasc.captures import TownDrive
 from carlasc.converting import LayoutOptions, convert
 from carlasc.motion import PoseOptions
 from carlasc.running import Run
@@ -16,7 +16,7 @@ MIRROR = np.array([1, -1, 1], np.float32)
 
 @pytest.mark.slow
 def test_flow_of_moving_vehicles_is_right_and_that_of_everything_static_exactly_zero(tmp_path):
-    truth = write_kitti(tmp_path / "in", Drive(7, "heavy"), range(240, 262), voxels_every=0)
+    truth = write_kitti(tmp_path / "in", TownDrive(7, "heavy"), range(240, 262), voxels_every=0)
     result = convert("kitti", tmp_path / "in", tmp_path / "out", grids=None, run=Run(workers=2))
     assert not result.failures
     sequence = carlasc.open(tmp_path / "out").sequences()[SEQUENCE]

@@ -8,7 +8,7 @@ from helpers.datasets.kitti import write_kitti
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
-from carlasc.captures import Drive, Lidar
+from carlasc.captures import Lidar, TownDrive
 from carlasc.converting import LayoutOptions, convert
 from carlasc.running import Run
 from carlasc.storage import layout
@@ -21,7 +21,7 @@ SEQUENCE = "Train/KITTI_00/cartesian"
 def test_kiss_icp_drifts_less_than_1_percent_over_100_m_of_a_drive_from_rest(tmp_path):
     """A town with cross streets and trees, no deskewing; every other scan, which is harder and takes half the time."""
     truth = write_kitti(
-        tmp_path / "in", Drive(3, "light", Lidar(channels=32, points=20_000)), range(0, 190, 2), voxels_every=0
+        tmp_path / "in", TownDrive(3, "light", Lidar(channels=32, points=20_000)), range(0, 190, 2), voxels_every=0
     )
     (truth.folder / "poses.txt").unlink()
     seen = []

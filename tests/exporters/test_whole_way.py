@@ -6,8 +6,7 @@ import tarfile
 
 import numpy as np
 import pytest
-from carlasc_converters.exporters.classes import mapping_of
-from carlasc_converters.exporters.kinds import KINDS
+from carlasc_converters.exporters.classes import KINDS, mapping_of
 from carlasc_converters.exporters.kitti import TO_RAW
 from carlasc_converters.exporters.opensceneflow import CATEGORIES
 from helpers.converters.drive_converter import DriveConverter

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 import carlasc
 from carlasc import Run
-from carlasc.captures.lidar import Lidar
+from carlasc.captures.settings import Lidar
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError

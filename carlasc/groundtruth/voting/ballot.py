@@ -10,19 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
-
-VoteRule = Literal["sensor", "sample", "ray"]
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 NOWHERE = 65534

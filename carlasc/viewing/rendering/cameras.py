@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.choices import ViewName
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import ArgumentError
@@ -122,7 +123,7 @@ class CameraOptions:
         ArgumentError: an unknown view.
     """
 
-    view: Literal["perspective", "bev", "both"] = "perspective"
+    view: ViewName = "perspective"
     viewpoint: Viewpoint = Viewpoint()
     orbit: bool = False
     still: bool = False

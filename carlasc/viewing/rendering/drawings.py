@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
 from carlasc.core.evidence import VoxelFlag
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -29,9 +30,6 @@ Extent = NDArray[np.float64]
 _FLOOR = (240, 240, 243)
 _MOVING_M_S = 0.2  # slower points count as static
 _ARROW_CELL_M = 3.0
-GridColor = Literal["class", "confidence", "views", "votes", "inferred"]
-"""What the colours of a grid mean: its classes, or one of the kinds of evidence (see `docs/format.md#evidence`)."""
-
 GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
 _SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one

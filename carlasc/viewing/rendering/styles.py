@@ -6,11 +6,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
+from carlasc.core.choices import StyleName as StyleName  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError
 
-StyleName = Literal["screen", "paper"]
 SMALLEST, LARGEST = (64, 64), 16384  # pixels of a picture
 
 _SCREEN_SIZE = (1280, 720)

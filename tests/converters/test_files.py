@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from carlasc_converters.npz import read_arrays
+from carlasc_converters.files import read_arrays
 
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from carlasc import first_use
+from carlasc.core import first_use
 
 PROGRAM = """
 import numpy as np
@@ -45,7 +45,7 @@ def test_loops_compile_without_the_messages_of_numpy(tmp_path):
 
 NOTED = """
 import sys
-from carlasc.first_use import note_compiling
+from carlasc.core.first_use import note_compiling
 note_compiling(lambda: print("told"), after_s=float(sys.argv[1]))
 assert "numba" not in sys.modules
 import numpy as np

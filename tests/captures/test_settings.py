@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from carlasc.captures import Lidar
-from carlasc.captures.lidar import sensor_offsets
+from carlasc.captures.settings import sensor_offsets
 from carlasc.errors import ArgumentError
 
 
