@@ -4,13 +4,13 @@ import re
 
 import numpy as np
 import pytest
+from helpers.readers.page_arrays import unpack_arrays
 from helpers.scenes.road_blocks import write_blocks
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.storage import open as open_source
 from carlasc.viewing import Scene, view
-from carlasc.viewing.page.coding import unpack_arrays
 
 
 def read_page(path):

@@ -18,10 +18,10 @@ from carlasc.errors import DependencyError
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import Entry
+from carlasc.viewing.libraries import PAGE_ADVICE, import_open3d
 from carlasc.viewing.rendering.drawings import ego_vehicle, grid_extent, motion_arrows, scan_extent
 from carlasc.viewing.rendering.meshes import QuadMesh, arrows, grid_mesh
 from carlasc.viewing.scene import FrameContent, Scene, SceneReader
-from carlasc.viewing.window.libraries import PAGE_ADVICE, import_open3d
 
 LAYERS = {"g": "grid", "p": "points", "f": "flow", "b": "boxes", "v": "vehicle"}
 KEYS = {
