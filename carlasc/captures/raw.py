@@ -22,7 +22,8 @@ from carlasc.core.scans import Scan, check_finite
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.storage.arrays import parse_npy
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, tree_of
+from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
+from carlasc.storage.transport.trees import LocalTree, Tree
 
 _SEARCH_DEPTH = 3  # levels: <root>/<split>/<sequence>, and one folder around them
 

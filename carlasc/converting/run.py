@@ -34,9 +34,8 @@ from carlasc.running.parts import Part
 from carlasc.running.processes import count_workers, one_pool
 from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.opening import as_sink
-from carlasc.storage.remote import check_shared
 from carlasc.storage.sinks import Sink
-from carlasc.storage.targets import LocalTarget
+from carlasc.storage.transport.targets import LocalTarget, check_shared
 
 if TYPE_CHECKING:
     from carlasc.groundtruth import RegridResult

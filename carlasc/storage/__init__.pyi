@@ -1,8 +1,7 @@
-from .caching import Cache as Cache
 from .downloads import download as download
 from .finishing import finish as finish
-from .folders.folder import FolderSink as FolderSink
-from .folders.folder import FolderSource as FolderSource
+from .folder import FolderSink as FolderSink
+from .folder import FolderSource as FolderSource
 from .metadata import Axes as Axes
 from .metadata import Metadata as Metadata
 from .opening import as_source as as_source
@@ -12,4 +11,5 @@ from .protocol import Sequence as Sequence
 from .protocol import Source as Source
 from .sinks import SequenceWriter as SequenceWriter
 from .sinks import Sink as Sink
+from .transport.caching import Cache as Cache
 from .unpacking import unpack as unpack

@@ -7,7 +7,7 @@ from typing import Any
 
 from carlasc.storage.packed.arrays.zarr_finish import FinishedStore
 from carlasc.storage.packed.arrays.zarr_finish import finish as finish_target
-from carlasc.storage.remote import target_of
+from carlasc.storage.transport.targets import target_of
 
 
 def finish(out: str | os.PathLike[str], *, incomplete: bool = False, **storage_options: Any) -> FinishedStore:

@@ -30,12 +30,12 @@ from carlasc.storage.copying import (
     refuse_overlap,
     typical_rows,
 )
-from carlasc.storage.folders.published import PublishedSequence
-from carlasc.storage.folders.trees import is_url
 from carlasc.storage.opening import as_source, open, open_sink
 from carlasc.storage.packed.protocol import Options, PackedSink, PackedSource, check_names
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.published import PublishedSequence
 from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.transport.trees import is_url
 
 if TYPE_CHECKING:
     from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter

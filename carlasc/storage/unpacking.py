@@ -12,11 +12,11 @@ from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
 from carlasc.running.processes import count_workers
 from carlasc.storage.copying import Progress, blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
-from carlasc.storage.folders.folder import FolderSink
-from carlasc.storage.folders.trees import is_url
+from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place, unfinished
 from carlasc.storage.protocol import Source
+from carlasc.storage.transport.trees import is_url
 
 _BLOCK = 16  # frames that one task unpacks
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import Sequence, Source, as_source, layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 
 SceneSource = str | os.PathLike[str] | Source | Sequence
 """What a scene is read from: anything that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence."""

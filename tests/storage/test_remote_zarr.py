@@ -25,8 +25,7 @@ from carlasc.errors import ConflictError
 from carlasc.storage.packed.arrays.zarr_finish import finish
 from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
 from carlasc.storage.packing import pack
-from carlasc.storage.remote import RemoteTarget, target_of
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target, target_of
 from carlasc.storage.unpacking import unpack
 
 for package in ("s3fs", "numcodecs", "google_crc32c"):

@@ -27,7 +27,7 @@ from carlasc.storage import FolderSink, Sequence, pack, unpack
 from carlasc.storage.packed.arrays.zarr_finish import finish
 from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter
 from carlasc.storage.packed.protocol import Options
-from carlasc.storage.targets import LocalTarget
+from carlasc.storage.transport.targets import LocalTarget
 
 for package in ("numcodecs", "google_crc32c"):
     pytest.importorskip(package)
@@ -107,7 +107,7 @@ from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from storage.test_shared_writing import start, write_block
 from carlasc.storage.packed.arrays.zarr_finish import finish
-from carlasc.storage.targets import LocalTarget
+from carlasc.storage.transport.targets import LocalTarget
 out = Path(sys.argv[1])
 writer = start(out)
 print("ready", flush=True)

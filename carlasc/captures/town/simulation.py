@@ -21,7 +21,7 @@ from carlasc.running.engines import Engine
 from carlasc.running.parts import Part
 from carlasc.running.processes import count_workers, run_all
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.storage.remote import check_shared
+from carlasc.storage.transport.targets import check_shared
 
 SETTINGS_FILE = "simulation.json"
 

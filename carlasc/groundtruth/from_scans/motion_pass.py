@@ -38,7 +38,7 @@ from carlasc.motion import (
 from carlasc.running.engines import Engine
 from carlasc.running.processes import run_all
 from carlasc.storage import layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 
 VERSION = 1
 """Version of the estimate of motion. It changes only when the same input gives other tracks."""

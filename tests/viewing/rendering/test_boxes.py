@@ -12,7 +12,7 @@ import carlasc
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z
 from carlasc.core.scans import Scan
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from carlasc.viewing.rendering.boxes import box_edges, tight_boxes
 
 pytest.importorskip("embreex")

@@ -9,7 +9,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from carlasc.viewing.rendering.evidence import evidence_legend
 
 pytest.importorskip("embreex")

@@ -18,7 +18,7 @@ from carlasc.storage.packed.arrays.fields import Encoded, FieldLayout, open_fiel
 from carlasc.storage.packed.arrays.shards import ZarrArray, join_shard, split_shard
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
 from carlasc.storage.packed.protocol import Options
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target
 
 BLOCKS = "blocks"  # folder of the tables
 _ASKED_ONE_BY_ONE = 4  # blocks; a caller that asks for more is going to ask for all

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.durability import sync_tree
-from carlasc.storage.folders.trees import LocalTree
 from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c, in_threads
 from carlasc.storage.packed.arrays.columns import Column, packing_of
 from carlasc.storage.packed.arrays.hdf5_store import CRC, HDF5Array
@@ -22,6 +21,7 @@ from carlasc.storage.packed.arrays.reading import COLUMN, DOCUMENT, FIELD, SEQUE
 from carlasc.storage.packed.numbers import common_type
 from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
 from carlasc.storage.packed.protocol import STORE, VERSION, FieldWriter, Options, PackedSink, PackedWriter, node_of
+from carlasc.storage.transport.trees import LocalTree
 
 _HEADROOM = 1.125  # a chunk is this much larger than the first frame, so that later frames seldom need a second chunk
 _AHEAD = 16  # chunks that are encoded in parallel

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.arrays import check_size
-from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.arrays.chunks import StoredArray, parallel, scratch
 from carlasc.storage.packed.arrays.columns import WIDE, Column, Packing, Points
 from carlasc.storage.packed.protocol import PackedSequence, PackedSource
 from carlasc.storage.protocol import Sequence
+from carlasc.storage.transport.trees import Tree
 
 SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlasc.column", "carlasc.document"
 

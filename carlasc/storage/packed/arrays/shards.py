@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
-from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.arrays.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.packed.arrays.zarr_metadata import encoding_of
+from carlasc.storage.transport.trees import Tree
 
 _CHECKSUM = 4  # bytes
 _RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c

@@ -11,7 +11,7 @@ from carlasc.storage.packed.arrays.fields import VERSION
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA, group_metadata
 from carlasc.storage.packed.output import remove, replaced
 from carlasc.storage.packed.protocol import STORE, Options
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target
 
 _TRIES = 5  # other processes may begin, finish and replace the same store meanwhile
 _OPTIONS = ("block", "lossy_mm", "small")

@@ -24,7 +24,7 @@ from carlasc.storage.packed.arrays.shards import encode_chunk
 from carlasc.storage.packed.arrays.zarr_begin import read_root, remove_replaced
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA, array_metadata, group_metadata
 from carlasc.storage.packed.protocol import STORE, check_names
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target
 
 EXPECTED = "expected.json"  # the frames that a run has announced
 _SMALL = Encoding(shuffle=SHUFFLE)

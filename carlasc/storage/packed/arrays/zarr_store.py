@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.arrays.fields import FieldLayout, open_field
 from carlasc.storage.packed.arrays.reading import (
     ArrayField,
@@ -31,6 +30,8 @@ from carlasc.storage.packed.arrays.reading import (
 from carlasc.storage.packed.arrays.shards import ZarrArray
 from carlasc.storage.packed.arrays.version1 import OffsetsSequence
 from carlasc.storage.packed.arrays.zarr_metadata import METADATA
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import Tree
 
 _T = TypeVar("_T")
 

@@ -28,7 +28,7 @@ from carlasc.storage.packed.arrays.zarr_store import ZarrSource
 from carlasc.storage.packed.protocol import Options, check_names, node_of
 from carlasc.storage.protocol import identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target
 
 _PUTS = 16  # objects that are written side by side
 _CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel

@@ -10,7 +10,7 @@ import zlib
 from pathlib import Path
 
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.storage.folders.trees import LocalTree, Tree
+from carlasc.storage.transport.trees import LocalTree, Tree
 
 _END = 8  # bytes: the length of the footer, and "PAR1"
 _MARK = b"PAR1"

@@ -18,12 +18,13 @@ from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.output import TABLES_MARK
 from carlasc.storage.packed.protocol import PackedSequence, PackedSource
 from carlasc.storage.packed.tables.columns import table_field
 from carlasc.storage.packed.tables.footers import check_footer
 from carlasc.storage.protocol import Sequence
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import Tree
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
 NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables, which older stores do not have

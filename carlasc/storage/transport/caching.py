@@ -21,7 +21,8 @@ from typing import Any
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
 from carlasc.storage.durability import sync_file
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import LocalTree, Tree
 
 _PIECE = 4 << 20  # bytes of a range that is requested
 _AT_ONCE = 4  # ranges of a file that are requested side by side: they are in memory together
