@@ -1,4 +1,4 @@
-from .downloads import download as download
+from .downloading import download as download
 from .finishing import finish as finish
 from .folder import FolderSink as FolderSink
 from .folder import FolderSource as FolderSource

@@ -129,12 +129,14 @@ def describe_failure(error: BaseException) -> str:
 
 
 def _is_of_connection(error: BaseException) -> bool:
-    return any(
-        isinstance(error, getattr(sys.modules[module], name, ()))
+    """Whether an error, or one that it was raised from, is of the connection: aiohttp gives an answer that is no HTTP a status of its own."""
+    kinds = [
+        getattr(sys.modules[module], name, ())
         for module, names in TEMPORARY.items()
         if module in sys.modules
         for name in names
-    )
+    ]
+    return any(isinstance(cause, kind) for cause in _causes(error) for kind in kinds)
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:

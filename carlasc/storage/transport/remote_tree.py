@@ -10,9 +10,9 @@ from functools import partial
 from typing import Any
 
 from carlasc.errors import CarlascError, MissingDataError, without_credentials
-from carlasc.storage.transport.clients import check_size
 from carlasc.storage.transport.failures import WrongAnswerError, bucket_is_missing, fail
 from carlasc.storage.transport.requests import Request, Requests
+from carlasc.storage.transport.servers import check_size
 from carlasc.storage.transport.trees import LocalTree, Tree, check_length, is_url
 
 _BLOCK = 1 << 18  # bytes of a block that a remote file fetches

@@ -2,7 +2,7 @@
 
 Object stores answer some requests with "503 Slow Down", close connections, or send less than they announced. Such requests are sent
 again, after a random time that doubles at each attempt. s3fs and botocore retry too, each by rules of its own, which would multiply:
-their retries are turned off, so that this module alone decides how often and how long. `carlasc.storage.transport.clients` does what differs
+their retries are turned off, so that this module alone decides how often and how long. `carlasc.storage.transport.servers` does what differs
 between servers, `carlasc.storage.transport.failures` says which failures are temporary.
 """
 
@@ -21,7 +21,8 @@ from functools import partial
 from typing import Any, TypeVar
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra
-from carlasc.storage.transport.clients import (
+from carlasc.storage.transport.failures import is_temporary
+from carlasc.storage.transport.servers import (
     HTTP,
     HUB,
     S3,
@@ -30,8 +31,8 @@ from carlasc.storage.transport.clients import (
     get_from_hub,
     http_answer,
     read_piece,
+    status_error,
 )
-from carlasc.storage.transport.failures import is_temporary
 
 _EXTRAS = {  # the package that a scheme needs, and the extra that installs it
     "http": ("aiohttp", "remote"),
@@ -235,14 +236,18 @@ class Requests:
 
         fs, answer = self.fs, None
 
-        async def begin() -> tuple[Any, bytes]:
+        async def begin() -> tuple[Any, bytes, Exception | None]:
             found = await http_answer(fs, self.url, {"Accept-Encoding": "identity", **headers})
-            return found, await read_piece(found.content, _PIECE)
+            try:
+                return found, await read_piece(found.content, _PIECE), status_error(found)
+            except BaseException:
+                found.close()
+                raise
 
         try:
-            answer, first = sync(fs.loop, begin)
+            answer, first, error = sync(fs.loop, begin)
             more = partial(sync, fs.loop, read_piece, answer.content, _PIECE)
-            yield HttpAnswer(answer.status, answer.reason or "", answer.headers, first, more)
+            yield HttpAnswer(answer.status, answer.reason or "", answer.headers, first, more, error)
         finally:
             if answer is not None:
                 fs.loop.call_soon_threadsafe(answer.close)
@@ -274,6 +279,7 @@ class HttpAnswer:
         headers: its headers; case does not matter.
         first: the first bytes of the body.
         more: returns the next bytes, none at the end of the body.
+        error: that of aiohttp, where the status is 400 or more.
     """
 
     status: int
@@ -281,6 +287,7 @@ class HttpAnswer:
     headers: Mapping[str, str]
     first: bytes
     more: Callable[[], bytes]
+    error: Exception | None
 
     def pieces(self) -> Iterator[bytes]:
         """Yield the body."""

@@ -13,10 +13,10 @@ from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.files import leads_outside, write_atomic, write_many
-from carlasc.storage.transport.clients import HUB
 from carlasc.storage.transport.failures import exists_error, fail
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.requests import Request
+from carlasc.storage.transport.servers import HUB
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
 _EXCLUSIVE = frozenset(

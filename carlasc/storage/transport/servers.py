@@ -125,6 +125,15 @@ def _leads_nowhere(url: str) -> CarlascError:
     )
 
 
+def status_error(answer: Any) -> Exception | None:
+    """Return the error of an answer of aiohttp whose status is 400 or more; None if it is a good one."""
+    try:
+        answer.raise_for_status()
+    except Exception as error:  # noqa: BLE001 (aiohttp is imported where it is used)
+        return error
+    return None
+
+
 async def read_piece(content: Any, most: int) -> bytes:
     """Return the next bytes of a body, at most `most`, and fewer where they arrive slowly; none at its end.
 
