@@ -39,6 +39,7 @@ from .inspection import stats as stats
 from .inspection import validate as validate
 from .metrics import evaluate as evaluate
 from .metrics import scores as scores
+from .running import Run as Run
 from .storage import Cache as Cache
 from .storage import Sink as Sink
 from .storage import Source as Source

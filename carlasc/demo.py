@@ -6,12 +6,13 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
@@ -57,8 +58,8 @@ def demonstrate(
     count: int = 4,
     sensors: int = 20,
     seed: int = 0,
-    workers: int | None = None,
     step: Step | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> DemoResult:
     """Simulate a short drive, make its ground truth in three grids, validate it, count its classes, and draw it.
 
@@ -69,8 +70,8 @@ def demonstrate(
         count: number of frames.
         sensors: number of LiDARs.
         seed: seed of the simulated town.
-        workers: number of processes. None: one per core.
         step: called with the name of each step. Returns a context manager that gives the step's progress callback.
+        run: how the work is spread; `step` is told of its progress.
 
     Returns:
         What was made.
@@ -94,18 +95,20 @@ def demonstrate(
         )
 
     with step("simulate a town") as progress:
-        simulate(sequence, count=count, sensors=sensors, seed=seed, traffic="heavy", workers=workers, progress=progress)
+        simulate(
+            sequence, count=count, sensors=sensors, seed=seed, traffic="heavy", run=replace(run, progress=progress)
+        )
     grids = []
     for name, spec in _demo_grids().items():
         with step(f"ground truth, {name}") as progress:
-            made = regrid(sequence, spec, workers=workers, progress=progress)
+            made = regrid(sequence, spec, run=replace(run, progress=progress))
             if made.failures:
                 raise ConflictError(made.failures[0].message)
             grids += [Path(folder) for folder in made.grids]
     with step("check every file") as progress:
-        validation = validate(out, every=1, progress=progress)
+        validation = validate(out, every=1, run=Run(workers=1, progress=progress))
     with step("count classes") as progress:
-        statistics = stats(out, progress=progress)
+        statistics = stats(out, run=Run(workers=1, progress=progress))
     pictures = []
     with step("draw") as progress:
         jobs = _list_pictures(out, grids, count - 1)

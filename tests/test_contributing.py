@@ -9,6 +9,7 @@ import pytest
 from helpers.datasets.sequences import scan
 
 import carlasc
+from carlasc import Run
 from carlasc.converting import Cloud, Sensor
 from carlasc.converting.assembling import Rig, assemble
 from carlasc.converting.scans import make_fields
@@ -101,6 +102,6 @@ def test_a_converter_passes_it_on(rings):
 
 def test_regrid_from_scans_carries_it_along(folder, tmp_path):
     spec = carlasc.GridSpec.published().with_size((8, 8, 4))
-    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), workers=1)
+    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), run=Run(workers=1))
     for found, wanted in zip(rings_of(tmp_path / "out"), rings_of(folder), strict=True):
         assert np.array_equal(found, wanted)

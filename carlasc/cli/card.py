@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, progress_bar, report_failures
+from carlasc.running.options import Run
 
 
 def card(
@@ -79,9 +80,8 @@ def card(
             published=published,
             pictures=pictures,
             every=every,
-            workers=workers or 1,
+            run=Run(workers=workers or 1, progress=progress),
             overwrite=overwrite,
-            progress=progress,
         )
     if as_json:
         print_json(result.to_dict())

@@ -33,6 +33,7 @@ FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 _INTERRUPTED = "interrupted: files written so far are complete; run the same command again to continue"
 _ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
 
+_OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also one that lost a slash; a drive has one letter
 
 
@@ -184,7 +185,10 @@ def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
         name, value = match[1], match[2]
         if name not in options:
             return match[0]
-        return f"`{options[name]}`" if value in ("True", None) else f"`{options[name]} {value.strip(chr(34))}`"
+        if value in ("True", None):
+            return f"`{options[name]}`"
+        value = _OPTIONS.sub(r"\1", value).strip('"')
+        return f"`{options[name]} {value}`"
 
     return _ARGUMENT.sub(replace, text)
 

@@ -14,6 +14,7 @@ import typer
 from carlasc.cli.common import FAILED, Workers, echo, file_argument, progress_bar
 from carlasc.cli.stats import print_statistics
 from carlasc.cli.validate import print_result
+from carlasc.running.options import Run
 
 
 def demo(
@@ -26,7 +27,7 @@ def demo(
     """Simulate a drive, make its ground truth in three grids, check it, and draw it in pictures and a page. This takes a minute or two."""
     from carlasc.demo import demonstrate
 
-    result = demonstrate(out, count=count, sensors=sensors, seed=seed, workers=workers, step=_show_step)
+    result = demonstrate(out, count=count, sensors=sensors, seed=seed, run=Run(workers=workers), step=_show_step)
     print_statistics(result.statistics)
     print_result(result.validation)
     echo(f"\ndone in {result.elapsed_s:.0f} s")

@@ -24,6 +24,7 @@ from carlasc.cli.common import (
     progress_bar,
     report_failures,
 )
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
@@ -146,24 +147,29 @@ def evaluate(
         check_plot(plot)  # before anything is counted
     common: dict[str, Any] = {
         "grid": grid, "truth_grid": truth_grid, "source_classes": source_classes, "frames": frames,
-        "workers": workers or 1,
     }  # fmt: skip
     name = name or Path(source).name
     if all_conventions:
-        with progress_bar("Scoring") as progress, engine(cluster, workers) as common["executor"]:
-            found = evaluate_by_all_conventions(source, truth, name=name, progress=progress, **common)
+        with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
+            found = evaluate_by_all_conventions(
+                source, truth, name=name, run=Run(workers or 1, executor, progress=progress), **common
+            )
         _print_conventions(found, as_json)
         return
 
     common |= {"convention": convention, "voxels": voxels}
     common["region"] = None if (near_m, far_m, fov) == (0.0, None, 360.0) else _Region(near_m, far_m, fov)
-    with progress_bar("Scoring") as progress, engine(cluster, workers) as common["executor"]:
+    with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
         parts = [part.value for part in by or ()]
-        result = score(source, truth, by=parts, rays=rays, name=name, progress=progress, **common)
+        result = score(
+            source, truth, by=parts, rays=rays, name=name, run=Run(workers or 1, executor, progress=progress), **common
+        )
     other = None
     if compare is not None:
-        with progress_bar("Scoring the other") as progress, engine(cluster, workers) as common["executor"]:
-            other = score(compare, truth, name=Path(compare).name, progress=progress, **common)
+        with progress_bar("Scoring the other") as progress, engine(cluster, workers) as executor:
+            other = score(
+                compare, truth, name=Path(compare).name, run=Run(workers or 1, executor, progress=progress), **common
+            )
     if per_frame is not None:
         from carlasc.storage.files import write_output
 

@@ -164,12 +164,17 @@ NoOwnPathOption = Annotated[
 def scans_of(*, window: str | None, **others: Any) -> FromScans | None:
     """Return how scans are merged, with the defaults of `FromScans` for what is None; None if everything is."""
     from carlasc.groundtruth import FromScans
+    from carlasc.motion import MotionOptions, PoseOptions
 
     given: dict[str, Any] = {
         name: value.value if isinstance(value, StrEnum) else value for name, value in others.items()
     }
     given["window"] = None if window is None else _parse_window(window)
     given = {name: value for name, value in given.items() if value is not None}
+    if "motion" in given:
+        given["motion"] = MotionOptions(given["motion"])
+    if "poses" in given or "force" in given:
+        given["poses"] = PoseOptions(given.pop("poses", "auto"), given.pop("force", False))
     return FromScans(**given) if given else None
 
 

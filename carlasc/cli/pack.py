@@ -20,6 +20,7 @@ from carlasc.cli.common import (
     print_json,
     progress_bar,
 )
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.storage.packing import PackResult
@@ -54,10 +55,7 @@ def pack(
             small=small,
             lossy_mm=lossy_mm,
             overwrite=overwrite,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
+            run=Run(workers=workers, executor=executor, part=parse_part(part), progress=progress),
         )
     if json:
         print_json(result)

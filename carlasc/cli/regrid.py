@@ -42,6 +42,7 @@ from carlasc.cli.grid_options import (
     scans_of,
 )
 from carlasc.errors import ArgumentError
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.groundtruth import FromScans, Observe
@@ -58,6 +59,7 @@ class Observed(StrEnum):
 class Poses(StrEnum):
     """Where poses come from."""
 
+    auto = "auto"
     file = "file"
     kiss_icp = "kiss-icp"
 
@@ -132,7 +134,10 @@ def regrid(
     ] = None,
     poses: Annotated[
         Poses | None,
-        typer.Option(help="file: from poses.txt (default); kiss-icp: estimated from the scans.", rich_help_panel=SCANS),
+        typer.Option(
+            help="file: from poses.txt; kiss-icp: estimated from the scans; auto: from the file if it exists, else estimated (default).",
+            rich_help_panel=SCANS,
+        ),
     ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Continue if poses jump between frames.", rich_help_panel=SCANS)
@@ -172,10 +177,7 @@ def regrid(
             frames=frames,
             name=name,
             overwrite=overwrite,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
+            run=Run(workers=workers, executor=executor, part=parse_part(part), progress=progress),
         )
     if json:
         print_json(result)

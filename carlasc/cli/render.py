@@ -30,6 +30,7 @@ from carlasc.cli.scene_options import (
     describe_frames,
 )
 from carlasc.errors import ArgumentError
+from carlasc.running.options import Run
 
 
 def render(
@@ -159,10 +160,8 @@ def render(
             orbit=orbit,
             still=still,
             fps=fps,
-            workers=workers,
-            executor=executor,
+            run=Run(workers=workers, executor=executor, progress=progress),
             overwrite=overwrite,
-            progress=progress,
         )
     if as_json:
         print_json(result)

@@ -21,6 +21,7 @@ from carlasc.cli.common import (
     progress_bar,
     report_failures,
 )
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.reporting.actors import Actor
@@ -64,9 +65,7 @@ def report(
             remake=remake,
             holdout=holdout,
             save=save,
-            workers=workers,
-            executor=executor,
-            progress=progress,
+            run=Run(workers=workers, executor=executor, progress=progress),
         )
     if html is not None:
         write_report_page(result, html)

@@ -38,6 +38,7 @@ from carlasc.cli.grid_options import (
     SizeOption,
     parse_grid_or_published,
 )
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.captures import SimulationResult
@@ -79,13 +80,15 @@ def simulate(
     if not chosen and PurePosixPath(out).suffix != ".zarr":
         with progress_bar("simulate") as progress, engine(cluster, workers) as executor:
             written = captures.simulate(
-                out, **drive, workers=workers, executor=executor, part=part_of, progress=progress
+                out, **drive, run=Run(workers=workers, executor=executor, part=part_of, progress=progress)
             )
         print_json(written) if json else _print_capture(written)
         return
     spec, simulated = parse_grid_or_published(res, size, preset, coordinates, None), captures.SimulatedCapture(**drive)
     with progress_bar("simulate") as progress, engine(cluster, workers) as executor:
-        made = regrid(simulated, spec, out, workers=workers, executor=executor, part=part_of, progress=progress)
+        made = regrid(
+            simulated, spec, out, run=Run(workers=workers, executor=executor, part=part_of, progress=progress)
+        )
     print_json(made) if json else _print_grids(made)
     report_failures([(f.frame, f.message) for f in made.failures], made.made + made.skipped + len(made.failures))
 

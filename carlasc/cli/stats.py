@@ -20,6 +20,7 @@ from carlasc.cli.common import (
     progress_bar,
     report_failures,
 )
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.core import ClassTable
@@ -62,9 +63,7 @@ def stats(
             grid=grid,
             remap=None if remap == "none" else remap,
             every=every,
-            workers=workers or 1,
-            executor=executor,
-            progress=progress,
+            run=Run(workers=workers or 1, executor=executor, progress=progress),
         )
     if plot is not None:
         draw_histograms(result, plot)

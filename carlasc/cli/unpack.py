@@ -18,6 +18,7 @@ from carlasc.cli.common import (
     print_json,
     progress_bar,
 )
+from carlasc.running.options import Run
 
 
 def unpack(
@@ -42,10 +43,7 @@ def unpack(
             source,
             out,
             overwrite=overwrite,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
+            run=Run(workers=workers, executor=executor, part=parse_part(part), progress=progress),
         )
     if json:
         print_json(result)

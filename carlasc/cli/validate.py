@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -30,6 +31,7 @@ from carlasc.cli.grid_options import (
     scans_of,
 )
 from carlasc.errors import ArgumentError
+from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
@@ -89,6 +91,7 @@ def validate(
     from carlasc.core.grids import GridSpec
     from carlasc.groundtruth import FromScans
     from carlasc.inspection.validation import validate as examine
+    from carlasc.motion import PoseOptions
 
     if full and every is not None:
         raise ArgumentError("every", expected="only one of --every and --full", found="both")
@@ -96,12 +99,12 @@ def validate(
     if not holdout and any(value is not None for value in (*grid, *others)):
         raise ArgumentError("holdout", expected="given with the options of held-out rays", found="not given")
     spec = parse_grid(res, size, preset, None, bounds) if any(grid) else GridSpec.published()
-    scans = scans_of(window=window, dynamic=dynamic, motion=motion) or FromScans()
+    scans = replace(scans_of(window=window, dynamic=dynamic, motion=motion) or FromScans(), poses=PoseOptions("file"))
     rays = None
     with engine(cluster, workers) as executor:
         with progress_bar("Validating", unit="steps") as progress:
             result = examine(
-                source, every=1 if full else every, workers=workers or 1, executor=executor, progress=progress
+                source, every=1 if full else every, run=Run(workers=workers or 1, executor=executor, progress=progress)
             )
         if holdout:
             from carlasc.inspection.heldout import EVERY
@@ -113,9 +116,7 @@ def validate(
                     spec,
                     observe=scans,
                     every=holdout_every or EVERY,
-                    workers=workers,
-                    executor=executor,
-                    progress=progress,
+                    run=Run(workers=workers, executor=executor, progress=progress),
                 )
     if as_json:
         print_json(result.to_dict() | ({} if rays is None else {"holdout": rays.to_dict()}))

@@ -17,6 +17,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 
 Velocity = tuple[float, float, float]
@@ -155,7 +156,7 @@ class ActorMotion:
     def _run(self) -> None:
         chains = sorted(self._ended, key=_Chain.size, reverse=True)  # so that no worker has a long one left at the end
         self._ended = []
-        with closing(run_all(self._estimate, chains, workers=self._workers, executor=self._executor)) as estimates:
+        with closing(run_all(self._estimate, chains, Run(self._workers, self._executor))) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):
                 for frame, velocity in zip(chain.frames, velocities, strict=True):
                     self._velocities.setdefault(frame, {})[chain.actor] = velocity

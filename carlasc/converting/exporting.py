@@ -22,8 +22,9 @@ from carlasc.converting.registry import load_exporter
 from carlasc.converting.results import Failure, Progress, Steps
 from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageError
 from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, one_pool, run_all
+from carlasc.running.processes import one_pool, run_all
 from carlasc.storage.durability import make_folder, rename, sync_tree
 from carlasc.storage.files import has_content, remove_stale, write_many
 
@@ -91,7 +92,7 @@ def export(
         ConflictError: `out` lies inside `source`, or holds an export of other sequences or with other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
-    start, workers = time.perf_counter(), count_workers(workers)
+    start = time.perf_counter()
     exporter = make_exporter(load_exporter(name), options)
     opened, root = storage.as_source(source), Path(out)
     check_outside(root, opened.location)
@@ -111,8 +112,8 @@ def export(
     remove_stale(root)
     ours = _deal(exporter, chosen, part)
     steps = Steps(progress, sum(len(exported.frames) for exported in ours))
-    with one_pool(workers, executor) as pool:
-        run = partial(run_all, workers=workers, executor=pool, lost=_fail)
+    with one_pool(Run(workers, executor)) as pooled:
+        run = partial(run_all, run=pooled, lost=_fail)
         done = _Done([], 0, [])
         for exported in ours:
             folder = root / exported.folder

@@ -12,7 +12,9 @@ from carlasc.converting.results import Steps
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
+from carlasc.motion.options import PoseOptions
 from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import Sink
 
@@ -50,11 +52,9 @@ class Regridding:
             _Converted(sink.source(), conversion.plan.recording),
             spec,
             sink,
-            observe=replace(self.observe or FromScans(), force=self.force),
+            observe=replace(self.observe or FromScans(), poses=PoseOptions("file", force=self.force)),
             voting=self.voting or Voting(),
-            workers=self.workers,
-            executor=self.executor,
-            progress=advance,
+            run=Run(self.workers, self.executor, progress=advance),
         )
 
     def fit(self, conversions: Series[Conversion], where: str) -> tuple[GridSpec, list[str]]:

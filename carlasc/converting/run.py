@@ -30,8 +30,9 @@ from carlasc.converting.trajectory import PoseSource
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, one_pool
+from carlasc.running.processes import one_pool
 from carlasc.storage.metadata import Axes, Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.sinks import Sink
@@ -113,12 +114,13 @@ def convert(
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
-    start, workers = time.perf_counter(), count_workers(workers)
+    start, run = time.perf_counter(), Run(workers, executor)
+    workers = run.processes
     converter = load_converter(name) if isinstance(name, str) else name
     _check(converter, classes=classes, axes=axes, grids=grids, split=split, poses=poses, flow=flow)
     root = Path(source)
     sink = as_sink(out, part=part)
-    check_shared(sink.location, 1 if executor is None and workers == 1 else 2)
+    check_shared(sink.location, run)
     _check_sink(root, sink, grids)
     if not root.exists():
         raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
@@ -150,7 +152,8 @@ def convert(
     steps = Steps(progress, sum(len(plan.recording.frames) for plan in plans))
     done: list[Conversion] = []
     made: list[RegridResult] = []
-    with one_pool(workers, executor) as pool:
+    with one_pool(run) as pooled:
+        pool = pooled.executor
         with ExitStack() as writers:
             for plan in plans:
                 writers.enter_context(plan.writer)

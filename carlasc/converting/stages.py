@@ -27,6 +27,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
 from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage.metadata import Metadata
 
@@ -153,7 +154,7 @@ class Conversion:
         lost: Callable[[Item, str], list[Result]],
     ) -> Iterator[Result]:
         """Yield what a function that works on blocks of frames returns for each frame; what workers cannot write is written here."""
-        run = partial(run_all, function, workers=self.workers, executor=self.pool)
+        run = partial(run_all, function, run=Run(self.workers, self.pool))
 
         def one_by_one(block: Item, message: str) -> list[Result]:
             """Work on the frames of a lost block again, each alone: one of them may have killed the workers."""

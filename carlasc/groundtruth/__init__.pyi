@@ -6,9 +6,7 @@ from .options import FromCapture as FromCapture
 from .options import FromGrid as FromGrid
 from .options import FromScans as FromScans
 from .options import GridOptions as GridOptions
-from .options import Motion as Motion
 from .options import Observe as Observe
-from .options import PoseSource as PoseSource
 from .options import Voting as Voting
 from .run import RegridResult as RegridResult
 from .run import regrid as regrid

@@ -24,7 +24,7 @@ from carlasc.groundtruth.options import FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.evidence import Evidence
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence
@@ -204,20 +204,14 @@ class SequenceInput(ABC):
         """Return the number of points of a scan; 0 if the sequence has no scans."""
 
     def prepare(  # noqa: B027 (most sequences need nothing)
-        self,
-        writer: SequenceWriter,
-        *,
-        workers: int,
-        executor: Engine | None,
-        progress: Callable[[int], None] | None,
+        self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
     ) -> None:
         """Do what is done once per sequence before its frames are made.
 
         Args:
             writer: where the sequence is written, and what is kept beside the grids.
-            workers: number of items that are worked on in parallel.
-            executor: runs the work instead of processes of our own.
-            progress: called with the number of steps since the last call, `steps_before` in all.
+            run: how the work is spread.
+            steps: called with the number of steps since the last call, `steps_before` in all.
         """
 
     @property

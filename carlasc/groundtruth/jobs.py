@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Set
+from collections.abc import Generator, Iterator, Set
 from collections.abc import Sequence as Series
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -16,8 +16,7 @@ from carlasc.groundtruth.inputs import Plan, SequenceInput, Steps
 from carlasc.groundtruth.reporting.facts import sample_frames
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.groundtruth.tasks import Batch, Done, MakeFrame, MeasureFrame, Task, fail_batch, run_batch, write_frames
-from carlasc.running.engines import Engine
-from carlasc.running.parts import Part
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.sinks import SequenceWriter
@@ -133,9 +132,7 @@ class Work:
     Attributes:
         jobs: the sequences.
         plan: what is made.
-        part: the part; frames that are stored together are dealt out together.
-        workers: number of frames that are made in parallel.
-        pool: does the work; None for this process.
+        spread: how the work is spread. Of a part of it, frames that are stored together are dealt out together.
         failures: frames that could not be made.
         wanted: number of frames to make.
         skipped: number of frames of this part that exist already.
@@ -144,15 +141,13 @@ class Work:
 
     jobs: Series[Job]
     plan: Plan
-    part: Part
-    workers: int
-    pool: Engine | None
+    spread: Run
     failures: list[FrameFailure] = field(default_factory=list)
     wanted: int = 0
     skipped: int = 0
     has_written: bool = False
 
-    def run(self, progress: Callable[[int, int], None] | None) -> list[FrameFailure]:
+    def run(self) -> list[FrameFailure]:
         """Make what is missing, and return the frames that could not be made.
 
         Sequences follow each other without a pause: while the last frames of one are made, the next one is prepared and begun.
@@ -162,7 +157,7 @@ class Work:
         self.wanted = sum(map(len, ours))
         self.skipped = sum(map(len, dealt)) - self.wanted
         passes = sum(job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing)
-        steps = Steps(progress, self.skipped, self.skipped + self.wanted + passes)
+        steps = Steps(self.spread.progress, self.skipped, self.skipped + self.wanted + passes)
         under_way: deque[Job] = deque()  # the job of each batch, in order
 
         def batches() -> Iterator[Batch]:
@@ -187,14 +182,14 @@ class Work:
     def _deal(self) -> list[set[int]]:
         """Return the frames of each sequence that belong to the part."""
         blocks = sorted({(n, job.block_of(number)) for n, job in enumerate(self.jobs) for number in job.numbers})
-        dealt = set(self.part.take(blocks))
+        dealt = set(self.spread.part.take(blocks))
         return [{i for i in job.numbers if (n, job.block_of(i)) in dealt} for n, job in enumerate(self.jobs)]
 
     def _prepare(self, job: Job, steps: Steps) -> None:
-        job.inputs.prepare(job.writer, workers=self.workers, executor=self.pool, progress=steps)
+        job.inputs.prepare(job.writer, self.spread, steps)
 
     def _results(self, batches: Iterator[Batch]) -> Generator[list[Done], None, None]:
-        return run_all(run_batch, batches, workers=self.workers, executor=self.pool, lost=fail_batch)
+        return run_all(run_batch, batches, self.spread, lost=fail_batch)
 
     def _finish(self, job: Job, made: list[Done], steps: Steps) -> None:
         """Note what failed, and write the report; where other parts make frames of the sequence, the last of them writes it."""
@@ -202,7 +197,7 @@ class Work:
         for done in made:
             if isinstance(done.task, MakeFrame) and done.error is not None:
                 self.failures.append(FrameFailure(job.inputs.location, done.task.frame.source_frame, done.error))
-        if (not made and job.is_reported) or (self.part.count > 1 and job.missing()):
+        if (not made and job.is_reported) or (self.spread.part.count > 1 and job.missing()):
             return
         if not made:
             self._prepare(job, Steps(None, 0, 0))

@@ -9,11 +9,10 @@ from typing import Literal, get_args
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
+from carlasc.motion.options import MotionOptions, PoseOptions
 
 Dynamic = Literal["align", "current", "drop", "tube"]
 Complete = Literal["seen", "mirror", "body"]
-Motion = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
-PoseSource = Literal["file", "kiss-icp"]
 
 
 @dataclass(frozen=True)
@@ -33,18 +32,13 @@ class FromScans:
         dynamic: what happens to moving points. "align": each moving actor is completed from all scans, at its position in the
             frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
             were seen, as in SemanticKITTI, and moving actors leave traces.
-        motion: what tells which points move, and how. "boxes", "instances", "flow": the field of the sequence; "evidence": free space:
-            a point moves if other scans saw through its place; "none": nothing is known to move, unless its class says so. "auto" (and
-            None): the best of these fields that exists, and "evidence" for what it misses, unless every point has flow.
-        own_path: count what the recording vehicle drove through as free space.
         complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": a vehicle's side that was
-            not seen is taken from its other side.
-        poses: "file": from poses.txt; "kiss-icp": estimated from the scans (needs the extra `kitti`). Estimated poses are
-            written only if the sequence has no poses.txt.
+            not seen is taken from its other side; "body": and what is still missing from the usual shape of vehicles.
+        own_path: count what the recording vehicle drove through as free space.
+        motion: what tells which points move, and how.
+        poses: where poses come from. Those of a sequence without any are estimated from its scans, unless `PoseOptions("file")` is given.
         min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
         max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no limit.
-        min_speed_m_s: slower actors count as standing, in metres per second.
-        force: continue if consecutive poses are farther apart than a vehicle can move or turn.
 
     Raises:
         ArgumentError: a value is out of its range.
@@ -54,14 +48,12 @@ class FromScans:
     window_m: float | None = None
     stride: int = 1
     dynamic: Dynamic = "align"
-    motion: Motion | None = None
-    own_path: bool = True
     complete: Complete = "mirror"
-    poses: PoseSource = "file"
+    own_path: bool = True
+    motion: MotionOptions = MotionOptions()  # noqa: RUF009 (frozen)
+    poses: PoseOptions = PoseOptions()  # noqa: RUF009 (frozen)
     min_range_m: float | None = None
     max_range_m: float | None = None
-    min_speed_m_s: float = 0.3
-    force: bool = False
 
     def __post_init__(self) -> None:
         first, last = self.window
@@ -71,18 +63,15 @@ class FromScans:
             raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
         if self.window_m is not None and not self.window_m > 0:
             raise ArgumentError("window_m", expected="a positive number of metres", found=str(self.window_m))
-        for name, kind, default in (
-            ("dynamic", Dynamic, "align"),
-            ("motion", Motion, None),
-            ("complete", Complete, "mirror"),
-            ("poses", PoseSource, "file"),
-        ):
-            value = getattr(self, name)
-            if value not in (*get_args(kind), default):
+        for name, kind in (("dynamic", Dynamic), ("complete", Complete)):
+            if (value := getattr(self, name)) not in get_args(kind):
                 raise ArgumentError(name, expected=f"one of {', '.join(get_args(kind))}", found=repr(value))
-        if self.dynamic == "tube" and self.motion is not None:
+        for name, options in (("motion", MotionOptions), ("poses", PoseOptions)):
+            if not isinstance(value := getattr(self, name), options):
+                raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))
+        if self.dynamic == "tube" and self.motion.source != "auto":
             raise ArgumentError(
-                "motion", expected='none with dynamic "tube", which ignores what moves', found=repr(self.motion)
+                "motion", expected='none with dynamic "tube", which ignores what moves', found=repr(self.motion.source)
             )
         low, high = self.min_range_m or 0.0, math.inf if self.max_range_m is None else self.max_range_m
         if not 0 <= low < high:
@@ -91,8 +80,6 @@ class FromScans:
                 expected="0 <= minimum < maximum, in metres",
                 found=f"minimum {low:g} and maximum {high:g}",
             )
-        if not self.min_speed_m_s > 0:
-            raise ArgumentError("min_speed_m_s", expected="a positive number", found=str(self.min_speed_m_s))
 
 
 @dataclass(frozen=True)

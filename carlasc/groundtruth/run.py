@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +19,8 @@ from carlasc.groundtruth.from_scans.sequences import scan_sequences
 from carlasc.groundtruth.inputs import Plan, SequenceInput
 from carlasc.groundtruth.jobs import FrameFailure, Job, Work
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
-from carlasc.running.engines import Engine
-from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, one_pool
+from carlasc.running.options import Run
+from carlasc.running.processes import one_pool
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.opening import as_sink
@@ -77,16 +75,13 @@ def regrid(
     frames: Frames = None,
     name: str | None = None,
     overwrite: bool = False,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    part: Part = Part(),  # noqa: B008 (frozen)
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> RegridResult:
     """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and times, and a report of each grid.
 
     Frames that exist already are skipped. If they were made with other settings, the run stops before it writes anything. A frame that
     cannot be read is reported in the result, and the other frames are made. The work is done in processes that import the main
-    module again: call this under `if __name__ == "__main__":` in scripts, or with `workers=1`.
+    module again: call this under `if __name__ == "__main__":` in scripts, or with `run=Run(workers=1)`.
 
     Args:
         source: a sequence's folder, a folder of several sequences, or, unless it holds captures, anything that `carlasc.open` takes; or a
@@ -101,11 +96,8 @@ def regrid(
         frames: range of the source's frame numbers; None for all. A capture's frames are renumbered from 0.
         name: name of the grid's folder; None for a name by its size.
         overwrite: replace a grid that `regrid` made with other settings.
-        workers: number of frames that are made in parallel; None for one per core. With an executor: the number of its workers.
-        executor: runs the work instead of processes of our own; it is not shut down.
-        part: makes only this part of the frames; other commands make the others, at the same time or not. The part that finds that no
-            frame is missing any more writes the report, and finishes a packed store.
-        progress: called with the number of finished frames and the number of all frames.
+        run: how the work is spread, whether this is only a part of it, and who is told of its progress. The part that finds that no frame
+            is missing any more writes the report, and finishes a packed store.
 
     Returns:
         What was made, what existed already, and what failed.
@@ -116,25 +108,25 @@ def regrid(
         ConflictError: the output is published data, or has other settings or other scans. Nothing in it is changed.
         StorageError: the disk is full or the output cannot be written to. Files that were written are complete.
     """
-    start, workers = time.perf_counter(), count_workers(workers)
-    part.refuse(overwrite)
+    start = time.perf_counter()
+    run.part.refuse(overwrite)
     grid = layout.grid_folder(spec) if name is None else check_name(name)
-    sink = as_sink(_folder_of(source) if out is None else out, part=part)
+    sink = as_sink(_folder_of(source) if out is None else out, part=run.part)
     for place in (sink.location, str(source)):
-        check_shared(place, 1 if executor is None and workers == 1 else 2)
+        check_shared(place, run)
     plan = Plan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
     jobs = [_prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)]
 
     with ExitStack() as open_things:
-        pool = open_things.enter_context(one_pool(workers, executor))
+        pool = open_things.enter_context(one_pool(run))
         for job in jobs:
             _begin(job)
             job.announce()
             open_things.enter_context(job.writer)
-        work = Work(jobs, plan, part, workers, pool)
-        failures = work.run(progress)
+        work = Work(jobs, plan, pool)
+        failures = work.run()
     if sink is not out and (work.has_written or not sink.is_finished):  # a sink of the caller may get more
-        if part.count == 1:
+        if run.part.count == 1:
             sink.finish(incomplete=True)  # what is missing could not be made, and is reported
         elif not any(job.missing() for job in jobs):
             sink.finish()

@@ -24,8 +24,8 @@ from carlasc.groundtruth.from_scans.others import feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import Plan, Steps
 from carlasc.inspection.heldout_scores import HeldOutScores
-from carlasc.running.engines import Engine
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 
@@ -96,9 +96,7 @@ def holdout(
     voting: Voting = Voting(),  # noqa: B008 (frozen)
     every: int = EVERY,
     frames: Frames = None,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> HoldoutResult:
     """Leave every N-th scan out, make the grids at these frames from the other scans, and follow the rays of the scans through them.
 
@@ -113,9 +111,7 @@ def holdout(
         voting: how votes are counted.
         every: one of so many scans is left out.
         frames: range of the frames that may be left out; None for all.
-        workers: number of frames that are measured in parallel; None for one per core. With an executor: the number of its workers.
-        executor: runs the work instead of processes of our own; it is not shut down.
-        progress: called with (steps done, steps in total).
+        run: how the work is spread, and who is told of its progress.
 
     Raises:
         ArgumentError: `every` is less than 2, or the grid is cylindrical.
@@ -130,11 +126,11 @@ def holdout(
     plan = Plan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
     inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
     drives = [_Drive.of(sequence, every) for sequence in inputs]
-    steps = Steps(progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
-    tasks = [task for drive in drives for task in drive.tasks(count_workers(workers), executor, steps)]
+    steps = Steps(run.progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
+    tasks = [task for drive in drives for task in drive.tasks(run, steps)]
     scores: dict[str, HeldOutScores] = {}
     failures = []
-    with closing(run_all(_run_task, tasks, workers=workers, executor=executor, lost=_fail)) as results:
+    with closing(run_all(_run_task, tasks, run, lost=_fail)) as results:
         for task, outcome in zip(tasks, results, strict=True):
             if isinstance(outcome, str):
                 failures.append(FrameFailure(task.whole.location, task.frame, outcome))
@@ -174,12 +170,12 @@ class _Drive:
         """Number of scans that the pass that finds the actors reads."""
         return self.feed.reads
 
-    def tasks(self, workers: int, executor: Engine | None, progress: Callable[[int], None]) -> list[_Task]:
+    def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_Task]:
         """Find the actors in the scans that are left, and return a task for each frame to measure."""
         feed, inputs = self.feed, self.inputs
         actors = Actors()
         if feed.needs_actors:
-            actors = find_actors(feed, workers=workers, executor=executor, progress=progress)
+            actors = find_actors(feed, run, steps)
         first, last = feed.options.window
         return [
             _Task(inputs.path, feed, actors.between(f + first, f + last), inputs.feed.sequence, f, inputs.plan)

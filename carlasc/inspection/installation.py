@@ -20,7 +20,7 @@ from typing import Any
 
 import carlasc
 from carlasc.errors import ArgumentError, DependencyError, StorageError, describe, import_extra
-from carlasc.running import count_workers
+from carlasc.running import count_cores
 from carlasc.running.pools import ONE_THREAD
 from carlasc.storage.durability import is_durable
 
@@ -330,7 +330,7 @@ def _look_at_processor(numba_loads: bool) -> Processor:
         features = tuple(
             name for name in _FEATURES if found.get(name) and f"-{name}" not in (config.CPU_FEATURES or "")
         )
-    return Processor(_model(), os.cpu_count() or 1, count_workers(None), target, features)
+    return Processor(_model(), os.cpu_count() or 1, count_cores(), target, features)
 
 
 def _model() -> str:

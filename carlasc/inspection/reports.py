@@ -18,8 +18,9 @@ from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_fram
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
-from carlasc.running.engines import Engine
-from carlasc.running.processes import count_workers, run_all
+from carlasc.motion.options import MotionOptions, PoseOptions
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import write_output
 from carlasc.storage.folder import FolderSequence
@@ -59,9 +60,7 @@ def report(
     remake: bool = False,
     holdout: bool = False,
     save: bool = False,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ReportResult:
     """Return the report of each grid of a data set: the one that its run left, or one that is made from the files.
 
@@ -73,9 +72,7 @@ def report(
         remake: make the reports from the files, also where there are some.
         holdout: add held-out scores (see `carlasc.inspection.holdout`) where there are none, for Cartesian grids that were made from scans.
         save: write the reports beside their grids: folders only, and only grids that carlasc made.
-        workers: number of frames that are read in parallel; None for one per core. With an executor: the number of its workers.
-        executor: runs the work instead of processes of our own; it is not shut down.
-        progress: called with (steps done, steps in total), for reports that are made.
+        run: how the work is spread, and who is told of the progress of reports that are made.
 
     Raises:
         MissingDataError: there is no data set, or no grid of this name.
@@ -99,7 +96,7 @@ def report(
     existing = {} if remake else {row: maker.existing() for row, maker in enumerate(makers)}
     reports = {row: one for row, one in existing.items() if one is not None}
     missing = [row for row in range(len(makers)) if row not in reports]
-    measured = _measure_all([makers[row] for row in missing], workers, executor, progress)
+    measured = _measure_all([makers[row] for row in missing], run)
     failures: list[FrameFailure] = []
     for row, results in zip(missing, measured, strict=True):
         failures += [result for result in results if isinstance(result, FrameFailure)]
@@ -108,7 +105,7 @@ def report(
     for row, (path, sequence, name) in enumerate(grids):
         one = reports[row]
         if holdout and one.holdout is None:
-            one = replace(one, holdout=makers[row].held_out(workers, executor))
+            one = replace(one, holdout=makers[row].held_out(run))
         if save and isinstance(sequence, FolderSequence):
             write_output(sequence.folder / layout.report_file(name), one.to_json())
         found[f"{path}/{name}" if path else name] = one
@@ -118,20 +115,15 @@ def report(
 _Measured = FrameFacts | FrameFailure
 
 
-def _measure_all(
-    makers: list[_Maker],
-    workers: int | None,
-    executor: Engine | None,
-    progress: Callable[[int, int], None] | None,
-) -> list[list[_Measured]]:
+def _measure_all(makers: list[_Maker], run: Run) -> list[list[_Measured]]:
     """Return what was measured of the frames of each report."""
-    steps = Steps(progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
+    steps = Steps(run.progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
     for maker in makers:
-        maker.find_actors(count_workers(workers), executor, steps)
+        maker.find_actors(run, steps)
     tasks = [(row, task) for row, maker in enumerate(makers) for task in maker.tasks()]
     measured: list[list[_Measured]] = [[] for _ in makers]
     frames = [task for _, task in tasks]
-    with closing(run_all(_measure, frames, workers=workers, executor=executor, lost=_fail)) as results:
+    with closing(run_all(_measure, frames, run, lost=_fail)) as results:
         for (row, _), result in zip(tasks, results, strict=True):
             measured[row].append(result)
             steps(1)
@@ -169,12 +161,12 @@ class _Maker:
         """Number of scans of the pass that finds the actors."""
         return 0 if self.inputs is None else self.inputs.steps_before
 
-    def find_actors(self, workers: int, executor: Engine | None, progress: Callable[[int], None]) -> None:
+    def find_actors(self, run: Run, steps: Callable[[int], None]) -> None:
         """Find the actors, if the grid was made with them; the inputs are given up if a scan cannot be read."""
         if self.inputs is None or not self.inputs.feed.needs_actors:
             return
         try:
-            self.inputs.actors = find_actors(self.inputs.feed, workers=workers, executor=executor, progress=progress)
+            self.inputs.actors = find_actors(self.inputs.feed, run, steps)
         except (CarlascError, OSError):  # measuring the frame reports the scan
             self.inputs = None
 
@@ -203,7 +195,7 @@ class _Maker:
         actors = None if self.inputs is None else self.inputs.summaries()
         return Report.make(self.grid, facts, params, classes, documents, actors=actors)
 
-    def held_out(self, workers: int | None, executor: Engine | None) -> Mapping[str, Any] | None:
+    def held_out(self, run: Run) -> Mapping[str, Any] | None:
         """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans beside it."""
         spec = self.sequence.grids[self.grid]
         if self.inputs is None or spec.coordinates != "cartesian":
@@ -215,8 +207,7 @@ class _Maker:
             observe=self.inputs.options,
             voting=self.inputs.plan.voting,
             every=every,
-            workers=workers,
-            executor=executor,
+            run=replace(run, progress=None),
         )
         return None if result.total is None else result.total.to_dict()
 
@@ -258,7 +249,10 @@ def _options_of(record: Mapping[str, Any]) -> FromScans:
     if "window" in given:
         first, _, last = str(given["window"]).partition(":")
         given["window"] = (int(first), int(last))
-    return FromScans(**given, force=True)
+    given["poses"] = PoseOptions(record.get("poses", "file"), force=True)
+    if "motion" in given:
+        given["motion"] = MotionOptions(given["motion"])
+    return FromScans(**given)
 
 
 def _measure(task: _Frame) -> FrameFacts | FrameFailure:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.running.engines import Engine
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
 from carlasc.storage import as_source
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
@@ -157,9 +157,7 @@ def stats(
     grid: str = EVALUATION,
     remap: str | Remap | None = "auto",
     every: int = 1,
-    workers: int | None = 1,
-    executor: Engine | None = None,
-    progress: Progress | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Statistics:
     """Count the classes of points and of a grid's known voxels, frame by frame.
 
@@ -169,9 +167,7 @@ def stats(
         remap: the remap to the classes of a second table: a remap or its name, None for no second table, or "auto", which takes the
             paper's 11 classes or SemanticKITTI's 19.
         every: count every N-th frame.
-        workers: processes that count side by side; None for one per core.
-        executor: an executor that counts instead of new processes.
-        progress: called with (frames counted, frames in total).
+        run: how the work is spread, and who is told of its progress.
 
     Returns:
         The histograms. Frames that could not be read are listed in `failures`.
@@ -194,13 +190,13 @@ def stats(
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
     count, lost = partial(_count, classes=classes), partial(_fail, classes=classes)
-    counted = run_all(count, tasks, workers=count_workers(workers), executor=executor, lost=lost)
+    counted = run_all(count, tasks, run, lost=lost)
     for (sequence, _, frames), (histogram, failed) in zip(tasks, counted, strict=True):
         histograms[sequence.path] += histogram
         failures += failed
         done += len(frames)
-        if progress is not None:
-            progress(done, total)
+        if run.progress is not None:
+            run.progress(done, total)
     splits = {path: sequence.split or "none" for path, sequence in sequences.items()}
     return Statistics(opened.location, classes, chosen, histograms, splits, tuple(failures))
 

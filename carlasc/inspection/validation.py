@@ -23,7 +23,7 @@ from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
@@ -42,9 +42,7 @@ def validate(
     source: str | os.PathLike[str] | Source,
     *,
     every: int | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
-    progress: Progress | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and grids.
 
@@ -54,9 +52,7 @@ def validate(
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
         every: read the contents of every N-th frame; 1 reads all, None about forty frames per sequence.
-        workers: number of sequences that are checked in parallel; None for one per core. With an executor: the number of its workers.
-        executor: checks instead of processes of our own; it is not shut down.
-        progress: called with (steps done, steps in total).
+        run: how the work is spread over the sequences, and who is told of its progress.
 
     Returns:
         The findings; `ok` is True if none of them is an error.
@@ -76,17 +72,17 @@ def validate(
     def step(steps: int = 1) -> None:
         nonlocal done
         done += steps
-        if progress is not None:
-            progress(done, total)
+        if run.progress is not None:
+            run.progress(done, total)
 
-    if executor is None and workers == 1:
+    if run.is_alone:
         examined: Iterator[_Examined] = (_examine(plan, step) for plan in plans)
     else:
-        examined = run_all(_examine, plans, workers=workers, executor=executor, lost=_fail)
+        examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (found, report) in zip(plans, examined, strict=True):
         findings += sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
-        if executor is not None or workers != 1:
+        if not run.is_alone:
             step(plan.steps)
     return ValidationResult(opened.location, tuple(findings), tuple(reports))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +13,7 @@ from carlasc.metrics.conventions import CONVENTIONS, Convention
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
 from carlasc.metrics.scorer import LabelPair, Options, Region, Scorer, Voxels
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 
 _TOGETHER = 8  # frames that a worker scores in one task
@@ -33,9 +33,7 @@ def evaluate(
     rays: bool = False,
     frames: Frames = None,
     name: str | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Evaluation:
     """Score predicted grids against the ground truth, one frame in memory at a time.
 
@@ -56,9 +54,7 @@ def evaluate(
         rays: also compute RayIoU; this needs poses and a Cartesian grid.
         frames: the frames that are scored; None scores all frames of the ground truth.
         name: name of the predictions in tables.
-        workers: number of processes that score; None for one per core. `region` must then be a function that can be pickled.
-        executor: scores instead of processes of our own; it is not shut down.
-        progress: called with (frames done, frames in total).
+        run: how the work is spread, and who is told of its progress. With several processes, `region` must be a function that can be pickled.
 
     Returns:
         The scores. Frames that could not be scored are listed in `failures`.
@@ -70,7 +66,7 @@ def evaluate(
     """
     (result,) = _score_all(
         [convention], source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
-        workers=workers, executor=executor, progress=progress, options=Options(voxels, region, tuple(by), rays),
+        run=run, options=Options(voxels, region, tuple(by), rays),
     )  # fmt: skip
     if isinstance(result, CarlascError):
         raise result
@@ -86,9 +82,7 @@ def evaluate_by_all_conventions(
     source_classes: str | None = None,
     frames: Frames = None,
     name: str | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Mapping[str, Evaluation | CarlascError]:
     """Score predictions by every convention. Each frame is read once.
 
@@ -100,16 +94,14 @@ def evaluate_by_all_conventions(
         source_classes: as for `evaluate`.
         frames: as for `evaluate`.
         name: as for `evaluate`.
-        workers: as for `evaluate`.
-        executor: as for `evaluate`.
-        progress: as for `evaluate`.
+        run: how the work is spread, and who is told of its progress.
 
     Returns:
         For the name of each convention: the scores, or the error that says why the data cannot be scored by it.
     """
     results = _score_all(
         list(CONVENTIONS), source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
-        workers=workers, executor=executor, progress=progress, options=Options(),
+        run=run, options=Options(),
     )  # fmt: skip
     return dict(zip(CONVENTIONS, results, strict=True))
 
@@ -124,9 +116,7 @@ def _score_all(
     source_classes: str | None,
     frames: Frames,
     name: str | None,
-    workers: int | None,
-    executor: Engine | None,
-    progress: Callable[[int, int], None] | None,
+    run: Run,
     options: Options,
 ) -> list[Evaluation | CarlascError]:
     """Read each frame once and score it by each convention."""
@@ -140,15 +130,15 @@ def _score_all(
         )
     label = name or getattr(source, "location", None) or str(source)
     scorers = [Scorer(convention, pairs, source_classes, options) for convention in conventions]
-    size = 1 if executor is None and workers == 1 else _TOGETHER
+    size = 1 if run.is_alone else _TOGETHER
     tasks = [
         _Task(pair, tuple(numbers[first : first + size].tolist()))
         for pair, numbers in jobs
         for first in range(0, len(numbers), size)
     ]
     score, fail = partial(_score_task, scorers=scorers), partial(_fail_task, scorers=scorers)
-    steps, done = progress or (lambda done, total: None), 0
-    with closing(run_all(score, tasks, workers=workers, executor=executor, lost=fail)) as results:
+    steps, done = run.progress or (lambda done, total: None), 0
+    with closing(run_all(score, tasks, run, lost=fail)) as results:
         for task, parts in zip(tasks, results, strict=True):
             for scorer, part in zip(scorers, parts, strict=True):
                 scorer.merge(part)

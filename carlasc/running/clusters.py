@@ -15,8 +15,8 @@ from typing import Any
 from carlasc.errors import ArgumentError, CarlascError, import_extra
 from carlasc.running.clients import one_line_if_lost
 from carlasc.running.engines import DaskClient, LazyClient
+from carlasc.running.options import Run
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
-from carlasc.running.processes import count_workers
 from carlasc.running.workers import Versions
 
 _CONNECT_S = "10s"  # Dask's setting carlasc.connect-timeout replaces it
@@ -79,7 +79,7 @@ def _starter(where: str, workers: int | None) -> Callable[[], Any] | None:
     if match := re.fullmatch(r"local(?::([1-9][0-9]*))?", where):
         if match[1] and workers not in (None, int(match[1])):
             raise ArgumentError("workers", expected=f"none beside {where}", found=str(workers))
-        return partial(_start_local, int(match[1]) if match[1] else count_workers(workers))
+        return partial(_start_local, int(match[1]) if match[1] else Run(workers).processes)
     module, _, name = "dask_jobqueue.SLURMCluster".rpartition(".") if where == "slurm" else where.rpartition(".")
     if where == "slurm":
         import_extra(module, "cluster")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import chain, islice
 from typing import TypeVar
 
-from carlasc.errors import ArgumentError, CarlascError
-from carlasc.running.engines import Engine
+from carlasc.errors import CarlascError
+from carlasc.running.options import Run
 from carlasc.running.pools import LostTaskError, OwnProcesses
 
 Item = TypeVar("Item")
@@ -21,9 +21,8 @@ Result = TypeVar("Result")
 def run_all(
     function: Callable[[Item], Result],
     items: Iterable[Item],
+    run: Run = Run(),  # noqa: B008 (frozen)
     *,
-    workers: int | None = None,
-    executor: Engine | None = None,
     lost: Callable[[Item, str], Result] | None = None,
 ) -> Generator[Result, None, None]:
     """Yield `function(item)` for every item, in the order of the items.
@@ -40,16 +39,14 @@ def run_all(
     Args:
         function: a top-level function; it and the items are pickled.
         items: the arguments of the calls. They are taken as work proceeds, and making one may call `run_all` with the same executor.
-        workers: number of processes, all cores if None. With an executor: the number of its workers.
-        executor: does the work instead; it is left open.
+        run: how many processes do the work, or which executor does.
         lost: makes the result of an item that is given up, from the item and a message. Without it, such an item is an error.
 
     Raises:
-        ArgumentError: `workers` is not positive.
         CarlascError: an item is given up and there is no `lost`, the worker processes of a caller's executor died, or the connection to
             a cluster is lost.
     """
-    workers, waiting = count_workers(workers), iter(items)
+    workers, executor, waiting = run.processes, run.executor, iter(items)
     first = list(islice(waiting, 2))
     items, is_one = chain(first, waiting), len(first) < 2
     if not first:
@@ -65,20 +62,6 @@ def run_all(
         from carlasc.running.clients import run_on_cluster  # Dask and what a worker of it needs
 
         yield from run_on_cluster(executor, function, items, lost)
-
-
-def count_workers(workers: int | None) -> int:
-    """Return `workers`, or the number of cores that this process may use if it is None.
-
-    Raises:
-        ArgumentError: `workers` is not positive.
-    """
-    if workers is None:
-        cores_of = getattr(os, "sched_getaffinity", None)  # macOS does not say which cores a process may use
-        return len(cores_of(0)) if cores_of else os.cpu_count() or 1
-    if workers < 1:
-        raise ArgumentError("workers", expected="at least 1", found=str(workers))
-    return workers
 
 
 def _submit_all(
@@ -118,20 +101,19 @@ def _submit_all(
 
 
 @contextmanager
-def one_pool(workers: int, executor: Engine | None) -> Iterator[Engine | None]:
-    """Yield an executor for several calls of `run_all`, so that its processes start only once.
+def one_pool(run: Run) -> Iterator[Run]:
+    """Yield a run with an executor for several calls of `run_all`, so that its processes start only once.
 
-    It is `executor` if that is given, and None, which `run_all` takes for work in this process, with one worker.
+    A run with an executor of its own, or with one worker, whose work is done in this process, is yielded as it is.
 
     Args:
-        workers: number of processes.
-        executor: does the work instead; it is left open.
+        run: how many processes do the work, or which executor does.
     """
-    if executor is not None or workers <= 1:
-        yield executor
+    if run.executor is not None or run.is_alone:
+        yield run
     else:
-        with _own_processes(workers) as pool:
-            yield pool
+        with _own_processes(run.processes) as pool:
+            yield replace(run, executor=pool)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from collections.abc import Sequence as Series
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError
-from carlasc.running.engines import Engine
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
@@ -28,7 +28,7 @@ _SAMPLED = 5  # frames of which the largest says how large frames are
 
 
 @dataclass(frozen=True)
-class Block:
+class FrameBlock:
     """Frames that one task copies.
 
     Attributes:
@@ -46,38 +46,38 @@ class Block:
         """Number of published files that the frames are."""
         return sum(map(len, self.frames.values()))
 
-    def missing(self) -> Block:
+    def missing(self) -> FrameBlock:
         """Return the frames that the writer lacks."""
         has = self.writer.has
         lacking = {name: [frame for frame in frames if not has(name, frame)] for name, frames in self.frames.items()}
-        return Block(self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames})
+        return FrameBlock(self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames})
 
 
-def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Block]:
+def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[FrameBlock]:
     """Return all frames of a sequence in blocks of `size` frame numbers."""
     blocks: dict[int, dict[str, list[int]]] = {}
     for name in sorted(sequence.fields()):
         for frame in sequence.frames(name).tolist():
             blocks.setdefault(frame // size, {}).setdefault(name, []).append(frame)
-    return [Block(sequence, writer, blocks[number]) for number in sorted(blocks)]
+    return [FrameBlock(sequence, writer, blocks[number]) for number in sorted(blocks)]
 
 
-def copy_blocks(
-    blocks: Series[Block], *, workers: int | None, executor: Engine | None, step: Callable[[int], None]
-) -> int:
+def copy_blocks(blocks: Series[FrameBlock], run: Run, step: Callable[[int], None]) -> int:
     """Copy blocks in parallel, and return the number of files that they are; `step` is called with that of each."""
     todo = [block for block in blocks if block.files]
-    files, processes = 0, _processes(workers, executor, todo)
+    files = 0
+    if run.workers is None and run.executor is None:
+        run = replace(run, workers=max(1, min(run.processes, len(todo) // _FEW)))
     for place in {place for block in todo for place in (block.sequence.location, block.writer.location)}:
-        check_shared(place, processes if executor is None else 2)
-    with closing(run_all(_copy, todo, workers=processes, executor=executor)) as copied:
+        check_shared(place, run)
+    with closing(run_all(_copy, todo, run)) as copied:
         for count in copied:
             step(count)
             files += count
     return files
 
 
-def _copy(block: Block) -> int:
+def _copy(block: FrameBlock) -> int:
     found: dict[int, dict[str, NDArray[Any]]] = {}
     for name, frames in block.frames.items():
         for frame, array in zip(frames, block.sequence.read_many(name, frames), strict=True):
@@ -118,13 +118,6 @@ def typical_rows(sequence: Sequence) -> dict[str, int]:
         places = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED).astype(np.int64))
         found[name] = max(len(sequence.read(name, frame)) for frame in frames[places].tolist())
     return found
-
-
-def _processes(workers: int | None, executor: Engine | None, blocks: Series[Block]) -> int:
-    """Return the number of processes: as given, else one per core, and fewer where there are few blocks."""
-    if workers is not None or executor is not None:
-        return count_workers(workers)
-    return max(1, min(count_workers(None), len(blocks) // _FEW))
 
 
 def counter(progress: Progress | None, total: int) -> Callable[[int], None]:

@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
-from carlasc.running.engines import Engine
-from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers
+from carlasc.running.options import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import (
-    Block,
+    FrameBlock,
     Progress,
     blocks_of,
     copy_blocks,
@@ -81,10 +79,7 @@ def pack(
     small: bool = False,
     lossy_mm: float | None = None,
     overwrite: bool = False,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    part: Part = Part(),  # noqa: B008 (frozen)
-    progress: Progress | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> PackResult:
     """Pack all sequences of `source` into one store. Nothing is lost, unless `lossy_mm` is given.
 
@@ -98,12 +93,9 @@ def pack(
         small: PCodec for points (zarr only): smaller, but fewer programs can read it.
         lossy_mm: quantise points to this many millimetres, which the store records. None keeps every bit.
         overwrite: replace a store that exists at `out`.
-        workers: number of processes that pack blocks of frames into a `.zarr`; None for one per core, and fewer where there are few blocks.
-            Other stores have one writer: this is the number of threads that read ahead of it. With an executor: the number of its workers.
-        executor: packs the blocks instead of processes of our own (zarr only); it is not shut down.
-        part: packs only this part of the frames (zarr only); other commands pack the others. The part that finds that no frame is missing any
-            more finishes the store.
-        progress: called with (files done, all files of this part).
+        run: how the work is spread. A `.zarr` is packed in blocks of frames: by one process per core, and fewer where there are few blocks,
+            unless `workers` is given; by an executor; or in parts, of which the one that finds that no frame is missing any more finishes the
+            store. Other stores have one writer: `workers` is the number of threads that read ahead of it. Steps of progress are files.
 
     Returns:
         What was packed, with the bytes before and after.
@@ -117,10 +109,9 @@ def pack(
     """
     began = time.perf_counter()
     options = Options(small, lossy_mm)
-    count_workers(workers)
-    part.refuse(overwrite)
+    run.part.refuse(overwrite)
     if PurePath(out).suffix != ".zarr":
-        _refuse_several(out, executor, part)
+        _refuse_several(out, run)
     source = as_source(source)
     refuse_overlap(out, source)
     result = PackResult(str(out) if is_url(out) else Path(out))
@@ -134,9 +125,9 @@ def pack(
     with _writing(out):
         sink = open_sink(out, options, overwrite)
         if isinstance(sink, PackedSink):
-            result.published_bytes = _append(sequences, sink, progress, workers or _AHEAD)
+            result.published_bytes = _append(sequences, sink, run.progress, run.workers or _AHEAD)
             sink.finish()
-        elif not _pack_blocks(sequences, sink, workers, executor, part, progress):
+        elif not _pack_blocks(sequences, sink, run):
             return replace(result, elapsed_s=time.perf_counter() - began)
     packed = cast(PackedSource, open(out))
     result.published_bytes = result.published_bytes or packed.published_bytes()
@@ -145,30 +136,23 @@ def pack(
     return result
 
 
-def _refuse_several(out: object, executor: Engine | None, part: Part) -> None:
+def _refuse_several(out: object, run: Run) -> None:
     """Refuse to write a store of one writer by several."""
-    for name, wanted in (("executor", executor is not None), ("part", part.count > 1)):
+    for name, wanted in (("executor", run.executor is not None), ("part", run.part.count > 1)):
         if wanted:
             raise ArgumentError(name, expected="a .zarr store, which several processes can write", found=str(out))
 
 
-def _pack_blocks(
-    sequences: Mapping[str, Sequence],
-    sink: ZarrSink,
-    workers: int | None,
-    executor: Engine | None,
-    part: Part,
-    progress: Progress | None,
-) -> bool:
+def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) -> bool:
     """Pack a part of the blocks of sequences, in any number of processes, and return whether the store is finished."""
-    if sink.is_finished and part.count == 1:
+    if sink.is_finished and run.part.count == 1:
         raise ConflictError(
             sink.location,
             expected="nothing there",
             found="a finished store",
             advice="choose another name, or give `overwrite=True`",
         )
-    blocks: list[Block] = []
+    blocks: list[FrameBlock] = []
     writers: list[ZarrWriter] = []
     for path, sequence in sequences.items():
         writers.append(writer := sink.sequence(path))
@@ -177,16 +161,16 @@ def _pack_blocks(
         fields = {name: sequence.frames(name).tolist() for name in sequence.fields()}
         writer.expect(fields, typical_rows(sequence))
         blocks += blocks_of(sequence, writer, writer.block)
-    ours = part.take(blocks)
+    ours = run.part.take(blocks)
     missing, total = [block.missing() for block in ours], sum(block.files for block in ours)
-    step = counter(progress, total)
+    step = counter(run.progress, total)
     step(total - sum(block.files for block in missing))
-    copy_blocks(missing, workers=workers, executor=executor, step=step)
+    copy_blocks(missing, run, step)
     for writer in writers:
         writer.close()
     for writer in writers:
         writer.refresh()
-    if part.count > 1 and any(block.missing().files for block in blocks):
+    if run.part.count > 1 and any(block.missing().files for block in blocks):
         return False  # another part finishes the store
     sink.finish()
     return True

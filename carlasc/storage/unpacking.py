@@ -8,10 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from carlasc.errors import ConflictError
-from carlasc.running.engines import Engine
-from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers
-from carlasc.storage.copying import Progress, blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
+from carlasc.running.options import Run
+from carlasc.storage.copying import blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place, unfinished
@@ -45,10 +43,7 @@ def unpack(
     out: str | os.PathLike[str],
     *,
     overwrite: bool = False,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    part: Part = Part(),  # noqa: B008 (frozen)
-    progress: Progress | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> UnpackResult:
     """Write all sequences of `source` as published files: for a packed store, the same bytes that were packed.
 
@@ -60,26 +55,22 @@ def unpack(
         source: a packed store, or anything else that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
         overwrite: write into a folder that exists and replace files of the same names; other files stay.
-        workers: number of processes; None for one per core, and fewer where there are few frames. With an executor: the number of its workers.
-        executor: does the work instead of processes of our own; it is not shut down.
-        part: writes only this part of the frames; other commands write the others.
-        progress: called with (files done, all files of this part).
+        run: how the work is spread: by one process per core, and fewer where there are few frames, unless `workers` is given. Steps of
+            progress are files.
 
     Returns:
         What was written.
 
     Raises:
-        ArgumentError: `workers` is not positive.
         ConflictError: something exists at `out`, or `out` lies inside `source`.
         FormatError, MissingDataError: a part of the source is damaged or missing.
         StorageError: the files cannot be written: a full disk, a folder without write permission.
     """
     began = time.perf_counter()
-    count_workers(workers)
     source = as_source(source)
     refuse_overlap(out, source)
     result = UnpackResult(str(out) if is_url(out) else Path(out))
-    in_place = overwrite or part.count > 1 or not isinstance(result.out, Path)
+    in_place = overwrite or run.part.count > 1 or not isinstance(result.out, Path)
     if isinstance(result.out, Path) and result.out.exists() and not in_place:
         raise ConflictError(
             result.out,
@@ -98,13 +89,13 @@ def unpack(
         else:
             copy_documents(sequence, writer)
         blocks += blocks_of(sequence, writer, _BLOCK)
-    ours = part.take(blocks)
+    ours = run.part.take(blocks)
     missing = ours if overwrite else [block.missing() for block in ours]
     total = sum(block.files for block in ours)
     result.kept = total - sum(block.files for block in missing)
-    step = counter(progress, total)
+    step = counter(run.progress, total)
     step(result.kept)
-    result.files = copy_blocks(missing, workers=workers, executor=executor, step=step)
+    result.files = copy_blocks(missing, run, step)
     if isinstance(folder, Path) and isinstance(result.out, Path) and folder != result.out:
         put_in_place(folder, result.out, overwrite=False)
     result.elapsed_s = time.perf_counter() - began

@@ -12,6 +12,7 @@ import time
 
 import psutil
 
+from carlasc import Run
 from carlasc.running import Engine, open_cluster, run_all
 from carlasc.running.processes import one_pool
 
@@ -32,9 +33,12 @@ def measure_overhead(workers: int, frames: int) -> tuple[str, str]:
 
 
 def _time(executor: Engine | None, workers: int, frames: int) -> str:
-    list(run_all(do_nothing, range(50), workers=workers, executor=executor))
+    list(run_all(do_nothing, range(50), run=Run(workers=workers, executor=executor)))
     start, before = time.perf_counter(), _cpu_s()
-    assert sum(run_all(do_nothing, range(frames), workers=workers, executor=executor)) == frames * (frames - 1) // 2
+    assert (
+        sum(run_all(do_nothing, range(frames), run=Run(workers=workers, executor=executor)))
+        == frames * (frames - 1) // 2
+    )
     elapsed, cpu = time.perf_counter() - start, _cpu_s() - before
     return f"{1e3 * elapsed / frames:.2f} ms a frame ({1e3 * cpu / frames:.2f} ms of CPU)"
 
@@ -49,7 +53,7 @@ def measure_whole(workers: int, frames: int) -> None:
     """Print the time of many frames, and the memory of this process, which holds the scheduler, on the way."""
     process, start = psutil.Process(), time.perf_counter()
     with open_cluster(f"local:{workers}") as cluster:
-        for done, _ in enumerate(run_all(do_nothing, range(frames), executor=cluster)):
+        for done, _ in enumerate(run_all(do_nothing, range(frames), run=Run(executor=cluster))):
             if done % (frames // 8) == 0:
                 tasks = len(cluster.client.cluster.scheduler.tasks)
                 print(

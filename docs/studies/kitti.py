@@ -17,7 +17,7 @@ from clock import Clock
 from PIL import Image
 
 import carlasc
-from carlasc import Grid, GridSpec
+from carlasc import Grid, GridSpec, Run
 from carlasc.captures import Drive
 from carlasc.converting import convert
 from carlasc.core.geometry import invert
@@ -58,7 +58,7 @@ def make(folder: Path, rule: str, name: str) -> dict[int, Grid]:
             observe=FromScans(dynamic=rule),  # type: ignore[arg-type]
             frames=(frame, frame + 1),
             name=f"{grid}_{frame}",
-            workers=1,
+            run=Run(workers=1),
         )
         if result.failures:
             raise SystemExit(result.failures[0].message)

@@ -32,6 +32,7 @@ from movers_rows import ABLATIONS, BASIC, MANY_CHANNELS, PARKED, ROWS, Row
 from movers_scores import Counts, count, figures
 from movers_tables import Table, write_tables
 
+from carlasc import Run
 from carlasc.core.frames import FrameRange
 from carlasc.groundtruth import Voting
 from carlasc.groundtruth.from_scans.actors import Actors
@@ -131,7 +132,9 @@ def run(task: Task) -> None:
     for row, grid in missing:
         start = time.perf_counter()
         if task.held_out:
-            scores = holdout(drive.folder, GRIDS[grid], observe=row.observe, every=15, frames=(30, 61), workers=1)
+            scores = holdout(
+                drive.folder, GRIDS[grid], observe=row.observe, every=15, frames=(30, 61), run=Run(workers=1)
+            )
             result = scores.to_dict()["total"]
             line = f"{setting} {grid} {row.name}: held-out rays"
         else:

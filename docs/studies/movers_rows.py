@@ -14,6 +14,7 @@ from carlasc import Boxes
 from carlasc.core.geometry import rotation_z
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.options import Complete
+from carlasc.motion import MotionOptions
 from carlasc.storage import Sequence
 
 SEED = 12  # of all noise that is added
@@ -209,11 +210,11 @@ def has_dufomap() -> bool:
     return find_spec("dufomap") is not None
 
 
-FLOW = _merging(motion="flow")
+FLOW = _merging(motion=MotionOptions("flow"))
 ROWS = (
     Row("tube", FromScans(dynamic="tube")),
-    Row("current", _merging(dynamic="current", motion="flow")),
-    Row("drop", _merging(dynamic="drop", motion="flow")),
+    Row("current", _merging(dynamic="current", motion=MotionOptions("flow"))),
+    Row("drop", _merging(dynamic="drop", motion=MotionOptions("flow"))),
     *(
         [Row("dufomap, then tube", FromScans(dynamic="tube"), without_what_dufomap_finds, True)]
         if has_dufomap()
@@ -226,14 +227,14 @@ ROWS = (
         for complete in get_args(Complete)
         if complete != FLOW.complete
     ),
-    Row("align, instances", _merging(motion="instances")),
-    Row("align, boxes", _merging(motion="boxes"), noisy_boxes),
-    Row("align, exact boxes", _merging(motion="boxes")),
-    Row("align, evidence", _merging(motion="evidence")),
+    Row("align, instances", _merging(motion=MotionOptions("instances"))),
+    Row("align, boxes", _merging(motion=MotionOptions("boxes")), noisy_boxes),
+    Row("align, exact boxes", _merging(motion=MotionOptions("boxes"))),
+    Row("align, evidence", _merging(motion=MotionOptions("evidence"))),
 )
 """The rows of the tables."""
 
-EVIDENCE = _merging(motion="evidence")
+EVIDENCE = _merging(motion=MotionOptions("evidence"))
 _HINTS = {"flow": FLOW, "evidence": EVIDENCE}
 ABLATIONS = (
     *(
@@ -252,7 +253,7 @@ ABLATIONS = (
         for hint, observe in _HINTS.items()
         for frames in (5, 15)
     ),
-    Row("instances, 10 % wrong ids", _merging(motion="instances"), wrong_ids),
+    Row("instances, 10 % wrong ids", _merging(motion=MotionOptions("instances")), wrong_ids),
 )
 """What is changed one at a time, at 32 channels on the coarse grid. The window is 30 frames elsewhere."""
 MANY_CHANNELS = tuple(Row(f"align, {hint}", observe) for hint, observe in _HINTS.items())

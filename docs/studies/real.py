@@ -19,15 +19,16 @@ from real_drive import find_poses, read_scans, write_drive
 from real_measures import Judge, Measures
 
 import carlasc
-from carlasc import GridSpec
+from carlasc import GridSpec, Run
 from carlasc.groundtruth import FromScans
+from carlasc.motion import MotionOptions
 
 WINDOW = (-30, 30)
 FRAMES = range(50, 75)
 SPEC = GridSpec.published().with_resolution(0.2)
 RULES = {  # name -> whether labels and boxes are given, what observes
     "tube": (True, FromScans(window=WINDOW, dynamic="tube")),
-    "align, boxes": (True, FromScans(window=WINDOW, motion="boxes", own_path=False)),
+    "align, boxes": (True, FromScans(window=WINDOW, motion=MotionOptions("boxes"), own_path=False)),
     "align, boxes, and evidence": (True, FromScans(window=WINDOW, own_path=False)),
     "tube, no labels": (False, FromScans(window=WINDOW, dynamic="tube")),
     "align, no labels": (False, FromScans(window=WINDOW, own_path=False)),
@@ -63,7 +64,7 @@ def measure_rule(judge: Judge, folder: Path, name: str, frames: list[int], every
     grid = "".join(letter if letter.isalnum() else "_" for letter in name)
     ranges = [(frames[0], frames[-1] + 1)] if every == 1 else [(frame, frame + 1) for frame in frames]
     for chosen in ranges:
-        result = carlasc.regrid(folder, SPEC, name=grid, frames=chosen, observe=observe, workers=1)
+        result = carlasc.regrid(folder, SPEC, name=grid, frames=chosen, observe=observe, run=Run(workers=1))
         if result.failures:
             raise SystemExit("\n".join(map(str, result.failures)))
     (sequence,) = carlasc.open(folder).sequences().values()

@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarking.sizes import SPLITS, Scenes, settings_of
-from carlasc import FromScans, Grid, GridSpec, Voting, regrid
+from carlasc import FromScans, Grid, GridSpec, Run, Voting, regrid
 from carlasc.captures import Drive, TrafficLevel
 from carlasc.core import CARLA, invert, relative_to, transform_points
 from carlasc.errors import ConflictError
 from carlasc.groundtruth import Observation, count_votes
+from carlasc.motion import MotionOptions
 from carlasc.storage import FolderSink, SequenceWriter
 
 TRAFFIC: TrafficLevel = "heavy"
@@ -104,10 +105,13 @@ def merge_scans(folder: Path, scenes: Scenes, workers: int | None) -> None:
     """Make the labels that one sensor's scans give. Frames that exist are skipped."""
     frames = scenes.margin, scenes.margin + scenes.frames
     window = -scenes.margin, scenes.margin
-    tube, align = FromScans(window=window, dynamic="tube"), FromScans(window=window, dynamic="align", motion="flow")
-    regrid(folder, scenes.spec, observe=tube, name="tube", frames=frames, workers=workers)
+    tube, align = (
+        FromScans(window=window, dynamic="tube"),
+        FromScans(window=window, dynamic="align", motion=MotionOptions("flow")),
+    )
+    regrid(folder, scenes.spec, observe=tube, name="tube", frames=frames, run=Run(workers=workers))
     evidence = Voting(keep_evidence=True)
-    regrid(folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, workers=workers)
+    regrid(folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, run=Run(workers=workers))
 
 
 def choose_stretch(drive: Drive, scenes: Scenes) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from carlasc import GridSpec, regrid, simulate
+from carlasc import GridSpec, Run, regrid, simulate
 from carlasc.captures import Lidar, TrafficLevel
 
 
@@ -68,8 +68,8 @@ def build_towns(
             seed=town.seed,
             traffic=town.traffic,
             bev=False,
-            workers=workers,
+            run=Run(workers=workers),
         )
-        regrid(folder, spec or GridSpec.published(), name="evaluation", workers=workers)
+        regrid(folder, spec or GridSpec.published(), name="evaluation", run=Run(workers=workers))
         if progress:
             progress(done, len(towns))

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from helpers.datasets.captures import write_capture
 
+from carlasc import Run
 from carlasc.captures.town.simulation import simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
@@ -47,6 +48,6 @@ def test_regrid(
 
     def run() -> None:
         out = tmp_path / (f"{next(numbers)}" + (".zarr" if kind == "zarr" else ""))
-        assert not regrid(capture, spec, out, workers=1).failures
+        assert not regrid(capture, spec, out, run=Run(workers=1)).failures
 
     benchmark.pedantic(run, rounds=6, warmup_rounds=1)  # type: ignore[attr-defined]

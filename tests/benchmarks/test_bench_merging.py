@@ -17,6 +17,7 @@ from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
 from carlasc.groundtruth.inputs import Plan
+from carlasc.motion import MotionOptions
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.testing.drives import KINDS, SimulatedDrive
 
@@ -38,7 +39,7 @@ def feed_of(folder: Path, full: bool) -> ScanFeed:
         poses = drive.world_T_vehicle(drive.times) @ mount
         writer.write_document(layout.POSES, layout.encode_poses(np.linalg.inv(poses[0]) @ poses))
     (sequence,) = FolderSource(folder).sequences().values()
-    return ScanFeed(sequence, FromScans(motion="none"))
+    return ScanFeed(sequence, FromScans(motion=MotionOptions("none")))
 
 
 @pytest.mark.parametrize("keep_evidence", [False, True], ids=["grid", "and evidence"])

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from carlasc import Run
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.folder import FolderSink
@@ -49,5 +50,5 @@ def test_bench_film(benchmark, tmp_path, workers):
         sequence.write("evaluation/labels", frame, np.roll(street(spec).labels, frame, axis=0))
     scene = Scene(tmp_path / "data", frames=(0, 20))
     benchmark.pedantic(
-        render, (scene, tmp_path / "film.mp4"), {"workers": workers, "overwrite": True}, rounds=2, warmup_rounds=1
+        render, (scene, tmp_path / "film.mp4"), {"run": Run(workers), "overwrite": True}, rounds=2, warmup_rounds=1
     )

@@ -16,6 +16,7 @@ from helpers.datasets.tiny_kitti import write_tiny_kitti
 from helpers.processes import interrupted
 from helpers.servers import dask_cluster, slurm
 
+from carlasc import Run
 from carlasc.inspection import validate
 from carlasc.running import open_cluster
 
@@ -87,10 +88,10 @@ def test_what_reads_a_data_set_prints_the_same(capture):
     data = root / "whole"
     for command in (("stats", data), ("evaluate", data, data, "--by", "distance", "--far", 20)):
         assert run(*command, "--json", "--cluster", "local:2") == run(*command, "--json"), command
-    one, two = (validate(data, executor=executor) for executor in (None, ThreadPoolExecutor(2)))
+    one, two = (validate(data, run=Run(1, executor)) for executor in (None, ThreadPoolExecutor(2)))
     assert one == two
     with open_cluster("local:2") as cluster:
-        assert validate(data, executor=cluster) == one
+        assert validate(data, run=Run(executor=cluster)) == one
 
 
 @pytest.mark.slow

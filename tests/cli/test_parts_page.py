@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from helpers.datasets.captures import read_tree, write_capture
 
+from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 
@@ -27,7 +28,7 @@ def site(tmp_path):
     command.write_text(f'#!/bin/sh\nexec {sys.executable} -m carlasc "$@"\n')
     command.chmod(command.stat().st_mode | stat.S_IXUSR)
     write_capture(tmp_path / "source", frames=70, points=50)
-    regrid(tmp_path / "source", SPEC, tmp_path / "one.zarr", workers=1)
+    regrid(tmp_path / "source", SPEC, tmp_path / "one.zarr", run=Run(workers=1))
     return tmp_path
 
 
@@ -48,7 +49,7 @@ def test_the_jobs_of_an_array_write_one_output(site, out):
     if out == "fine.zarr":
         assert read_tree(site / out) == read_tree(site / "one.zarr")
     else:
-        regrid(site / "source", SPEC, site / "one", workers=1)
+        regrid(site / "source", SPEC, site / "one", run=Run(workers=1))
         assert read_tree(site / out) == read_tree(site / "one")
 
 

@@ -141,7 +141,7 @@ def test_a_folder_without_a_capture_is_1(tmp_path):
 
 def test_advice_names_options_where_the_library_names_arguments(tmp_path, capture):
     street = passing_car.write_sequence(tmp_path / "street", (), frames=2, poses=False)
-    assert "`--poses kiss-icp`" in _regrid(street, "--res", 0.4).stderr
+    assert "`--poses kiss-icp`" in _regrid(street, "--res", 0.4, "--poses", "file").stderr
     assert _regrid("--preset", "coarse").exit_code == 0
     advice = _regrid("--preset", "coarse", "--voting", "sample").stderr
     assert "choose another `--name`, or replace the grid with `--overwrite`" in advice

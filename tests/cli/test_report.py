@@ -7,7 +7,7 @@ import pytest
 from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
-from carlasc import GridSpec
+from carlasc import GridSpec, Run
 from carlasc.cli import app
 from carlasc.groundtruth import FromScans, regrid
 from carlasc.storage import layout
@@ -23,7 +23,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=6)
-    regrid(folder, SPEC, observe=FromScans(window=(-2, 2)), workers=1)
+    regrid(folder, SPEC, observe=FromScans(window=(-2, 2)), run=Run(workers=1))
     return folder
 
 

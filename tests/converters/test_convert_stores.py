@@ -5,6 +5,7 @@ from helpers.datasets.captures import read_tree
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
+from carlasc import Run
 from carlasc.converting import convert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
@@ -33,7 +34,7 @@ def without_tracks(tree):
 def test_a_store_unpacks_to_the_files_of_a_folder(kitti, tmp_path, workers):
     result = convert("kitti", kitti / "kitti", tmp_path / "x.zarr", **HOW, workers=workers)
     assert (result.made, len(result.grids)) == (23, 2)
-    carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", workers=1)
+    carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", run=Run(workers=1))
     assert without_tracks(read_tree(tmp_path / "x")) == without_tracks(read_tree(kitti / "files"))
     again = convert("kitti", kitti / "kitti", tmp_path / "x.zarr", **HOW, workers=1)
     assert (again.made, again.skipped) == (0, 23)

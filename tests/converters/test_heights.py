@@ -5,14 +5,16 @@ import pytest
 from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
+from carlasc import Run
 from carlasc.converting import Sensor, convert
 from carlasc.core import GridSpec, translation
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.heights import find_ground, fit_to_ground, share_below
+from carlasc.motion import MotionOptions
 from carlasc.testing import SimulatedDrive
 
 COARSE = GridSpec.published()
-ALONE = FromScans(window=(0, 0), motion="none")
+ALONE = FromScans(window=(0, 0), motion=MotionOptions("none"))
 
 
 def drive_at(height_m):
@@ -83,10 +85,10 @@ def test_bounds_that_are_given_are_kept_and_a_note_says_what_is_below(tmp_path):
 
 def test_a_regrid_says_what_is_below_its_grid(tmp_path):
     sequence, _, _ = converted(2.6, tmp_path)
-    result = carlasc.regrid(sequence.location, COARSE, tmp_path / "more", observe=ALONE, workers=1)
+    result = carlasc.regrid(sequence.location, COARSE, tmp_path / "more", observe=ALONE, run=Run(workers=1))
     assert any("100% of the points on the ground are below the grid" in note for note in result.notes)
     lower = GridSpec("cartesian", COARSE.size, (-25.6, -25.6, -2.75), (25.6, 25.6, 0.25))
-    result = carlasc.regrid(sequence.location, lower, tmp_path / "lower", observe=ALONE, workers=1)
+    result = carlasc.regrid(sequence.location, lower, tmp_path / "lower", observe=ALONE, run=Run(workers=1))
     assert not any("below the grid" in note for note in result.notes)
 
 

@@ -13,6 +13,7 @@ from converters.formats.kitti_drive import small_drive
 from converters.formats.kitti_tracking import OFFICIAL, OTHER, write_tracking
 
 import carlasc
+from carlasc import Run
 from carlasc.converting import convert
 from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import FormatError, MissingDataError
@@ -325,7 +326,9 @@ def test_movers_of_the_real_sample_leave_no_trail_in_a_grid(converted, monkeypat
     assert sorted(body.name for body in judge.movers) == ["track 1", "track 2"]
     spec = GridSpec.published().with_resolution(0.2)
     frames = (frame, frame + 1)
-    result = carlasc.regrid(converted, spec, name="fine", frames=frames, observe=FromScans(window=window), workers=1)
+    result = carlasc.regrid(
+        converted, spec, name="fine", frames=frames, observe=FromScans(window=window), run=Run(workers=1)
+    )
     assert not result.failures
     (sequence,) = carlasc.open(converted).sequences().values()
     measures = judge.measure(sequence.grid("fine", frame), frame)

@@ -15,6 +15,7 @@ from helpers.datasets.exported import occ3d_cell, read_occ3d
 from typer.testing import CliRunner
 
 import carlasc
+from carlasc import Run
 from carlasc.captures import Lidar, simulate
 from carlasc.cli import app
 from carlasc.converting import convert, converter_names, export, load_converter, remaps_to_carla
@@ -120,7 +121,7 @@ def test_kinds_are_named_as_in_their_tables():
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("capture") / "Val" / "Town07_Light"
-    simulate(folder, count=2, sensors=3, lidar=Lidar(channels=16, points=8_000), bev=False, workers=1)
+    simulate(folder, count=2, sensors=3, lidar=Lidar(channels=16, points=8_000), bev=False, run=Run(workers=1))
     return folder
 
 

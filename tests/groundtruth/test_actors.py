@@ -6,14 +6,14 @@ from helpers.datasets.captures import read_tree
 from helpers.scenes import passing_car
 
 import carlasc
-from carlasc import FromScans
+from carlasc import FromScans, Run
 from carlasc.errors import FormatError
 from carlasc.groundtruth.from_scans import sequences
 from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
 from carlasc.groundtruth.from_scans.sequences import TRACKS
-from carlasc.motion import Extent, Track
+from carlasc.motion import Extent, MotionOptions, Track
 from carlasc.storage import layout
 
 FRAMES = 12
@@ -119,7 +119,7 @@ def passes(monkeypatch):
 
 def run(street, name="mine", frames=None, workers=1, **options):
     result = carlasc.regrid(
-        street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=workers
+        street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), run=Run(workers=workers)
     )
     assert result.failures == ()
     return {file: data for file, data in read_tree(street / "cartesian" / name).items() if file[:1].isdigit()}
@@ -160,10 +160,10 @@ class TestPass:
 
     def test_other_options_of_motion_need_another_one(self, street, passes):
         run(street, "fields", (4, 5))
-        run(street, "evidence", (4, 5), motion="evidence")
+        run(street, "evidence", (4, 5), motion=MotionOptions("evidence"))
         assert len(passes) == 2
         run(street, "tube", (4, 5), dynamic="tube")
-        run(street, "none", (4, 5), motion="none")
+        run(street, "none", (4, 5), motion=MotionOptions("none"))
         assert len(passes) == 2  # nothing is asked about motion
 
     def test_two_workers_find_the_same_as_one(self, street):
@@ -182,7 +182,7 @@ class TestPass:
         ("options", "scans"),
         [
             ({}, 2 * FRAMES),  # fields, and then free space
-            ({"motion": "instances"}, FRAMES),
+            ({"motion": MotionOptions("instances")}, FRAMES),
             ({"dynamic": "tube"}, 0),
         ],
     )
@@ -195,8 +195,7 @@ class TestPass:
                 name=name,
                 frames=(4, 6),
                 observe=FromScans(**options),
-                workers=1,
-                progress=lambda *step, steps=steps: steps.append(step),
+                run=Run(workers=1, progress=lambda *step, steps=steps: steps.append(step)),
             )
             done, totals = zip(*steps, strict=True)
             assert set(totals) == {scans + 2}
@@ -209,8 +208,8 @@ def test_the_key_depends_on_what_the_actors_are_made_from(street):
         key_of(ScanFeed(sequence, FromScans(**options)))
         for options in (
             {},
-            {"motion": "instances"},
-            {"min_speed_m_s": 0.5},
+            {"motion": MotionOptions("instances")},
+            {"motion": MotionOptions(min_speed_m_s=0.5)},
             {"max_range_m": 20.0},
             {"min_range_m": 2.0},
         )

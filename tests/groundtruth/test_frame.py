@@ -14,7 +14,7 @@ from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.inputs import Plan
-from carlasc.motion import Extent, Track
+from carlasc.motion import Extent, MotionOptions, PoseOptions, Track
 from carlasc.storage import FolderSink, FolderSource, layout
 
 ROAD, BUILDING, VEHICLE = CARLA.id_of("Road"), CARLA.id_of("Building"), CARLA.id_of("Vehicle")
@@ -36,7 +36,9 @@ def feed_of(folder, scans, pose=lambda frame: np.eye(4), **options):
         writer.write("labels", frame, np.array([label for _, label in points], np.uint32))
     writer.write_document(layout.POSES, layout.encode_poses(np.stack([pose(f) for f in range(max(scans) + 1)])))
     (sequence,) = FolderSource(folder).sequences().values()
-    return ScanFeed(sequence, FromScans(**{"motion": "none", "force": True, **options}))
+    return ScanFeed(
+        sequence, FromScans(**{"motion": MotionOptions("none"), "poses": PoseOptions(force=True), **options})
+    )
 
 
 def merge(feed, actors, frame=NOW, spec=SPEC, evidence=True):

@@ -10,7 +10,7 @@ from helpers.datasets.sequences import scan
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc import FromCapture, FromGrid, FromScans, GridSpec, Voting
+from carlasc import FromCapture, FromGrid, FromScans, GridSpec, Run, Voting
 from carlasc.cli import app
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.errors import ArgumentError, ConflictError, FormatError
@@ -50,7 +50,7 @@ def known_evidence(monkeypatch):
 
 
 def run(drive, **settings):
-    return carlasc.regrid(drive, SPEC, observe=FromScans(), voting=Voting(**settings), workers=1)
+    return carlasc.regrid(drive, SPEC, observe=FromScans(), voting=Voting(**settings), run=Run(workers=1))
 
 
 def the_sequence(drive):
@@ -94,7 +94,9 @@ def test_voxels_that_are_not_certain_enough_become_unknown(drive):
     whole = the_sequence(drive).grid("evaluation_8x8x4", 1)
     with pytest.raises(ConflictError, match=r"carlasc.min_confidence null where this run has 0.8"):
         run(drive, min_confidence=0.8)
-    carlasc.regrid(drive, SPEC, observe=FromScans(), voting=Voting(min_confidence=0.8), workers=1, overwrite=True)
+    carlasc.regrid(
+        drive, SPEC, observe=FromScans(), voting=Voting(min_confidence=0.8), run=Run(workers=1), overwrite=True
+    )
     sequence = the_sequence(drive)
     grid = sequence.grid("evaluation_8x8x4", 1)
     p = EVIDENCE.occupied.astype(np.float16)
@@ -135,7 +137,7 @@ def test_a_confidence_is_a_probability_below_1(min_confidence):
 def test_only_rays_of_scans_say_how_certain_a_voxel_is(drive, observe, rule, found, name):
     voting = Voting(rule, **{name: True if name == "keep_evidence" else 0.9})
     with pytest.raises(ArgumentError) as error:
-        carlasc.regrid(drive, SPEC, observe=observe, voting=voting, workers=1)
+        carlasc.regrid(drive, SPEC, observe=observe, voting=voting, run=Run(workers=1))
     assert str(error.value).startswith(f"{name}: expected grids from scans with the rule")
     assert str(error.value).endswith(f"found {found}: make the grid from scans, or leave out `{name}`")
 

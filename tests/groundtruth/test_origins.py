@@ -7,12 +7,14 @@ import pytest
 from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
+from carlasc import Run
 from carlasc.converting import Sensor, convert
 from carlasc.core import GridSpec, runs_of_origins, sorted_by_origin, translation
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.merging import PreparedScan
 from carlasc.groundtruth.voting.ballot import count_votes
 from carlasc.groundtruth.voting.observations import Observation
+from carlasc.motion import MotionOptions
 from carlasc.testing import SimulatedDrive, Thing
 
 SPEC = GridSpec("cartesian", (96, 80, 12), (-12.0, -10.0, -1.8), (12.0, 10.0, 1.2))
@@ -40,8 +42,8 @@ def grids_of(converter, folder):
     for name in ("own", "one"):
         if name == "one":
             shutil.rmtree(f"{sequence.location}/origins")
-        observe = FromScans(window=(0, 0), own_path=False, motion="none")
-        carlasc.regrid(sequence.location, SPEC, name=name, observe=observe, frames=(0, 1), workers=1)
+        observe = FromScans(window=(0, 0), own_path=False, motion=MotionOptions("none"))
+        carlasc.regrid(sequence.location, SPEC, name=name, observe=observe, frames=(0, 1), run=Run(workers=1))
         (again,) = carlasc.open(folder.parent / f"{folder.name}_out").sequences().values()
         found.append(again.grid(name, 0))
     return found
@@ -111,7 +113,13 @@ def test_a_lidar_that_turns_on_a_fast_vehicle_leaves_as_much_free_space_wrong_as
     convert(Fast, tmp_path / "in", tmp_path / "out", axes="right", grids="none", force=True, workers=1)
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     assert ("origins" in sequence.fields()) == rolling
-    carlasc.regrid(sequence.location, SPEC, name="g", observe=FromScans(window=(-1, 1), motion="none"), workers=1)
+    carlasc.regrid(
+        sequence.location,
+        SPEC,
+        name="g",
+        observe=FromScans(window=(-1, 1), motion=MotionOptions("none")),
+        run=Run(workers=1),
+    )
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     grid, frame = sequence.grid("g", 1), 1
     vehicle = Fast.drive.world_T_vehicle(frame * Fast.drive.period_s)

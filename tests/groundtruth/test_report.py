@@ -12,7 +12,7 @@ from helpers.scenes import passing_car
 from helpers.scenes.box_actors import MovingBox, scan_of
 
 import carlasc
-from carlasc import Grid, GridSpec
+from carlasc import Grid, GridSpec, Run
 from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
@@ -36,7 +36,7 @@ def street(tmp_path_factory):
 
 
 def make(source, out=None, **options):
-    return regrid(source, SPEC, out, **{"observe": OBSERVE, "workers": 1, **options})
+    return regrid(source, SPEC, out, **{"observe": OBSERVE, "run": Run(workers=1), **options})
 
 
 def report_in(folder, grid=GRID):
@@ -178,12 +178,12 @@ def test_a_frame_that_fails_is_not_in_the_report(tmp_path):
 
 def test_captures_and_finer_grids_have_reports_too(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, GridSpec.published(), workers=1)
+    regrid(tmp_path, GridSpec.published(), run=Run(workers=1))
     report = report_in(tmp_path, "evaluation")
     assert report.frames == (0, 1, 2)
     assert (report.convergence, report.actors) == (None, None)
     assert "bev" in report.digests
-    regrid(tmp_path, SPEC, observe=FromGrid(), workers=1)
+    regrid(tmp_path, SPEC, observe=FromGrid(), run=Run(workers=1))
     assert report_in(tmp_path).coverage.voxels == 3 * SPEC.num_voxels
 
 

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from carlasc import Run
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
@@ -69,6 +70,8 @@ def test_the_finest_grid_of_the_same_coordinates_is_resampled_unless_another_is_
         writer.write(f"{name}/labels", 0, grid.labels.astype(np.uint32))
         writer.write(f"{name}/counts", 0, grid.counts)
     for observe, chosen in ((FromGrid(), "fine"), (FromGrid("last"), "last")):
-        regrid(tmp_path, random_grid(0).spec.with_size((4, 4, 2)), observe=observe, name=f"of_{chosen}", workers=1)
+        regrid(
+            tmp_path, random_grid(0).spec.with_size((4, 4, 2)), observe=observe, name=f"of_{chosen}", run=Run(workers=1)
+        )
         params = json.loads((tmp_path / f"Val/Street/cartesian/of_{chosen}/params.json").read_bytes())
         assert params["carlasc"]["grid"] == chosen

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.datasets.captures import make_recording, read_tree, write_capture
 
+from carlasc import Run
 from carlasc.captures.raw import Capture
 from carlasc.captures.writing import CaptureWriter
 from carlasc.core.frames import FrameRange
@@ -32,7 +33,12 @@ GOLDEN = {
 def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, variant, workers):
     spec, free_step = GOLDEN[variant]
     result = regrid(
-        golden_capture, spec, tmp_path, voting=Voting(free_step_m=free_step), name="evaluation", workers=workers
+        golden_capture,
+        spec,
+        tmp_path,
+        voting=Voting(free_step_m=free_step),
+        name="evaluation",
+        run=Run(workers=workers),
     )
     assert (result.made, result.skipped, result.failures) == (3, 0, ())
     made, golden = read_tree(tmp_path / spec.coordinates), read_tree(golden_capture / variant)
@@ -50,7 +56,7 @@ def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, varia
 
 
 def test_what_we_add_stands_beside_the_published_files_only(golden_capture, tmp_path):
-    regrid(golden_capture, GridSpec.published(), tmp_path, workers=1)
+    regrid(golden_capture, GridSpec.published(), tmp_path, run=Run(workers=1))
     added = set(read_tree(tmp_path / "cartesian")) - set(read_tree(golden_capture / "cartesian"))
     assert added == {*(f"instances/{frame:06d}.label" for frame in range(3)), "evaluation/carlasc-report.json"}
     instances = np.fromfile(tmp_path / "cartesian/instances/000001.label", "<u4")
@@ -59,7 +65,7 @@ def test_what_we_add_stands_beside_the_published_files_only(golden_capture, tmp_
 
 def test_the_run_is_recorded_in_params_json(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, SMALL, voting=Voting("sample", 0.7), workers=1)
+    regrid(tmp_path, SMALL, voting=Voting("sample", 0.7), run=Run(workers=1))
     params = json.loads((tmp_path / "cartesian/evaluation_32x32x4/params.json").read_bytes())
     assert params["carlasc"] == {
         "format": 1,
@@ -74,7 +80,7 @@ def test_the_run_is_recorded_in_params_json(tmp_path):
 
 def test_what_is_written_is_read_back_by_a_source(tmp_path):
     capture = write_capture(tmp_path)
-    regrid(tmp_path, SMALL, workers=1)
+    regrid(tmp_path, SMALL, run=Run(workers=1))
     (sequence,) = FolderSource(tmp_path).sequences().values()
     scan, recording = sequence.scan(1), capture.read(0, 101)
     assert np.array_equal(scan.points, recording.scan.points)
@@ -102,7 +108,7 @@ def test_sensors_that_stand_turned_see_the_same_world(tmp_path):
         writer.write(0, 0, ego)
         writer.write(1, 0, second)
         regrid(
-            writer.location, SMALL, voting=Voting(free_step_m=1000), workers=1
+            writer.location, SMALL, voting=Voting(free_step_m=1000), run=Run(workers=1)
         )  # endpoints alone: rays start elsewhere
     grids = [FolderSource(w.out).sequences()["cartesian"].grid("evaluation_32x32x4", 0) for w in (upright, turned)]
     assert grids[0].counts.sum() > 100
@@ -111,8 +117,8 @@ def test_sensors_that_stand_turned_see_the_same_world(tmp_path):
 
 def test_votes_are_kept_when_asked_for_and_added_to_a_grid_that_is_there(tmp_path):
     capture = write_capture(tmp_path, frames=2)
-    regrid(tmp_path, SMALL, workers=1)
-    result = regrid(tmp_path, SMALL, voting=Voting(keep=True), workers=1)
+    regrid(tmp_path, SMALL, run=Run(workers=1))
+    result = regrid(tmp_path, SMALL, voting=Voting(keep=True), run=Run(workers=1))
     assert (result.made, result.skipped) == (2, 0)
     (sequence,) = FolderSource(tmp_path).sequences().values()
     votes = sequence.read("evaluation_32x32x4/votes", 1)
@@ -128,22 +134,22 @@ def test_votes_are_kept_when_asked_for_and_added_to_a_grid_that_is_there(tmp_pat
 
 def test_a_second_run_skips_what_is_there_and_makes_what_is_missing(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, SMALL, workers=1)
+    regrid(tmp_path, SMALL, run=Run(workers=1))
     whole = read_tree(tmp_path)
-    again = regrid(tmp_path, SMALL, workers=1)
+    again = regrid(tmp_path, SMALL, run=Run(workers=1))
     assert (again.made, again.skipped) == (0, 3)
     for name in ("evaluation_32x32x4/000001.bin", "velodyne/000002.bin"):
         (tmp_path / "cartesian" / name).unlink()
-    again = regrid(tmp_path, SMALL, workers=1)
+    again = regrid(tmp_path, SMALL, run=Run(workers=1))
     assert (again.made, again.skipped) == (2, 1)
     assert read_tree(tmp_path) == whole
 
 
 def test_a_run_goes_on_when_the_capture_has_grown(tmp_path):
     write_capture(tmp_path, frames=2)
-    regrid(tmp_path, SMALL, workers=1)
+    regrid(tmp_path, SMALL, run=Run(workers=1))
     write_capture(tmp_path, frames=3)
-    result = regrid(tmp_path, SMALL, workers=1)
+    result = regrid(tmp_path, SMALL, run=Run(workers=1))
     assert (result.made, result.skipped) == (1, 2)
     assert len((tmp_path / "cartesian/poses.txt").read_text().splitlines()) == 3
 
@@ -152,7 +158,7 @@ def test_frames_are_chosen_by_their_number_in_the_capture_and_renumbered(tmp_pat
     capture = write_capture(tmp_path, frames=5)
     for chosen, expected in (((101, 103), [101, 102]), ((None, 102), [100, 101]), ((103, None), [103, 104])):
         out = tmp_path / f"out{expected[0]}"
-        regrid(tmp_path, SMALL, out, frames=chosen, workers=1)
+        regrid(tmp_path, SMALL, out, frames=chosen, run=Run(workers=1))
         (sequence,) = FolderSource(out).sequences().values()
         assert sequence.scan_frames().tolist() == [0, 1]
         assert len(sequence.poses) == len(sequence.times) == 2
@@ -165,7 +171,7 @@ def test_frames_that_the_capture_skipped_keep_their_time(tmp_path):
     capture = write_capture(tmp_path, frames=4)
     for kind in ("velodyne", "labels", "instances", "velocities", "pose"):
         (Path(capture.location) / f"{kind}0" / "101.npy").unlink()
-    regrid(tmp_path, SMALL, workers=1)
+    regrid(tmp_path, SMALL, run=Run(workers=1))
     (sequence,) = FolderSource(tmp_path).sequences().values()
     assert sequence.scan_frames().tolist() == [0, 1, 2]
     assert np.allclose(sequence.times, [0.0, 0.2, 0.3])
@@ -187,14 +193,14 @@ def test_a_sequence_without_any_frame_says_so():
 def test_several_sequences_keep_their_paths(tmp_path):
     for path in ("Train/Town01_Light", "Val/Town07_Light"):
         write_capture(tmp_path / "in" / path, frames=2)
-    result = regrid(tmp_path / "in", SMALL, tmp_path / "out", workers=2)
+    result = regrid(tmp_path / "in", SMALL, tmp_path / "out", run=Run(workers=2))
     assert result.made == 4
     assert list(FolderSource(tmp_path / "out").sequences()) == [
         "Train/Town01_Light/cartesian",
         "Val/Town07_Light/cartesian",
     ]
     cylindrical = GridSpec.published("cylindrical").with_size((16, 16, 4))
-    regrid(tmp_path / "in", cylindrical, workers=1)
+    regrid(tmp_path / "in", cylindrical, run=Run(workers=1))
     assert list(FolderSource(tmp_path / "in").sequences()) == [
         "Train/Town01_Light/cylindrical",
         "Val/Town07_Light/cylindrical",
@@ -203,25 +209,25 @@ def test_several_sequences_keep_their_paths(tmp_path):
 
 def test_raw_itself_as_the_source_writes_beside_it(tmp_path):
     write_capture(tmp_path, frames=1)
-    regrid(tmp_path / "raw", SMALL, workers=1)
+    regrid(tmp_path / "raw", SMALL, run=Run(workers=1))
     assert (tmp_path / "cartesian/velodyne/000000.bin").is_file()
 
 
 def test_progress_counts_what_was_there_and_ends_at_the_total(tmp_path):
     write_capture(tmp_path)
     seen: list[tuple[int, int]] = []
-    regrid(tmp_path, SMALL, workers=1, frames=(100, 102), progress=lambda *counts: seen.append(counts))
+    regrid(tmp_path, SMALL, run=Run(workers=1, progress=lambda *counts: seen.append(counts)), frames=(100, 102))
     assert seen == [(0, 2), (1, 2), (2, 2)]
     seen.clear()
-    regrid(tmp_path, SMALL, workers=1, frames=(100, 102), progress=lambda *counts: seen.append(counts))
+    regrid(tmp_path, SMALL, run=Run(workers=1, progress=lambda *counts: seen.append(counts)), frames=(100, 102))
     assert seen == [(2, 2)]
 
 
 def test_a_callers_executor_makes_the_same_files(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, SMALL, tmp_path / "own", workers=1)
+    regrid(tmp_path, SMALL, tmp_path / "own", run=Run(workers=1))
     with ThreadPoolExecutor(2) as executor:
-        regrid(tmp_path, SMALL, tmp_path / "threads", executor=executor)
+        regrid(tmp_path, SMALL, tmp_path / "threads", run=Run(executor=executor))
     assert read_tree(tmp_path / "threads") == read_tree(tmp_path / "own")
 
 
@@ -263,16 +269,16 @@ class MemoryWriter(SequenceWriter):
 def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_path):
     write_capture(tmp_path, frames=6)
     sink = MemorySink()
-    assert regrid(tmp_path, SMALL, sink, workers=2).made == 6
+    assert regrid(tmp_path, SMALL, sink, run=Run(workers=2)).made == 6
     (writer,) = sink.writers.values()
     assert writer.closed == 1
-    regrid(tmp_path, SMALL, workers=1)
+    regrid(tmp_path, SMALL, run=Run(workers=1))
     (sequence,) = FolderSource(tmp_path).sequences().values()
     for name in sequence.fields():
         for frame in range(6):
             assert np.array_equal(writer.fields[name, frame], sequence.read(name, frame)), name
     with pytest.raises(ConflictError, match="memory: this store cannot replace its grid evaluation_32x32x4"):
-        regrid(tmp_path, SMALL, sink, workers=1, overwrite=True)
+        regrid(tmp_path, SMALL, sink, run=Run(workers=1), overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +287,6 @@ def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_p
         ({"observe": "capture"}, "observe: expected one of FromCapture, FromScans, FromGrid, found 'capture'"),
         ({"frames": (5, 5)}, "frames: expected a range that holds a frame, found 5:5"),
         ({"frames": "5:7"}, "frames: expected .*, found '5:7'"),
-        ({"workers": 0}, "workers: expected at least 1, found 0"),
         ({"name": "a/b"}, "name: expected letters, digits and _ . [+] -, found 'a/b'"),
         ({"name": ".."}, "name: expected letters"),
         ({"name": ""}, "name: expected letters"),
@@ -331,7 +336,7 @@ def test_a_real_scan_of_a_street_gives_a_sane_grid(real, tmp_path, coordinates):
     )
     CaptureWriter(tmp_path).write(0, 0, replace(recording, scan=scan))
     spec = GridSpec.published(coordinates).with_resolution(0.2)
-    assert regrid(tmp_path, spec, workers=1).failures == ()
+    assert regrid(tmp_path, spec, run=Run(workers=1)).failures == ()
     (sequence,) = FolderSource(tmp_path).sequences().values()
     (name,) = sequence.grids
     grid = sequence.grid(name, 0)

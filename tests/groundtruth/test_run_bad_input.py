@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.datasets.captures import read_tree, write_capture
 
+from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth import FromCapture, Voting, regrid
@@ -46,12 +47,12 @@ BAD = {  # the file of frame 101, what is done to it, what the message says
 def test_a_bad_frame_is_named_the_others_are_made_and_a_fixed_one_is_added(tmp_path, bad):
     folder, spoil, message = BAD[bad]
     capture = write_capture(tmp_path)
-    regrid(tmp_path, SMALL, tmp_path / "good", workers=1)
+    regrid(tmp_path, SMALL, tmp_path / "good", run=Run(workers=1))
     path = Path(capture.location) / folder / "101.npy"
     sound = path.read_bytes()
     spoil(path)
 
-    result = regrid(tmp_path, SMALL, tmp_path / "out", workers=1)
+    result = regrid(tmp_path, SMALL, tmp_path / "out", run=Run(workers=1))
     (failure,) = result.failures
     assert (result.made, result.skipped, failure.frame) == (2, 0, 101)
     assert failure.message.startswith(str(path)) and "\n" not in failure.message
@@ -62,7 +63,7 @@ def test_a_bad_frame_is_named_the_others_are_made_and_a_fixed_one_is_added(tmp_p
     assert np.isfinite(sequence.read_pose(2)).all() and len(sequence.times) == 3
 
     path.write_bytes(sound)
-    again = regrid(tmp_path, SMALL, tmp_path / "out", workers=1)
+    again = regrid(tmp_path, SMALL, tmp_path / "out", run=Run(workers=1))
     assert (again.made, again.skipped, again.failures) == (1, 2, ())
     assert read_tree(tmp_path / "out") == read_tree(tmp_path / "good")
 
@@ -73,9 +74,9 @@ def test_the_first_pose_is_the_origin_without_which_nothing_is_written(tmp_path)
     with pytest.raises(
         FormatError, match="pose0/100.npy: .*: the first frame's pose is the origin .*start with a later"
     ):
-        regrid(tmp_path, SMALL, workers=1)
+        regrid(tmp_path, SMALL, run=Run(workers=1))
     assert not (tmp_path / "cartesian").exists()
-    assert regrid(tmp_path, SMALL, workers=1, frames=(101, None)).made == 2
+    assert regrid(tmp_path, SMALL, run=Run(workers=1), frames=(101, None)).made == 2
 
 
 def test_no_capture_and_no_sensor_are_said(tmp_path):
@@ -91,11 +92,11 @@ def test_no_capture_and_no_sensor_are_said(tmp_path):
 
 def test_files_cut_short_in_the_output_are_made_again(tmp_path):
     write_capture(tmp_path)
-    regrid(tmp_path, SMALL, workers=1, voting=Voting(keep=True))
+    regrid(tmp_path, SMALL, run=Run(workers=1), voting=Voting(keep=True))
     whole = read_tree(tmp_path, leave_out="nothing")
     for file in ("velodyne/000001.bin", f"{GRID}/000000.bin", f"{GRID}/000001.votes.npz", f"{GRID}/000002.label"):
         _cut_short(tmp_path / "cartesian" / file)
-    result = regrid(tmp_path, SMALL, workers=1, voting=Voting(keep=True))
+    result = regrid(tmp_path, SMALL, run=Run(workers=1), voting=Voting(keep=True))
     assert (result.made, result.failures) == (3, ())
     assert read_tree(tmp_path, leave_out="nothing") == whole
 
@@ -117,7 +118,7 @@ def test_a_full_disk_stops_the_run_in_one_line_and_leaves_whole_files(tmp_path, 
     assert "evaluation/00000" in line and "cannot be written: File too large" in line
     written = read_tree(tmp_path)
     assert not [name for name in written if ".part" in name or name.startswith("cartesian/evaluation/0")]
-    result = regrid(tmp_path, GridSpec.published(), workers=1)
+    result = regrid(tmp_path, GridSpec.published(), run=Run(workers=1))
     assert result.made == 4  # with room again it goes on
     assert written.items() <= read_tree(tmp_path).items()
 

@@ -12,6 +12,7 @@ import pytest
 from helpers.datasets.captures import read_tree, write_capture
 from helpers.processes import interrupted
 
+from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 
@@ -24,7 +25,7 @@ def capture(tmp_path_factory):
     """The folder of a capture, and all that an uninterrupted run makes of it."""
     root = tmp_path_factory.mktemp("interrupted")
     write_capture(root, frames=FRAMES, points=5000)
-    regrid(root, SPEC, root / "whole", workers=1)
+    regrid(root, SPEC, root / "whole", run=Run(workers=1))
     return root, read_tree(root / "whole")
 
 
@@ -54,7 +55,7 @@ def test_ctrl_c_stops_at_once_with_whole_files_and_the_next_run_finishes(capture
     left = read_tree(tmp_path)
     assert left.items() < whole.items()  # every file that is there is whole, and some are missing
     assert sum(name.endswith("evaluation/000004.bin") for name in left) == 1
-    result = regrid(root, SPEC, tmp_path, workers=1)
+    result = regrid(root, SPEC, tmp_path, run=Run(workers=1))
     assert 0 < result.made <= FRAMES - 5
     assert result.made + result.skipped == FRAMES
     assert read_tree(tmp_path) == whole
@@ -66,6 +67,6 @@ def test_a_killed_run_is_finished_by_the_next_one(capture, tmp_path):
     assert _interrupt(root, tmp_path, signal.SIGKILL, 2)[0] == -signal.SIGKILL
     half = {name for name in read_tree(tmp_path) if name.endswith(".part")}
     assert {name: data for name, data in read_tree(tmp_path).items() if name not in half}.items() < whole.items()
-    result = regrid(root, SPEC, tmp_path, workers=1)
+    result = regrid(root, SPEC, tmp_path, run=Run(workers=1))
     assert result.made + result.skipped == FRAMES and result.skipped >= 5
     assert read_tree(tmp_path) == whole

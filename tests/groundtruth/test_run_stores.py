@@ -12,9 +12,11 @@ import pytest
 from helpers.datasets.captures import read_tree, write_capture
 
 import carlasc
+from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.groundtruth import FromScans, Voting, regrid
+from carlasc.motion import PoseOptions
 from carlasc.running import Part
 
 pytest.importorskip("numcodecs")
@@ -28,22 +30,22 @@ def source(tmp_path_factory):
     """A capture, and the files and the store that one process makes of it."""
     root = tmp_path_factory.mktemp("stores")
     write_capture(root / "source", frames=FRAMES, points=100)
-    regrid(root / "source", SPEC, root / "files", workers=1)
-    regrid(root / "source", SPEC, root / "one.zarr", workers=1)
+    regrid(root / "source", SPEC, root / "files", run=Run(workers=1))
+    regrid(root / "source", SPEC, root / "one.zarr", run=Run(workers=1))
     return root / "source", read_tree(root / "files"), read_tree(root / "one.zarr")
 
 
 def test_a_store_unpacks_to_the_files_of_a_folder(source, tmp_path):
-    regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
-    carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", workers=1)
+    regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
+    carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", run=Run(workers=1))
     assert read_tree(tmp_path / "x") == source[1]
 
 
 def test_two_processes_and_any_order_of_parts_make_the_same_store(source, tmp_path):
-    regrid(source[0], SPEC, tmp_path / "two.zarr", workers=2)
+    regrid(source[0], SPEC, tmp_path / "two.zarr", run=Run(workers=2))
     assert read_tree(tmp_path / "two.zarr") == source[2]
     for number in (3, 1, 4, 2):
-        regrid(source[0], SPEC, tmp_path / "parts.zarr", part=Part(number, 4), workers=1)
+        regrid(source[0], SPEC, tmp_path / "parts.zarr", run=Run(part=Part(number, 4), workers=1))
         if number == 3:
             with pytest.raises(FormatError, match="`carlasc finish`"):
                 carlasc.open(tmp_path / "parts.zarr")
@@ -51,19 +53,19 @@ def test_two_processes_and_any_order_of_parts_make_the_same_store(source, tmp_pa
 
 
 def test_a_run_on_a_finished_store_finds_that_everything_exists(source, tmp_path):
-    regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
-    again = regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
+    regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
+    again = regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     assert (again.made, again.skipped) == (0, FRAMES)
     assert read_tree(tmp_path / "x.zarr") == source[2]
     with pytest.raises(ConflictError, match="free_step_m"):
-        regrid(source[0], SPEC, tmp_path / "x.zarr", voting=Voting(free_step_m=0.5), workers=1)
+        regrid(source[0], SPEC, tmp_path / "x.zarr", voting=Voting(free_step_m=0.5), run=Run(workers=1))
 
 
 def test_a_grid_is_added_to_a_store_that_can_be_read_meanwhile(source, tmp_path):
-    regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
+    regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     before = carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"]
-    observe = FromScans(window=(0, 0), force=True)
-    regrid(tmp_path / "x.zarr", SPEC, tmp_path / "x.zarr", observe=observe, name="own", workers=1)
+    observe = FromScans(window=(0, 0), poses=PoseOptions(force=True))
+    regrid(tmp_path / "x.zarr", SPEC, tmp_path / "x.zarr", observe=observe, name="own", run=Run(workers=1))
     assert before.grid("evaluation_16x16x4", 3).labels.shape == (16, 16, 4)
     after = carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"]
     assert {"own/labels", "evaluation_16x16x4/labels"} <= after.fields()
@@ -76,11 +78,11 @@ def test_what_was_read_before_a_store_grew_is_read_again(tmp_path):
     damaged = tmp_path / "source/raw/labels0/103.npy"
     good = damaged.read_bytes()
     damaged.write_bytes(good[:-4])
-    regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", workers=1)
+    regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     sequence = carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"]
     before = [sequence.read("points", frame).copy() for frame in (2, 9)]
     damaged.write_bytes(good)
-    regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", workers=1)
+    regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     for one, other in zip(before, sequence.read_many("points", [2, 9]), strict=True):
         assert np.array_equal(one, other)
     assert len(sequence.read("points", 3)) == 100
@@ -91,14 +93,14 @@ def test_frames_that_fail_are_left_out_and_added_when_they_are_corrected(tmp_pat
     damaged = tmp_path / "source/raw/labels0/105.npy"
     good = damaged.read_bytes()
     damaged.write_bytes(good[:-4])
-    result = regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", workers=1)
+    result = regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     assert [failure.frame for failure in result.failures] == [105]
     grid = "evaluation_16x16x4/labels"
     assert len(carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"].frames(grid)) == 19
     damaged.write_bytes(good)
-    assert regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", workers=1).made == 1
-    regrid(tmp_path / "source", SPEC, tmp_path / "files", workers=1)
-    carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", workers=1)
+    assert regrid(tmp_path / "source", SPEC, tmp_path / "x.zarr", run=Run(workers=1)).made == 1
+    regrid(tmp_path / "source", SPEC, tmp_path / "files", run=Run(workers=1))
+    carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", run=Run(workers=1))
     assert read_tree(tmp_path / "x") == read_tree(tmp_path / "files")
 
 
@@ -129,19 +131,19 @@ def test_a_command_that_is_killed_is_finished_by_the_next_one(source, tmp_path, 
             time.sleep(0.05)
         time.sleep(delay_s)
         os.kill(process.pid, signal.SIGKILL)
-    regrid(source[0], SPEC, out, workers=1)
+    regrid(source[0], SPEC, out, run=Run(workers=1))
     assert read_tree(out) == source[2]
 
 
 def test_the_clocks_of_machines_do_not_matter(source, tmp_path):
     """Files of another machine may be from tomorrow, or from 1970."""
     out = tmp_path / "x.zarr"
-    regrid(source[0], SPEC, out, part=Part(2, 3), workers=1)
+    regrid(source[0], SPEC, out, run=Run(part=Part(2, 3), workers=1))
     for number, path in enumerate(sorted(path for path in out.rglob("*") if path.is_file())):
         moment = time.time() + 86_400 if number % 2 else 0
         os.utime(path, (moment, moment))
     for number in (1, 3):
-        regrid(source[0], SPEC, out, part=Part(number, 3), workers=1)
+        regrid(source[0], SPEC, out, run=Run(part=Part(number, 3), workers=1))
     assert read_tree(out) == source[2]
 
 
@@ -158,9 +160,9 @@ def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(source, 
 
     monkeypatch.setattr(targets, "write_atomic", full)
     with pytest.raises(StorageError, match="No space left"):
-        regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
+        regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     monkeypatch.setattr(targets, "write_atomic", write)
-    regrid(source[0], SPEC, tmp_path / "x.zarr", workers=1)
+    regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     assert read_tree(tmp_path / "x.zarr") == source[2]
 
 
@@ -168,34 +170,34 @@ def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(source, 
 @pytest.mark.parametrize("kind", ["h5", "parquet"])
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_stores_of_one_writer_take_what_workers_make(source, tmp_path, kind, workers):
-    result = regrid(source[0], SPEC, tmp_path / f"x.{kind}", workers=workers)
+    result = regrid(source[0], SPEC, tmp_path / f"x.{kind}", run=Run(workers=workers))
     assert result.grids == (f"{tmp_path}/x.{kind}/cartesian/evaluation_16x16x4",)
-    carlasc.unpack(tmp_path / f"x.{kind}", tmp_path / "x", workers=1)
+    carlasc.unpack(tmp_path / f"x.{kind}", tmp_path / "x", run=Run(workers=1))
     assert read_tree(tmp_path / "x") == source[1]
 
 
 @pytest.mark.parametrize("kind", ["h5", "parquet"])
 def test_stores_of_one_writer_refuse_parts(source, tmp_path, kind):
     with pytest.raises(ArgumentError, match=r"part: expected a folder or a \.zarr store"):
-        regrid(source[0], SPEC, tmp_path / f"x.{kind}", part=Part(1, 2))
+        regrid(source[0], SPEC, tmp_path / f"x.{kind}", run=Run(part=Part(1, 2)))
     assert not list(tmp_path.iterdir())
 
 
 def test_a_run_that_cannot_begin_leaves_no_store(tmp_path):
     with pytest.raises(MissingDataError):
-        regrid(tmp_path / "nothing", SPEC, tmp_path / "x.zarr", workers=1)
+        regrid(tmp_path / "nothing", SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     assert not list(tmp_path.iterdir())
 
 
 def test_memory_is_of_one_process(source, tmp_path):
     for place in ("memory://run/x.zarr", "memory://run/folder"):
         with pytest.raises(ArgumentError, match="workers: expected 1 with memory://run/"):
-            regrid(source[0], SPEC, place, workers=2)
-        regrid(source[0], SPEC, place, workers=1)
-    carlasc.unpack("memory://run/x.zarr", tmp_path / "x", workers=1)
+            regrid(source[0], SPEC, place, run=Run(workers=2))
+        regrid(source[0], SPEC, place, run=Run(workers=1))
+    carlasc.unpack("memory://run/x.zarr", tmp_path / "x", run=Run(workers=1))
     assert read_tree(tmp_path / "x") == source[1]
     with pytest.raises(ArgumentError, match="workers: expected 1 with memory://run/"):
-        carlasc.pack("memory://run/folder", tmp_path / "x.zarr", workers=2)
+        carlasc.pack("memory://run/folder", tmp_path / "x.zarr", run=Run(workers=2))
 
 
 def test_a_store_without_its_last_part_is_finished_by_hand(source, tmp_path):
@@ -204,7 +206,7 @@ def test_a_store_without_its_last_part_is_finished_by_hand(source, tmp_path):
     from carlasc.cli import app
 
     out = tmp_path / "x.zarr"
-    regrid(source[0], SPEC, out, part=Part(1, 3), workers=1)
+    regrid(source[0], SPEC, out, run=Run(part=Part(1, 3), workers=1))
     ran = CliRunner().invoke(app, ["finish", str(out)])
     assert ran.exit_code == 1
     assert ran.stderr.startswith(f"carlasc: {out}: expected all frames that the run announced, found 20 of ")

@@ -13,13 +13,14 @@ from helpers.scenes.box_street import drive, write_drive
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc import GridSpec
+from carlasc import GridSpec, Run
 from carlasc.cli import app
 from carlasc.core.geometry import translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.groundtruth import FromGrid, FromScans, Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import PreparedScan
+from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.storage import FolderSink, layout
 
 VEHICLE = 10
@@ -42,7 +43,9 @@ def grid_of(sequence, name, frame=FRAME):
 
 def make(sequence, name, frames=(FRAME, FRAME + 1), spec=passing_car.SPEC, **options):
     observe = FromScans(**options.pop("settings", {}))
-    return carlasc.regrid(sequence, spec, name=name, frames=frames, observe=observe, workers=1, **options)
+    return carlasc.regrid(
+        sequence, spec, name=name, frames=frames, observe=observe, **{"run": Run(workers=1), **options}
+    )
 
 
 def vehicle_score(grid, truth):
@@ -125,7 +128,7 @@ def test_a_frame_does_not_depend_on_which_frames_a_run_makes(street):
 
 def test_processes_make_the_same_grids(street):
     make(street, "one", frames=(18, 22))
-    carlasc.regrid(street, passing_car.SPEC, name="two", frames=(18, 22), observe=FromScans(), workers=2)
+    carlasc.regrid(street, passing_car.SPEC, name="two", frames=(18, 22), observe=FromScans(), run=Run(workers=2))
     for frame in range(18, 22):
         assert (grid_of(street, "one", frame).labels == grid_of(street, "two", frame).labels).all()
 
@@ -133,12 +136,12 @@ def test_processes_make_the_same_grids(street):
 def test_an_executor_that_outlives_a_run_sees_the_files_of_the_next(tmp_path):
     street = passing_car.write_sequence(tmp_path)
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:
-        make(street, "before", executor=executor)
+        make(street, "before", run=Run(1, executor))
         for path in street.rglob(f"velodyne/{FRAME:06d}.bin"):
             points = np.fromfile(path, np.float32).reshape(-1, 4)
             points[:, :3] *= 0.9
             path.write_bytes(points.tobytes())
-        make(street, "after", executor=executor)
+        make(street, "after", run=Run(1, executor))
     make(street, "plain")
     assert (grid_of(street, "after").labels == grid_of(street, "plain").labels).all()
     assert (grid_of(street, "after").labels != grid_of(street, "before").labels).any()
@@ -260,16 +263,22 @@ def test_rays_through_a_box_are_those_a_plain_look_at_all_rays_finds():
 
 
 class TestBadInput:
-    def test_no_poses_offer_kiss_icp(self, tmp_path):
+    def test_no_poses_offer_kiss_icp_if_those_of_the_file_are_asked_for(self, tmp_path):
         street = passing_car.write_sequence(tmp_path, frames=3, poses=False)
-        with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=\"kiss-icp\""):
-            make(street, "x", frames=None)
+        with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=PoseOptions\(\"kiss-icp\"\)"):
+            make(street, "x", frames=None, settings={"poses": PoseOptions("file")})
 
-    def test_kiss_icp_can_find_them(self, tmp_path):
+    @pytest.mark.parametrize("source", ["auto", "kiss-icp"])
+    def test_kiss_icp_can_find_them(self, tmp_path, source):
         pytest.importorskip("kiss_icp")
         folder = write_drive(tmp_path / "Street" / "cartesian", drive(8, speed_m=0.8))
         (folder / "poses.txt").unlink()
-        make(tmp_path, "x", frames=(2, 4), settings={"poses": "kiss-icp"})
+        result = make(tmp_path, "x", frames=(2, 4), settings={"poses": PoseOptions(source)})
+        assert sum("they were estimated from the scans" in note for note in result.notes) == (source == "auto")
+        record = json.loads((folder / "x" / "params.json").read_bytes())["carlasc"]
+        assert record["poses"] == "kiss-icp"
+        again = make(tmp_path, "x", frames=(2, 5), settings={"poses": PoseOptions(source)})
+        assert (again.made, again.skipped) == (1, 2)
         poses = layout.decode_poses((folder / "poses.txt").read_bytes(), "poses.txt")
         assert poses.shape == (8, 4, 4)
         assert poses[7, 0, 3] == pytest.approx(5.6, abs=0.3)
@@ -285,7 +294,7 @@ class TestBadInput:
         (note,) = make(street, "x", frames=(10, 11)).notes
         assert "cartesian: free space shows 1 actors that move" in note
         assert ", although nothing else says so" in note
-        (note,) = make(street, "y", frames=(10, 11), settings={"motion": "none"}).notes
+        (note,) = make(street, "y", frames=(10, 11), settings={"motion": MotionOptions("none")}).notes
         assert "cartesian: nothing shows what moves: everything was treated as static" in note
         assert make(street, "z", frames=(10, 11), settings={"dynamic": "tube"}).notes == ()
 
@@ -309,7 +318,7 @@ class TestBadInput:
         path.write_bytes(layout.encode_poses(poses))
         with pytest.raises(FormatError, match=r"poses.txt: .*jump of 301 m/s.* at frame 4 .*`force=True`"):
             make(street, "x", frames=None)
-        assert make(street, "x", frames=None, settings={"force": True}).made == 6
+        assert make(street, "x", frames=None, settings={"poses": PoseOptions(force=True)}).made == 6
 
     def test_a_scan_cut_short_fails_its_frames_and_the_command_says_which(self, tmp_path):
         street = passing_car.write_sequence(tmp_path, frames=30)
@@ -325,7 +334,7 @@ class TestFromFinerGrids:
     def test_a_coarser_grid_of_the_finest_there_is(self, street):
         fine = replace(passing_car.SPEC, size=(256, 256, 16))
         make(street, "fine", frames=(20, 22), spec=fine)
-        result = carlasc.regrid(street, passing_car.SPEC, name="coarse", observe=FromGrid("fine"), workers=1)
+        result = carlasc.regrid(street, passing_car.SPEC, name="coarse", observe=FromGrid("fine"), run=Run(workers=1))
         assert result.made == 2
         coarse, finer = grid_of(street, "coarse", 20), grid_of(street, "fine", 20)
         assert coarse.counts.sum() == finer.counts.sum()

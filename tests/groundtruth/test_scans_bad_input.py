@@ -5,10 +5,11 @@ import pytest
 from helpers.scenes import passing_car
 
 import carlasc
-from carlasc import FromScans
+from carlasc import FromScans, Run
 from carlasc.core.boxes import Boxes
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.storage import FolderSink, layout
 
 FRAMES, FRAME = 21, 10
@@ -17,7 +18,9 @@ VEHICLE = CARLA.id_of("Vehicle")
 
 
 def make(street, name="x", frames=(FRAME, FRAME + 1), **options):
-    result = carlasc.regrid(street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), workers=1)
+    result = carlasc.regrid(
+        street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), run=Run(workers=1)
+    )
     assert result.failures == ()
     return result
 
@@ -140,28 +143,41 @@ def test_times_that_fall_are_one_line(street):
 def test_motion_from_a_field_that_is_not_there_is_one_line(street, motion):
     with pytest.raises(
         MissingDataError,
-        match=f'cartesian: expected {motion} in the sequence, found instances: use `motion="evidence"`',
+        match=rf'cartesian: expected {motion} in the sequence, found instances: use `motion=MotionOptions\("evidence"\)`',
     ) as error:
-        make(street, motion=motion)
+        make(street, motion=MotionOptions(motion))
     assert "\n" not in str(error.value)
 
 
 def test_motion_from_numbers_needs_labels(tmp_path):
     street = passing_car.write_sequence(tmp_path, ("instances",), 3)
     with pytest.raises(MissingDataError, match="expected instances in the sequence, found no field that shows motion"):
-        make(street, frames=None, motion="instances")
+        make(street, frames=None, motion=MotionOptions("instances"))
 
 
-@pytest.mark.parametrize("motion", ["auto", "flow", "evidence", "none"])
+@pytest.mark.parametrize("motion", ["flow", "evidence", "none"])
 def test_a_tube_takes_no_motion(motion):
     with pytest.raises(ArgumentError, match='^motion: expected none with dynamic "tube"'):
-        FromScans(dynamic="tube", motion=motion)
+        FromScans(dynamic="tube", motion=MotionOptions(motion))
 
 
-@pytest.mark.parametrize(("name", "value"), [("motion", "magic"), ("complete", "all"), ("poses", "guess")])
-def test_choices_that_do_not_exist_are_named(name, value):
-    with pytest.raises(ArgumentError, match=f"^{name}: expected one of .*, found '{value}'"):
-        FromScans(**{name: value})
+@pytest.mark.parametrize(
+    ("name", "make_options"),
+    [
+        ("motion", lambda: MotionOptions("magic")),
+        ("complete", lambda: FromScans(complete="magic")),
+        ("poses", lambda: PoseOptions("magic")),
+    ],
+)
+def test_choices_that_do_not_exist_are_named(name, make_options):
+    with pytest.raises(ArgumentError, match=f"^{name}: expected one of .*, found 'magic'"):
+        make_options()
+
+
+@pytest.mark.parametrize(("name", "kind"), [("motion", "MotionOptions"), ("poses", "PoseOptions")])
+def test_names_in_the_place_of_options_are_one_line(name, kind):
+    with pytest.raises(ArgumentError, match=rf"^{name}: expected {kind}\(\.\.\.\), found 'file'$"):
+        FromScans(**{name: "file"})
 
 
 def add_boxes(street, label=VEHICLE):
@@ -180,10 +196,10 @@ def test_boxes_of_frames_without_a_scan_are_left_out(street):
             path.unlink()
     (sequence,) = carlasc.open(street).sequences().values()
     assert set(sequence.frames("boxes").tolist()) - set(sequence.frames("points").tolist()) == {FRAME - 2}
-    make(street, motion="boxes")
+    make(street, motion=MotionOptions("boxes"))
 
 
 def test_a_box_of_a_class_that_does_not_exist_is_named(street):
     add_boxes(street, 4_294_967_295)
     with pytest.raises(FormatError, match="boxes of frame 0: expected class ids 0..24 .*, found 4294967295 on 1 of 1"):
-        make(street, motion="boxes")
+        make(street, motion=MotionOptions("boxes"))

@@ -11,6 +11,7 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
 from carlasc.groundtruth.inputs import without_caches
+from carlasc.motion import PoseOptions
 from carlasc.storage import FolderSink, layout
 
 
@@ -51,8 +52,8 @@ def test_what_a_vehicle_can_do_is_accepted(tmp_path, poses):
 def test_what_no_vehicle_can_do_is_refused_unless_forced(tmp_path, poses, message):
     sequence = write(tmp_path, poses)
     with pytest.raises(FormatError, match=f"poses.txt: expected at most 70 m/s and 5 rad/s, {message}"):
-        check_trajectory(sequence, FromScans())
-    check_trajectory(sequence, FromScans(force=True))
+        check_trajectory(sequence, FromScans(poses=PoseOptions("file")))
+    check_trajectory(sequence, FromScans(poses=PoseOptions(force=True)))
 
 
 def test_times_say_how_long_a_vehicle_drove_and_turned(tmp_path):
@@ -84,7 +85,7 @@ def test_a_pose_that_is_not_rigid_is_refused_even_if_forced(tmp_path):
     poses = straight(10)
     poses[3] = poses[3] @ np.diag([1.0, -1.0, 1.0, 1.0])
     with pytest.raises(FormatError, match=r"poses.txt.*reflection"):
-        check_trajectory(write(tmp_path, poses), FromScans(force=True))
+        check_trajectory(write(tmp_path, poses), FromScans(poses=PoseOptions(force=True)))
 
 
 @pytest.mark.parametrize(
@@ -98,15 +99,15 @@ def test_a_pose_that_is_not_rigid_is_refused_even_if_forced(tmp_path):
 def test_times_must_increase_even_if_forced(tmp_path, last, message):
     sequence = write(tmp_path, straight(10, 4), times=[0.0, 0.1, 0.2, last])
     with pytest.raises(FormatError, match=f"times.txt: {message}"):
-        check_trajectory(sequence, FromScans(force=True))
+        check_trajectory(sequence, FromScans(poses=PoseOptions(force=True)))
 
 
 def test_a_sequence_without_poses_offers_to_estimate_them(tmp_path):
     sequence = write(tmp_path, straight(10))
     (tmp_path / "Val/Street/cartesian/poses.txt").unlink()
     (sequence,) = carlasc.open(tmp_path).sequences().values()
-    with pytest.raises(MissingDataError, match='poses.txt: expected poses.*`poses="kiss-icp"`'):
-        check_trajectory(sequence, FromScans())
+    with pytest.raises(MissingDataError, match='poses.txt: expected poses.*`poses=PoseOptions\\("kiss-icp"\\)`'):
+        check_trajectory(sequence, FromScans(poses=PoseOptions("file")))
 
 
 def test_frames_without_a_scan_take_the_estimated_pose_of_the_scan_before(tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc
+from carlasc import Run
 from carlasc.captures.lidar import Lidar
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
@@ -59,8 +60,8 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny simulated town with a grid, as the demo makes one."""
     root = tmp_path_factory.mktemp("simulated") / "town"
     sequence = root / "Train" / "Demo"
-    carlasc.simulate(sequence, count=2, sensors=2, lidar=Lidar(channels=16, points=4000), bev=False, workers=1)
-    carlasc.regrid(sequence, GridSpec.published().with_resolution(1.6), workers=1)
+    carlasc.simulate(sequence, count=2, sensors=2, lidar=Lidar(channels=16, points=4000), bev=False, run=Run(workers=1))
+    carlasc.regrid(sequence, GridSpec.published().with_resolution(1.6), run=Run(workers=1))
     return root
 
 
@@ -359,7 +360,7 @@ def test_an_existing_picture_is_found_before_anything_is_counted(tmp_path: Path)
     (root / "images").mkdir()
     (root / "images" / "grid.png").write_bytes(b"mine")
     with pytest.raises(ConflictError, match=r"grid\.png: exists already"):
-        carlasc.card(root, **SAID, progress=lambda done, total: pytest.fail("counted"))
+        carlasc.card(root, **SAID, run=Run(1, progress=lambda done, total: pytest.fail("counted")))
     assert not (root / "README.md").exists()
 
 
@@ -524,7 +525,7 @@ def test_every_text_of_responsibility_is_filled_for_converted_data_too(mixed: Pa
     from carlasc.inspection.cards.facts import Details, gather
     from carlasc.inspection.cards.licenses import find_license
 
-    facts = gather(carlasc.open(mixed), find_license("mit"), 1, 1, None)
+    facts = gather(carlasc.open(mixed), find_license("mit"), 1, Run(workers=1))
     told = responsibility(facts, Details("x"))
     assert all(value not in ("", []) for value in told.values())
     assert told["dataCollectionType"] == ["Software Collection", "Secondary Data analysis"]

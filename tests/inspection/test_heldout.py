@@ -8,7 +8,7 @@ import pytest
 from helpers.scenes import passing_car
 
 import carlasc
-from carlasc import Grid, GridSpec
+from carlasc import Grid, GridSpec, Run
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
@@ -165,7 +165,7 @@ def test_swept_voxels_are_those_whose_centre_the_vehicle_covers():
 def test_traces_are_told_from_a_clean_grid(street):
     scores = {
         dynamic: holdout(
-            street, passing_car.SPEC, observe=FromScans(window=(-6, 6), dynamic=dynamic), every=4, workers=1
+            street, passing_car.SPEC, observe=FromScans(window=(-6, 6), dynamic=dynamic), every=4, run=Run(workers=1)
         ).total
         for dynamic in ("tube", "align", "current")
     }
@@ -183,24 +183,26 @@ def bare(tmp_path_factory):
 
 
 def test_a_drive_without_labels_is_measured(bare):
-    result = holdout(bare, observe=FromScans(window=(-3, 3)), every=3, workers=1)
+    result = holdout(bare, observe=FromScans(window=(-3, 3)), every=3, run=Run(workers=1))
     assert result.total.all.occupied > 0.9
     assert result.to_dict()["total"]["by_class"] == {}
 
 
 def test_frames_whose_window_is_cut_are_not_measured(bare):
-    result = holdout(bare, observe=FromScans(window=(-3, 3)), every=2, workers=1)
+    result = holdout(bare, observe=FromScans(window=(-3, 3)), every=2, run=Run(workers=1))
     assert result.total.frames == 2  # of frames 1, 3, 5 and 7, those with a whole window
-    assert holdout(bare, observe=FromScans(window=(-3, 3)), every=2, frames=(0, 2), workers=1).total.frames == 1
+    assert (
+        holdout(bare, observe=FromScans(window=(-3, 3)), every=2, frames=(0, 2), run=Run(workers=1)).total.frames == 1
+    )
     with pytest.raises(MissingDataError, match="leave out"):
         holdout(bare, every=2, frames=(2, 3))
 
 
 def test_executors_give_the_same_scores_and_progress_counts_frames(bare):
     steps = []
-    one = holdout(bare, every=3, workers=1, progress=lambda *step: steps.append(step))
+    one = holdout(bare, every=3, run=Run(workers=1, progress=lambda *step: steps.append(step)))
     with ThreadPoolExecutor(2) as threads:
-        other = holdout(bare, every=3, executor=threads, workers=2)
+        other = holdout(bare, every=3, run=Run(executor=threads, workers=2))
     assert one.to_dict() | {"elapsed_s": 0} == other.to_dict() | {"elapsed_s": 0}
     assert steps == [(done, 9) for done in range(10)]  # six scans in which actors are found, and three frames
 
@@ -208,7 +210,7 @@ def test_executors_give_the_same_scores_and_progress_counts_frames(bare):
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_are_measured(tmp_path):
     folder = passing_car.write_sequence(tmp_path, frames=9)
     (folder / "cartesian" / "labels" / "000004.label").write_bytes(b"odd")
-    result = holdout(folder, observe=FromScans(window=(-1, 1)), every=3, workers=1)
+    result = holdout(folder, observe=FromScans(window=(-1, 1)), every=3, run=Run(workers=1))
     (failure,) = result.failures
     assert failure.frame == 4
     assert "000004.label" in failure.message
@@ -216,7 +218,7 @@ def test_a_scan_that_cannot_be_read_is_reported_and_the_others_are_measured(tmp_
 
 
 def test_a_window_without_another_scan_is_a_failure(bare):
-    result = holdout(bare, observe=FromScans(window=(-4, 4), stride=2), every=2, workers=1)
+    result = holdout(bare, observe=FromScans(window=(-4, 4), stride=2), every=2, run=Run(workers=1))
     assert {failure.frame for failure in result.failures} == {3, 5}
     assert "other scans in its window" in result.failures[0].message
     assert result.total.frames == 0

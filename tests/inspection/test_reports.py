@@ -11,7 +11,7 @@ import pytest
 from helpers.scenes import passing_car
 
 import carlasc
-from carlasc import GridSpec
+from carlasc import GridSpec, Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.groundtruth import FromScans, regrid
 from carlasc.inspection import report, validate, write_report_page
@@ -28,7 +28,7 @@ NAME = f"cartesian/{GRID}"
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=FRAMES)
-    regrid(folder, SPEC, observe=FromScans(window=(-2, 2)), workers=1)
+    regrid(folder, SPEC, observe=FromScans(window=(-2, 2)), run=Run(workers=1))
     return folder
 
 
@@ -47,24 +47,24 @@ def test_the_report_of_a_run_is_read(made, monkeypatch):
 
 def test_a_report_that_is_made_from_files_is_that_of_the_run(made, copied):
     steps = []
-    again = report(made, remake=True, workers=1, progress=lambda *step: steps.append(step))
+    again = report(made, remake=True, run=Run(workers=1, progress=lambda *step: steps.append(step)))
     assert again == report(made)
     assert steps == [(i, 2 * FRAMES) for i in range(2 * FRAMES + 1)]  # the pass that finds the actors, and the frames
     next(copied.rglob(layout.REPORT)).unlink()
     with ThreadPoolExecutor(2) as threads:
-        assert report(copied, executor=threads, workers=2).reports == again.reports
+        assert report(copied, run=Run(executor=threads, workers=2)).reports == again.reports
     assert not list(copied.rglob(layout.REPORT))
 
 
 def test_reports_are_saved_on_request(copied):
     before = next(copied.rglob(layout.REPORT)).read_bytes()
     next(copied.rglob(layout.REPORT)).unlink()
-    report(copied, save=True, workers=1)
+    report(copied, save=True, run=Run(workers=1))
     assert next(copied.rglob(layout.REPORT)).read_bytes() == before
 
 
 def test_held_out_scores_are_added_and_kept(copied):
-    result = report(copied, holdout=True, save=True, workers=1)
+    result = report(copied, holdout=True, save=True, run=Run(workers=1))
     rays = result.reports[NAME].holdout["rays"]
     assert rays["returns"] > 1000
     assert rays["occupied"] > 0.9
@@ -73,11 +73,11 @@ def test_held_out_scores_are_added_and_kept(copied):
 
 def test_published_grids_have_reports_that_are_never_saved(golden_capture, tmp_path):
     folder = shutil.copytree(golden_capture / "cartesian", tmp_path / "cartesian")
-    result = report(folder, workers=1)
+    result = report(folder, run=Run(workers=1))
     made = result.reports["evaluation"]
     assert made.coverage.known > 0
     assert (made.actors, made.convergence) == (None, None)
-    assert report(folder, holdout=True, workers=1).reports["evaluation"].holdout is None
+    assert report(folder, holdout=True, run=Run(workers=1)).reports["evaluation"].holdout is None
     with pytest.raises(ConflictError, match="never written to"):
         report(folder, save=True)
     assert not list(folder.rglob(layout.REPORT))
@@ -88,7 +88,7 @@ def test_a_store_keeps_the_report_and_takes_none(made, tmp_path):
     carlasc.pack(made, tmp_path / "a.h5")
     packed = report(tmp_path / "a.h5").reports
     assert list(packed.values()) == list(report(made).reports.values())
-    assert list(report(tmp_path / "a.h5", remake=True, workers=1).reports.values()) == list(packed.values())
+    assert list(report(tmp_path / "a.h5", remake=True, run=Run(workers=1)).reports.values()) == list(packed.values())
     assert validate(tmp_path / "a.h5").count("warning") == 0
     with pytest.raises(ArgumentError, match="folder"):
         report(tmp_path / "a.h5", save=True)
@@ -96,7 +96,7 @@ def test_a_store_keeps_the_report_and_takes_none(made, tmp_path):
 
 def test_a_frame_that_cannot_be_read_is_a_failure_and_the_others_are_reported(copied):
     next(copied.rglob(f"{GRID}/000002.label")).write_bytes(b"odd")
-    result = report(copied, remake=True, workers=1)
+    result = report(copied, remake=True, run=Run(workers=1))
     (failure,) = result.failures
     assert failure.frame == 2
     assert result.reports[NAME].frames == tuple(frame for frame in range(FRAMES) if frame != 2)
@@ -106,7 +106,7 @@ def test_a_damaged_report_is_an_error_that_remaking_avoids(copied):
     next(copied.rglob(layout.REPORT)).write_text("{}")
     with pytest.raises(FormatError, match=layout.REPORT):
         report(copied)
-    assert report(copied, remake=True, workers=1).reports[NAME].frames
+    assert report(copied, remake=True, run=Run(workers=1)).reports[NAME].frames
 
 
 def test_a_grid_that_does_not_exist_is_missing(made):
@@ -205,7 +205,7 @@ class Checked(HTMLParser):
 
 
 def test_the_page_loads_nothing_and_shows_every_figure(made, tmp_path):
-    result = report(made, holdout=True, workers=1)
+    result = report(made, holdout=True, run=Run(workers=1))
     write_report_page(result, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     parser = Checked()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carlasc import Run
 from carlasc.core.classes import class_weights
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI
@@ -55,7 +56,7 @@ def test_every_point_and_known_voxel_is_counted_once(
     data: tuple[Path, dict[str, dict[str, np.ndarray]]], workers: int
 ) -> None:
     root, expected = data
-    result = stats(root, workers=workers)
+    result = stats(root, run=Run(workers=workers))
     assert list(result.sequences) == list(expected)
     for path, histogram in result.sequences.items():
         np.testing.assert_array_equal(histogram.points, expected[path]["points"])
@@ -151,7 +152,7 @@ def test_senseless_arguments_and_data_without_classes_are_told(
 
 def test_progress_ends_at_its_total(data: tuple[Path, dict[str, dict[str, np.ndarray]]]) -> None:
     seen: list[tuple[int, int]] = []
-    stats(data[0], progress=lambda done, total: seen.append((done, total)))
+    stats(data[0], run=Run(1, progress=lambda done, total: seen.append((done, total))))
     assert seen[-1] == (30, 30)
 
 

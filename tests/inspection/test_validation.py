@@ -12,6 +12,7 @@ import pytest
 from helpers.scenes.box_street import MIRROR, camera_poses, drive, write_drive
 
 import carlasc
+from carlasc import Run
 from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
@@ -456,7 +457,7 @@ def test_a_level_too_low_and_an_empty_folder_are_told(turning: Path, tmp_path: P
 
 def test_progress_reaches_its_total_and_a_source_serves_as_well_as_a_path(turning: Path) -> None:
     seen: list[tuple[int, int]] = []
-    validate(FolderSource(turning), progress=lambda done, total: seen.append((done, total)))
+    validate(FolderSource(turning), run=Run(1, progress=lambda done, total: seen.append((done, total))))
     assert seen[-1][0] == seen[-1][1] == 12 + 12 + 1
     assert [done for done, _ in seen] == list(range(1, 26))
 

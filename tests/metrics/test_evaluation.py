@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlasc import ClassTable, GridSpec
+from carlasc import ClassTable, GridSpec, Run
 from carlasc.core.tables import CARLASC11, REMAPS
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics import (
@@ -73,7 +73,7 @@ def expected_matrix(world, keep=lambda key: True, mask=None):
 
 def test_a_data_set_is_scored_as_the_sum_of_its_frames(folders, world):
     seen = []
-    result = evaluate(*folders, progress=lambda done, total: seen.append((done, total)))
+    result = evaluate(*folders, run=Run(1, progress=lambda done, total: seen.append((done, total))))
     assert result.matrix == expected_matrix(world)
     assert result.matrix.total < 6 * np.prod(SHAPE)
     assert set(result.sequences) == set(SEQUENCES)

@@ -10,6 +10,7 @@ import pytest
 from helpers.processes import jobs
 from helpers.servers import dask_cluster
 
+from carlasc import Run
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.running import open_cluster, run_all
 
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.needs("distributed")
 
 def run(where: str, count: int = 4, workers: int | None = None) -> list[int]:
     with open_cluster(where, workers=workers) as cluster:
-        return list(run_all(jobs.square, range(count), executor=cluster))
+        return list(run_all(jobs.square, range(count), run=Run(executor=cluster)))
 
 
 @pytest.mark.parametrize("where", ["nonsense", "local:0", "local:x", "no.such.Class", "carlasc.NoSuchClass", ""])
@@ -48,7 +49,7 @@ def test_no_scheduler_at_the_address():
 
 def test_no_work_opens_nothing():
     with open_cluster("tcp://127.0.0.1:1") as cluster:
-        assert list(run_all(jobs.square, [], executor=cluster)) == []
+        assert list(run_all(jobs.square, [], run=Run(executor=cluster))) == []
 
 
 @pytest.mark.slow
@@ -92,7 +93,7 @@ def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
         dask_cluster.worker(address),
         open_cluster(address) as cluster,
     ):
-        results = run_all(jobs.name_of_process, range(1000), executor=cluster)
+        results = run_all(jobs.name_of_process, range(1000), run=Run(executor=cluster))
         next(results)
         with dask_cluster.worker(address, other), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
             list(results)
@@ -104,7 +105,7 @@ def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
         dask_cluster.worker(address),
         open_cluster(address) as cluster,
     ):
-        results = run_all(jobs.name_of_process, range(1000), executor=cluster)
+        results = run_all(jobs.name_of_process, range(1000), run=Run(executor=cluster))
         next(results)
         process.send_signal(signal.SIGKILL)
         with pytest.raises(

@@ -14,6 +14,7 @@ import psutil
 import pytest
 from helpers.processes import jobs
 
+from carlasc import Run
 from carlasc.running import Engine, open_cluster, run_all
 from carlasc.running.pools import LostTaskError
 
@@ -57,7 +58,7 @@ def work_until_killed_often_enough(killer: Killer, folder: Path, executor: Engin
     with killer.at_work():
         while killer.kills < killer.wanted:
             paths = [folder / str(number) for number in range(len(made), len(made) + 100)]
-            results = run_all(jobs.write_own_number, paths, workers=2, executor=executor)
+            results = run_all(jobs.write_own_number, paths, run=Run(workers=2, executor=executor))
             with (
                 suppress(LostTaskError),
                 closing(results),
@@ -75,7 +76,7 @@ def work_until_killed_often_enough(killer: Killer, folder: Path, executor: Engin
 @pytest.mark.parametrize("kills", [3, 50])
 def test_workers_of_a_cluster_are_killed(kills, tmp_path: Path):
     with open_cluster("local:2") as cluster:
-        assert list(run_all(jobs.square, range(2), executor=cluster)) == [0, 1]  # it has started
+        assert list(run_all(jobs.square, range(2), run=Run(executor=cluster))) == [0, 1]  # it has started
         work_until_killed_often_enough(Killer(kills), tmp_path, cluster)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from helpers.processes import jobs
 
+from carlasc import Run
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.running.processes import run_all
 
@@ -36,18 +37,18 @@ class RecordingExecutor(Executor):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_the_order_of_the_items(workers):
-    assert list(run_all(jobs.square, range(20), workers=workers)) == [n * n for n in range(20)]
+    assert list(run_all(jobs.square, range(20), run=Run(workers=workers))) == [n * n for n in range(20)]
 
 
 def test_one_worker_works_in_this_process_and_two_in_others():
-    assert set(run_all(jobs.name_of_process, range(3), workers=1)) == {os.getpid()}
-    others = set(run_all(jobs.name_of_process, range(8), workers=2))
+    assert set(run_all(jobs.name_of_process, range(3), run=Run(workers=1))) == {os.getpid()}
+    others = set(run_all(jobs.name_of_process, range(8), run=Run(workers=2)))
     assert others and os.getpid() not in others
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_of_the_function_is_raised_in_its_place(workers):
-    results = run_all(jobs.fail_at_three, range(6), workers=workers)
+    results = run_all(jobs.fail_at_three, range(6), run=Run(workers=workers))
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(ValueError, match="three"):
         next(results)
@@ -55,11 +56,11 @@ def test_an_error_of_the_function_is_raised_in_its_place(workers):
 
 def test_a_callers_executor_gets_a_bounded_number_of_tasks_and_stays_open():
     executor = RecordingExecutor()
-    assert list(run_all(jobs.square, range(50), workers=3, executor=executor)) == [n * n for n in range(50)]
+    assert list(run_all(jobs.square, range(50), run=Run(workers=3, executor=executor))) == [n * n for n in range(50)]
     assert len(executor.submitted) == 50
     assert executor.most_pending == 6
     with ThreadPoolExecutor(2) as threads:
-        assert list(run_all(jobs.square, range(5), executor=threads)) == [0, 1, 4, 9, 16]
+        assert list(run_all(jobs.square, range(5), run=Run(executor=threads))) == [0, 1, 4, 9, 16]
         assert threads.submit(jobs.square, 9).result() == 81
 
 
@@ -67,21 +68,23 @@ def test_workers_have_one_thread_each_and_the_caller_keeps_its_environment(monke
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"]
-    assert list(run_all(jobs.environment, names, workers=2)) == ["1", "1"]
+    assert list(run_all(jobs.environment, names, run=Run(workers=2))) == ["1", "1"]
     assert [os.environ.get(name) for name in names] == ["7", None]
 
 
 def test_workers_are_deaf_to_ctrl_c():
-    assert list(run_all(jobs.ignores_interrupt, range(2), workers=2)) == [True, True]
+    assert list(run_all(jobs.ignores_interrupt, range(2), run=Run(workers=2))) == [True, True]
 
 
 def test_what_a_killed_worker_worked_on_is_done_by_another(tmp_path: Path):
     marks = [tmp_path / f"{number}" for number in range(4)]
-    assert list(run_all(jobs.die_once, marks, workers=2)) == ["0", "1", "2", "3"]
+    assert list(run_all(jobs.die_once, marks, run=Run(workers=2))) == ["0", "1", "2", "3"]
 
 
 def test_what_always_kills_its_worker_is_given_up_and_nothing_else():
-    results = run_all(jobs.kill_itself_at_three, range(8), workers=2, lost=lambda item, message: f"{item}: {message}")
+    results = run_all(
+        jobs.kill_itself_at_three, range(8), run=Run(workers=2), lost=lambda item, message: f"{item}: {message}"
+    )
     found = list(results)
     assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7]
     assert found[3].startswith("3: a task: 3 worker processes died while they did it: they ran out of memory")
@@ -89,16 +92,16 @@ def test_what_always_kills_its_worker_is_given_up_and_nothing_else():
 
 def test_without_a_result_for_what_is_given_up_there_is_one_clear_line():
     with pytest.raises(CarlascError, match="a task: 3 worker processes died while they did it") as caught:
-        list(run_all(jobs.kill_itself, range(2), workers=2))
+        list(run_all(jobs.kill_itself, range(2), run=Run(workers=2)))
     assert "\n" not in str(caught.value)
 
 
 def test_workers_that_cannot_start_are_one_clear_line(tmp_path: Path):
     script = tmp_path / "unguarded.py"
     script.write_text(
-        "from carlasc.running import run_all\n"
+        "from carlasc.running import Run, run_all\n"
         "try:\n"
-        "    list(run_all(abs, range(4), workers=2))\n"
+        "    list(run_all(abs, range(4), Run(workers=2)))\n"
         "except Exception as error:\n"
         "    raise SystemExit(f'{type(error).__name__}: {error}')\n"
     )
@@ -111,7 +114,7 @@ def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file
     started = time.monotonic()
     with (
         pytest.raises(KeyboardInterrupt),
-        closing(run_all(jobs.write_for_a_minute, [Path("nothing"), *slow], workers=2)) as results,
+        closing(run_all(jobs.write_for_a_minute, [Path("nothing"), *slow], run=Run(workers=2))) as results,
     ):
         next(results)
         while not all(path.with_suffix(".begun").exists() for path in slow):
@@ -159,4 +162,4 @@ def test_a_worker_that_is_told_to_end_between_tasks_leaves_the_next_one_whole():
 
 def test_a_number_of_workers_below_one_makes_no_sense():
     with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
-        list(run_all(jobs.square, range(3), workers=0))
+        list(run_all(jobs.square, range(3), run=Run(workers=0)))

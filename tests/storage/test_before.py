@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import carlasc
+from carlasc import Run
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI
 from carlasc.storage import layout
 from carlasc.storage.packing import pack
@@ -146,8 +147,8 @@ def unpacked(file: Path) -> bytes:
 def test_what_an_old_version_wrote_is_packed_and_unpacked_without_a_change(before, tmp_path, name, ending):
     for kind in {ending, name.rpartition(".")[2]} & set(ENDINGS):
         pytest.importorskip({"zarr": "numcodecs", "h5": "h5py", "parquet": "pyarrow"}[kind])
-    pack(before / name, tmp_path / f"new.{ending}", workers=1)
-    unpack(tmp_path / f"new.{ending}", tmp_path / "files", workers=1)
+    pack(before / name, tmp_path / f"new.{ending}", run=Run(workers=1))
+    unpack(tmp_path / f"new.{ending}", tmp_path / "files", run=Run(workers=1))
     found, wanted = files_of_layout(tmp_path / "files"), files_of_layout(before / "published")
     assert len(wanted) > 50
     assert found == wanted
@@ -157,8 +158,8 @@ def test_what_an_old_version_wrote_is_packed_and_unpacked_without_a_change(befor
 def test_a_zarr_store_of_version_1_is_unpacked_and_packed_without_a_change(tmp_path):
     with tarfile.open(Path(__file__).parents[1] / "data/before/zarr-1.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
-    pack(tmp_path / "store.zarr", tmp_path / "new.zarr", workers=1)
+    pack(tmp_path / "store.zarr", tmp_path / "new.zarr", run=Run(workers=1))
     wanted = files_of_layout(tmp_path / "published")
     for store in ("store.zarr", "new.zarr"):
-        unpack(tmp_path / store, tmp_path / f"{store}.files", workers=1)
+        unpack(tmp_path / store, tmp_path / f"{store}.files", run=Run(workers=1))
         assert files_of_layout(tmp_path / f"{store}.files") == wanted

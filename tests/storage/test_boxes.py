@@ -8,6 +8,7 @@ import pytest
 from helpers.datasets.sequences import scan
 
 import carlasc
+from carlasc import Run
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans
 from carlasc.storage import FolderSink, layout
@@ -66,9 +67,11 @@ def test_info_counts_their_frames(folder):
 
 def test_regrid_from_scans_carries_them_along(folder, tmp_path):
     spec = carlasc.GridSpec.published().with_size((8, 8, 4))
-    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), workers=1)
+    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), run=Run(workers=1))
     assert files(tmp_path / "out") == files(folder)
-    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), workers=1)  # it continues with the same boxes
+    carlasc.regrid(
+        folder, spec, tmp_path / "out", observe=FromScans(), run=Run(workers=1)
+    )  # it continues with the same boxes
 
 
 def test_a_scan_has_them_if_they_are_asked_for(folder):

@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from numpy.typing import NDArray
 
+from carlasc import Run
+
 pytest.importorskip("hypothesis")
 
 from hypothesis import Phase, settings
@@ -46,8 +48,8 @@ class CarlascMachine(StoreMachine):
 
     def _pack_and_unpack(self, folder: Path) -> None:
         packed = folder / f"packed{ENDINGS[len(self.model) % len(ENDINGS)]}"
-        pack(self.out, packed, workers=1)
-        unpack(packed, folder / "unpacked", workers=1)
+        pack(self.out, packed, run=Run(workers=1))
+        unpack(packed, folder / "unpacked", run=Run(workers=1))
         assert contents(packed) == contents(folder / "unpacked") == contents(self.out)
 
     def _regrid(self, folder: Path) -> None:
@@ -65,7 +67,7 @@ class CarlascMachine(StoreMachine):
         for (path, field, frame), array in self.model.items():
             sink.sequence(path).write(field, frame, array)
         for source, out in ((folder / "plain", folder / "wanted"), (self.out, folder / "made")):
-            carlasc.regrid(source, COARSE, out, observe=FromGrid(GRID), name="coarse", workers=1)
+            carlasc.regrid(source, COARSE, out, observe=FromGrid(GRID), name="coarse", run=Run(workers=1))
         assert contents(folder / "made") == contents(folder / "wanted")
 
 

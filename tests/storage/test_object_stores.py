@@ -18,6 +18,7 @@ from helpers.datasets.sequences import files_of, write_dataset
 from helpers.servers.object_store import BUCKET, SECRET, FaultyServer, every, faulty_server, options_for, s3_server
 
 import carlasc
+from carlasc import Run
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, StorageError, without_credentials
 from carlasc.storage import FolderSink
 from carlasc.storage.opening import as_sink
@@ -368,10 +369,10 @@ def test_sinks_are_of_the_kind_that_their_place_says(tmp_path: Path) -> None:
 
 
 def test_memory_is_for_one_process() -> None:
-    check_shared("memory://x", 1)
-    check_shared("s3://x", 8)
+    check_shared("memory://x", Run(workers=1))
+    check_shared("s3://x", Run(workers=8))
     with pytest.raises(ArgumentError, match=r"workers: expected 1 with memory://x, .* found 2"):
-        check_shared("memory://x", 2)
+        check_shared("memory://x", Run(workers=2))
 
 
 @pytest.mark.parametrize(("name", "value"), [("REQUESTS", "many"), ("TIMEOUT_S", "0"), ("ATTEMPTS", "-1")])

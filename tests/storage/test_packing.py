@@ -19,6 +19,7 @@ from storage.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc
+from carlasc import Run
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.storage import FolderSink, FolderSource, pack, unpack
@@ -184,7 +185,7 @@ def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(data: Path
     root = write_dataset(tmp_path / "data")
     (root / PATH / "notes.txt").write_text("mine")
     steps: list[tuple[int, int]] = []
-    result = pack(root, tmp_path / "x.zarr", progress=lambda done, total: steps.append((done, total)))
+    result = pack(root, tmp_path / "x.zarr", run=Run(progress=lambda done, total: steps.append((done, total))))
     files = files_of(root)
     assert result.left_out == [f"{PATH}: notes.txt"]
     assert result.sequences == sorted(carlasc.open(root).sequences())
@@ -272,11 +273,12 @@ def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(data: Path, tmp_path
 
 KILLED = """
 import os, signal, sys, carlasc.storage as packing
+from carlasc import Run
 from carlasc.storage import FolderSource
 def kill(done, total):
     if done >= min(int(sys.argv[4]), total):
         os.kill(os.getpid(), signal.SIGKILL)
-getattr(packing, sys.argv[1])(sys.argv[2], sys.argv[3], progress=kill)
+getattr(packing, sys.argv[1])(sys.argv[2], sys.argv[3], run=Run(progress=kill))
 """
 
 
@@ -376,21 +378,13 @@ def test_only_zarr_has_a_small_kind_and_the_command_names_the_option(data: Path,
     assert result.stderr.endswith("leave `--small` out\n")
 
 
-def test_no_workers_are_an_argument_error(data: Path, tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
-        pack(data, tmp_path / "x.h5", workers=0)
-    with pytest.raises(ArgumentError, match="workers: expected at least 1, found 0"):
-        unpack(data, tmp_path / "files", workers=0)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("kind", ["h5", "parquet"])
 def test_stores_of_one_writer_take_no_executor(data: Path, tmp_path: Path, kind: str) -> None:
     with (
         ThreadPoolExecutor(1) as executor,
         pytest.raises(ArgumentError, match=r"executor: expected a \.zarr store, which several processes can write"),
     ):
-        pack(data, tmp_path / f"x.{kind}", executor=executor)
+        pack(data, tmp_path / f"x.{kind}", run=Run(executor=executor))
     assert not list(tmp_path.iterdir())
 
 
@@ -410,7 +404,10 @@ def test_unpacking_over_a_folder_replaces_its_files_and_counts_them(data: Path, 
     damaged.write_bytes(b"damaged!")
     steps: list[tuple[int, int]] = []
     again = unpack(
-        tmp_path / "x.h5", tmp_path / "files", overwrite=True, progress=lambda done, total: steps.append((done, total))
+        tmp_path / "x.h5",
+        tmp_path / "files",
+        overwrite=True,
+        run=Run(progress=lambda done, total: steps.append((done, total))),
     )
     assert (again.files, again.kept) == (15, 0)
     assert steps[-1] == (15, 15)
@@ -422,7 +419,9 @@ def test_a_continued_unpacking_counts_the_files_that_it_kept(data: Path, tmp_pat
     unpack(tmp_path / "x.h5", tmp_path / "files").out.rename(tmp_path / "files.part")
     next((tmp_path / "files.part").rglob("000001.label")).unlink()
     steps: list[tuple[int, int]] = []
-    result = unpack(tmp_path / "x.h5", tmp_path / "files", progress=lambda done, total: steps.append((done, total)))
+    result = unpack(
+        tmp_path / "x.h5", tmp_path / "files", run=Run(progress=lambda done, total: steps.append((done, total)))
+    )
     assert (result.files, result.kept) == (1, 14)
     assert steps[-1] == (15, 15)
 
@@ -446,5 +445,5 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(data: Path, tmp_path: 
         (tmp_path / "x.h5").write_bytes(b"diary")
 
     with pytest.raises(ConflictError, match=r"x\.h5: expected nothing there, found a file"):
-        pack(data / "Val", tmp_path / "x.h5", progress=appear)
+        pack(data / "Val", tmp_path / "x.h5", run=Run(progress=appear))
     assert (tmp_path / "x.h5").read_bytes() == b"diary"

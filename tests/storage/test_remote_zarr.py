@@ -21,6 +21,7 @@ from helpers.servers.object_store import (
 from storage.test_shared_writing import FRAMES, PATH, arrays_of, start_sink, write_block
 
 import carlasc
+from carlasc import Run
 from carlasc.errors import ConflictError
 from carlasc.storage.packed.arrays.zarr_finish import finish
 from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
@@ -103,17 +104,17 @@ def test_a_bucket_store_is_read_with_few_requests(server: FaultyServer, referenc
 @pytest.mark.slow
 def test_packing_to_a_bucket_and_back(server: FaultyServer, reference: Path, tmp_path: Path) -> None:
     out = f"s3://{BUCKET}/{tmp_path.name}.zarr"
-    there, here = pack(reference, out, workers=1), pack(reference, tmp_path / "x.zarr", workers=1)
+    there, here = pack(reference, out, run=Run(workers=1)), pack(reference, tmp_path / "x.zarr", run=Run(workers=1))
     assert there.out == out
     assert (there.stored_bytes, there.published_bytes) == (here.stored_bytes, here.published_bytes)
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
     with pytest.raises(ConflictError, match=r"\.zarr: expected nothing there, found a finished store"):
         pack(reference, out)
-    assert len(pack(reference, out, overwrite=True, workers=1).sequences) == 1
+    assert len(pack(reference, out, overwrite=True, run=Run(workers=1)).sequences) == 1
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
     with pytest.raises(ConflictError, match="expected a path outside"):
         pack(out, f"{out}/inside.zarr")
-    unpack(out, tmp_path / "files", workers=1)
+    unpack(out, tmp_path / "files", run=Run(workers=1))
     sequence = carlasc.open(tmp_path / "files").sequences()[PATH]
     assert np.array_equal(sequence.read("points", FRAMES - 1), arrays_of(FRAMES - 1)["points"])
 

@@ -22,6 +22,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import carlasc
+from carlasc import Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Sequence, pack, unpack
 from carlasc.storage.packed.arrays.zarr_finish import finish
@@ -349,10 +350,10 @@ def test_packing_in_processes_gives_the_same_files(tmp_path: Path, small: bool, 
     writer.write_document("evaluation/params.json", params(SIZE))
     for frame in range(FRAMES):
         writer.write_frames({frame: arrays_of(frame)})
-    pack(tmp_path / "data", tmp_path / "a.zarr", small=small, workers=workers)
-    pack(tmp_path / "a.zarr", tmp_path / "b.zarr", small=small, workers=1)
+    pack(tmp_path / "data", tmp_path / "a.zarr", small=small, run=Run(workers=workers))
+    pack(tmp_path / "a.zarr", tmp_path / "b.zarr", small=small, run=Run(workers=1))
     assert files_of(tmp_path / "a.zarr") == files_of(tmp_path / "b.zarr")
-    unpack(tmp_path / "b.zarr", tmp_path / "files", workers=workers)
+    unpack(tmp_path / "b.zarr", tmp_path / "files", run=Run(workers=workers))
     assert files_of(tmp_path / "files") == files_of(tmp_path / "data")
 
 

@@ -10,7 +10,7 @@ from helpers.displays.virtual_screen import virtual_screen
 from helpers.readers.pixels import has_color
 from helpers.viewing import write_page
 
-from carlasc import regrid, simulate
+from carlasc import Run, regrid, simulate
 from carlasc.captures import Lidar
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
@@ -24,8 +24,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town") / "Train" / "Demo_Heavy"
-    simulate(folder, count=2, sensors=6, traffic="heavy", lidar=Lidar(points=60_000), bev=False, workers=1)
-    regrid(folder, GridSpec.published(), workers=1)
+    simulate(folder, count=2, sensors=6, traffic="heavy", lidar=Lidar(points=60_000), bev=False, run=Run(workers=1))
+    regrid(folder, GridSpec.published(), run=Run(workers=1))
     return folder / "cartesian"
 
 
@@ -46,8 +46,8 @@ def test_the_page_of_a_street(browser, street, tmp_path):
 def drive(tmp_path_factory):
     """A street with two grids that were merged from scans in two ways, and the truth."""
     folder = tmp_path_factory.mktemp("drive") / "Train" / "Demo_Heavy"
-    simulate(folder, count=16, sensors=4, traffic="heavy", lidar=Lidar(points=40_000), bev=False, workers=1)
-    regrid(folder, GridSpec.published(), workers=1)
+    simulate(folder, count=16, sensors=4, traffic="heavy", lidar=Lidar(points=40_000), bev=False, run=Run(workers=1))
+    regrid(folder, GridSpec.published(), run=Run(workers=1))
     for name in ("tube", "align"):
         scans = FromScans(window=(-6, 6), dynamic=name)
         regrid(
@@ -56,7 +56,7 @@ def drive(tmp_path_factory):
             observe=scans,
             voting=Voting(keep_evidence=True),
             name=name,
-            workers=1,
+            run=Run(workers=1),
         )
     return folder / "cartesian"
 

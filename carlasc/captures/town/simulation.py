@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,9 +16,8 @@ from carlasc.captures.town.simulated import SimulatedCapture
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
 from carlasc.errors import import_extra
-from carlasc.running.engines import Engine
-from carlasc.running.parts import Part
-from carlasc.running.processes import count_workers, run_all
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.storage.transport.targets import check_shared
 
@@ -72,10 +70,7 @@ def simulate(
     traffic: TrafficLevel = "medium",
     lidar: Lidar | None = None,
     bev: bool = True,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    part: Part = Part(),  # noqa: B008 (frozen)
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> SimulationResult:
     """Record a drive through a simulated town as a raw capture. The same arguments write the same bytes.
 
@@ -90,11 +85,8 @@ def simulate(
         traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
         lidar: model of the LiDARs. None: the data set's.
         bev: whether to write bird's-eye pictures.
-        workers: number of processes. None: one per core.
-        executor: runs the work instead of processes of its own.
-        part: writes only this part of the frames; other commands write the others. The part that finds that no frame is missing any more
-            writes the times.
-        progress: called with (frames done, number of frames).
+        run: how the work is spread, whether this is only a part of it, and who is told of its progress. The part that finds that no frame
+            is missing any more writes the times.
 
     Returns:
         What was written.
@@ -109,24 +101,24 @@ def simulate(
     drive = SimulatedCapture(
         count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev
     )
-    check_shared(os.fspath(out), count_workers(workers))
+    check_shared(os.fspath(out), run)
     settings = _Settings(seed, traffic, sensors, bev, lidar or Lidar())
     check_dependencies(bev)
     writer = CaptureWriter(out)
     writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc simulate")
     writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))
 
-    wanted = part.take(range(first_frame, first_frame + count))
+    wanted = run.part.take(range(first_frame, first_frame + count))
     missing = [frame for frame in wanted if not writer.has_frame(frame, sensors, bev)]
     complete = set(wanted) - set(missing)
-    if progress is not None:
-        progress(len(complete), len(wanted))
+    progress = run.progress or (lambda done, total: None)
+    progress(len(complete), len(wanted))
     points: Counter[str] = Counter()
-    recorded = run_all(partial(_record_frame, writer, drive), missing, workers=workers, executor=executor)
+    recorded = run_all(partial(_record_frame, writer, drive), missing, run)
     with TimesLog(writer) as log:
 
         def note(frame: int) -> None:
-            if part.count == 1:  # several parts that wrote one file would overwrite each other's lines
+            if run.part.count == 1:  # several parts that wrote one file would overwrite each other's lines
                 log.add(frame, [frame * FRAME_PERIOD_S] * sensors)
 
         for frame in sorted(complete - writer.timed_frames(sensors)):  # a run was killed before it wrote their times
@@ -134,9 +126,8 @@ def simulate(
         for done, (frame, points_of_frame) in enumerate(zip(missing, recorded, strict=True), len(complete) + 1):
             points.update(points_of_frame)
             note(frame)
-            if progress is not None:
-                progress(done, len(wanted))
-    if part.count > 1:
+            progress(done, len(wanted))
+    if run.part.count > 1:
         _write_times_of_all(writer, range(first_frame, first_frame + count), sensors, bev)
     classes = {name: points[name] for name in CARLA.names.values() if points[name]}
     return SimulationResult(writer.out, len(wanted), len(missing), sensors, points.total(), classes)

@@ -123,7 +123,7 @@ class ScanFeed:
         Raises:
             MissingDataError: the options ask for a field that the sequence does not have.
         """
-        asked, fields = self.options.motion or "auto", self.sequence.fields()
+        asked, fields = self.options.motion.source, self.sequence.fields()
         if self.options.dynamic == "tube" or asked == "none":
             return ()
         if asked == "evidence":
@@ -142,7 +142,7 @@ class ScanFeed:
                 self.sequence.location,
                 expected=f"{asked} in the sequence",
                 found=", ".join(usable) or "no field that shows motion",
-                advice='use `motion="evidence"`, which needs points and poses only',
+                advice='use `motion=MotionOptions("evidence")`, which needs points and poses only',
             )
         return (asked,)
 
@@ -237,7 +237,7 @@ class ScanFeed:
         scan = self._voting_points(frame)
         moving = np.isin(_labels(scan), sorted(self.classes.moving))
         if "flow" in self.motion and scan.flow is not None:
-            moving |= is_fast(scan.flow, self.options.min_speed_m_s)
+            moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
         return PreparedScan.of(
             frame,
             scan.points,
@@ -279,7 +279,7 @@ class ScanFeed:
         elif "instances" in self.motion:
             found = segment_by_instances(frame, scan, pose, ground=self.classes.ground)
         elif "flow" in self.motion:
-            speed = self.options.min_speed_m_s
+            speed = self.options.motion.min_speed_m_s
             found = segment_by_flow(frame, scan, pose, min_speed_m_s=speed)
             standing = standing_points(frame, scan, pose, self.classes.movable, min_speed_m_s=speed)
         return ScanMotion(frame, tuple(found), standing)

@@ -35,7 +35,7 @@ from carlasc.motion import (
     seen_from,
     tracks_from_boxes,
 )
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import layout
 from carlasc.storage.folder import FolderSequence
@@ -96,17 +96,15 @@ class _Pass:
 
     Attributes:
         feed: its scans.
-        workers: number of scans, blocks or tracks that are worked on in parallel.
-        executor: runs the work instead of processes of our own.
-        progress: called with the number of scans that were read since the last call.
+        run: how the work is spread.
+        steps: called with the number of scans that were read since the last call.
     """
 
     feed: ScanFeed
-    workers: int
-    executor: Engine | None
-    progress: Callable[[int], None] | None
+    run: Run
+    steps: Callable[[int], None] | None
 
-    def run(self) -> Actors:
+    def find(self) -> Actors:
         boxes = _box_tracks(self.feed)
         moving_boxes = tuple(track for track in boxes if track.moves)
         tracks = self._boxed(boxes, moving_boxes) if boxes else self._linked()
@@ -117,12 +115,12 @@ class _Pass:
         return Actors.of(tracks if boxes else complete_bodies(tracks), moving)
 
     def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-        with closing(run_all(function, items, workers=self.workers, executor=self.executor)) as results:
+        with closing(run_all(function, items, self.run)) as results:
             yield from results
 
     def _count(self, scans: int) -> None:
-        if self.progress is not None:
-            self.progress(scans)
+        if self.steps is not None:
+            self.steps(scans)
 
     def _linked(self) -> list[Track]:
         """Return the tracks of the actors that flow or instances show."""
@@ -181,23 +179,20 @@ class _Pass:
 
 def find_actors(
     feed: ScanFeed,
-    *,
-    workers: int = 1,
-    executor: Engine | None = None,
-    progress: Callable[[int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
+    steps: Callable[[int], None] | None = None,
 ) -> Actors:
     """Find the actors of a sequence.
 
     Args:
         feed: the scans of the sequence.
-        workers: number of scans that are read in parallel.
-        executor: runs the work instead of processes of our own.
-        progress: called with the number of scans that were read since the last call.
+        run: how the work is spread over its scans, blocks of scans and tracks.
+        steps: called with the number of scans that were read since the last call.
 
     Raises:
         FormatError: a scan is not valid.
     """
-    return _Pass(feed, workers, executor, progress).run()
+    return _Pass(feed, run, steps).find()
 
 
 def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict[int, NDArray[np.integer]]:
@@ -248,7 +243,7 @@ def key_of(feed: ScanFeed) -> str:
     about: dict[str, Any] = {
         "version": VERSION,
         "motion": feed.motion,
-        "min_speed_m_s": options.min_speed_m_s,
+        "min_speed_m_s": options.motion.min_speed_m_s,
         "range_m": [feed.min_range_m, str(feed.max_range_m)],
         "frames": feed.frames.tolist(),
         "poses": hashlib.sha256(sequence.poses.tobytes()).hexdigest(),

@@ -34,9 +34,10 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.motion import LONGEST_M
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.resuming import RECORD
 from carlasc.storage.sinks import SequenceWriter
 
 TRACKS = "tracks.npz"
@@ -115,6 +116,15 @@ class ScanSequence(StoredSequence):
         self.actors = Actors()
 
     @cached_property
+    def estimates_poses(self) -> bool:
+        """Whether poses are estimated from the scans: if that is asked for, or if the sequence has none but those of an earlier run."""
+        source, sequence, grid = self.options.poses.source, self.sequence, self.plan.grid
+        if source != "auto" or layout.POSES not in sequence.documents():
+            return source != "file"
+        record = sequence.params(grid).get(RECORD) if grid in sequence.grids else None
+        return isinstance(record, dict) and record.get("poses") == "kiss-icp"
+
+    @cached_property
     def feed(self) -> ScanFeed:
         """The scans of the sequence, after its poses and times were checked.
 
@@ -122,8 +132,7 @@ class ScanSequence(StoredSequence):
             MissingDataError: there are no poses.
             FormatError: poses or times are not valid.
         """
-        estimated = self.options.poses == "kiss-icp"
-        sequence = with_estimated_poses(self.sequence) if estimated else self.sequence
+        sequence = with_estimated_poses(self.sequence) if self.estimates_poses else self.sequence
         check_trajectory(sequence, self.options)
         return ScanFeed(sequence, self.options)
 
@@ -140,26 +149,18 @@ class ScanSequence(StoredSequence):
         """Number of scans that the pass that finds the actors reads."""
         return self.feed.reads
 
-    def prepare(
-        self,
-        writer: SequenceWriter,
-        *,
-        workers: int,
-        executor: Engine | None,
-        progress: Callable[[int], None] | None,
-    ) -> None:
+    def prepare(self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> None:
         """Find the actors of the sequence, or read those that an earlier run found."""
         if not self.feed.needs_actors:
             return
         key = key_of(self.feed)
         kept = _read_actors(writer, key)
         if kept is None:
-            self.actors = find_actors(self.feed, workers=workers, executor=executor, progress=progress)
+            self.actors = find_actors(self.feed, run, steps)
             writer.write_document(TRACKS, self.actors.to_bytes(key))
             return
         self.actors = kept
-        if progress is not None:
-            progress(self.steps_before)
+        steps(self.steps_before)
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return what was found of each actor, by number; None if no actor is tracked."""
@@ -174,7 +175,7 @@ class ScanSequence(StoredSequence):
             record |= {"complete": options.complete}
         if not options.own_path:
             record |= {"own_path": False}
-        record |= {} if options.poses == "file" else {"poses": options.poses}
+        record |= {"poses": "kiss-icp"} if self.estimates_poses else {}
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}
         record |= {} if options.window_m is None else {"window_m": options.window_m}
         limits = {"min_range_m": self.feed.min_range_m, "max_range_m": self.feed.max_range_m}
@@ -183,11 +184,13 @@ class ScanSequence(StoredSequence):
     def poses(self) -> NDArray[np.float64] | None:
         """Return the poses to write beside the grids; None if they were estimated and the sequence has its own."""
         has_own = layout.POSES in self.sequence.documents()
-        return None if has_own and self.options.poses != "file" else self.feed.sequence.poses
+        return None if has_own and self.estimates_poses else self.feed.sequence.poses
 
     def notes(self) -> list[str]:
         """Return what the scans lack, and what was found in spite of it."""
         where, dynamic, notes = self.location, self.options.dynamic, []
+        if self.estimates_poses and self.options.poses.source == "auto":
+            notes.append(f"{where}: there are no poses: they were estimated from the scans (kiss-icp)")
         if not self.feed.has_labels:
             notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
         elif not self.feed.motion and dynamic != "tube":

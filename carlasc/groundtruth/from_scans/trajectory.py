@@ -36,7 +36,7 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
 
     Raises:
         MissingDataError: it has no poses.
-        FormatError: nobody knows where points were seen from, a pose is not rigid, or jumps without `options.force`, or a time does not increase; names the frame.
+        FormatError: nobody knows where points were seen from, a pose is not rigid, or jumps without `options.poses.force`, or a time does not increase; names the frame.
     """
     where = f"{sequence.location}/{layout.POSES}"
     if not sequence.metadata.has_rays:
@@ -46,17 +46,17 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
             found='"rays": false in carlasc.json',
             advice="free space cannot be told from unknown space: take the grids that came with the data",
         )
-    if options.poses == "file" and layout.POSES not in sequence.documents():
+    if options.poses.source == "file" and layout.POSES not in sequence.documents():
         raise MissingDataError(
             where,
             expected="poses, which merging scans needs",
             found="none",
-            advice='estimate them with KISS-ICP (`poses="kiss-icp"`)',
+            advice='estimate them with KISS-ICP (`poses=PoseOptions("kiss-icp")`)',
         )
     check_rigid(sequence.poses, where)
     frames = sequence.frames("points")
     _check_times(sequence, frames)
-    if not options.force:
+    if not options.poses.force:
         _check_speed(sequence, frames, where)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from carlasc.inspection.cards.licenses import license_given
 from carlasc.inspection.cards.places import place_of
 from carlasc.inspection.cards.readme import readme
 from carlasc.inspection.cards.tables import tables_of
+from carlasc.running.options import Run
 from carlasc.storage import as_source
 from carlasc.storage.files import parse_json, write_output
 from carlasc.storage.packed.tables.reading import ParquetSource
@@ -76,9 +77,8 @@ def card(
     published: str | None = None,
     pictures: bool = True,
     every: int = 1,
-    workers: int | None = 1,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> CardResult:
     """Write the card of a data set: README.md with the YAML that the Hugging Face Hub reads, croissant.json, and pictures.
 
@@ -100,9 +100,8 @@ def card(
         published: date of the publication, YYYY-MM-DD; None takes today.
         pictures: whether a grid and a scan are drawn, which needs the extra `render`.
         every: count the classes of every N-th frame.
-        workers: processes that count side by side; None for one per core.
         overwrite: whether an existing card is replaced.
-        progress: called with (frames counted, frames in total).
+        run: how the counting is spread, and who is told of its progress.
 
     Returns:
         What was written. Frames that could not be read are listed in `failures`.
@@ -121,7 +120,7 @@ def card(
     opened = as_source(source)
     place, folder = place_of(opened if isinstance(source, Source) else source, None if out is None else Path(out), url)
     overwrite = _check_free(folder, overwrite, pictures)
-    facts = gather(opened, stated, every, workers, progress)
+    facts = gather(opened, stated, every, run)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
     details = Details(name or place.title, description, tuple(authors), version, day, url, contact, citation)
     told = description or _describe(facts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,6 +12,7 @@ from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
 from carlasc.inspection.overview import GridOverview, Overview, info
 from carlasc.inspection.statistics import Histogram, Statistics, stats
+from carlasc.running.options import Run
 from carlasc.storage import layout
 from carlasc.storage.packed.protocol import PackedSource
 from carlasc.storage.protocol import Sequence, Source
@@ -167,13 +168,7 @@ class Facts:
         return sum(int(one.total.voxels.sum()) for one in self.statistics) / total if total else None
 
 
-def gather(
-    source: Source,
-    license_: License | None,
-    every: int,
-    workers: int | None,
-    progress: Callable[[int, int], None] | None,
-) -> Facts:
+def gather(source: Source, license_: License | None, every: int, run: Run) -> Facts:
     """Read what a card says.
 
     Raises:
@@ -200,7 +195,7 @@ def gather(
         overview,
         sequences,
         parts,
-        _count(source.location, sequences, every, workers, progress),
+        _count(source.location, sequences, every, run),
         every,
         reports,
         source.lossy_mm if isinstance(source, PackedSource) else None,
@@ -217,13 +212,7 @@ class _Chosen(Source):
         return self.chosen
 
 
-def _count(
-    location: str,
-    sequences: Mapping[str, Sequence],
-    every: int,
-    workers: int | None,
-    progress: Callable[[int, int], None] | None,
-) -> tuple[Statistics, ...]:
+def _count(location: str, sequences: Mapping[str, Sequence], every: int, run: Run) -> tuple[Statistics, ...]:
     """Count the classes, apart for each class table; sequences without labels are left out."""
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
@@ -234,9 +223,7 @@ def _count(
     counted = []
     for chosen in tables.values():
         try:
-            counted.append(
-                stats(_Chosen(location, chosen), remap=None, every=every, workers=workers, progress=progress)
-            )
+            counted.append(stats(_Chosen(location, chosen), remap=None, every=every, run=run))
         except MissingDataError:  # several grids, and none of them the published one
             continue
     return tuple(counted)

@@ -222,7 +222,7 @@ class CachedTree(Tree):
                 return None
             place = self.cache.path(name)
             try:
-                data = read(_Part(place.parent, self.where(path)), name)
+                data = read(_CacheFolder(place.parent, self.where(path)), name)
             except MissingDataError:
                 self._names.pop(path, None)  # removed to make room: fetched again
                 continue
@@ -282,7 +282,7 @@ class CachedTree(Tree):
         self._forget()
 
 
-class _Part(LocalTree):
+class _CacheFolder(LocalTree):
     """A folder of the cache. Its errors name the remote file."""
 
     def __init__(self, root: Path, named: str) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError
+from carlasc.running.options import Run
 from carlasc.storage.files import leads_outside, write_atomic, write_many
 from carlasc.storage.transport.failures import exists_error, fail
 from carlasc.storage.transport.remote_tree import RemoteTree
@@ -261,13 +262,12 @@ def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> T
     return RemoteTarget(text, storage_options) if is_url(text) else LocalTarget(text.removeprefix("file://"))
 
 
-def check_shared(location: str, workers: int) -> None:
-    """Check that several processes can use a place: `memory://` exists in one process only.
+def check_shared(location: str, run: Run) -> None:
+    """Check that all processes of a run can use a place: `memory://` exists in one process only.
 
     Raises:
         ArgumentError: they cannot.
     """
-    if location.startswith("memory://") and workers > 1:
-        raise ArgumentError(
-            "workers", expected=f"1 with {location}, which exists in one process only", found=str(workers)
-        )
+    if location.startswith("memory://") and not run.is_alone:
+        found = "an executor" if run.executor is not None else str(run.processes)
+        raise ArgumentError("workers", expected=f"1 with {location}, which exists in one process only", found=found)

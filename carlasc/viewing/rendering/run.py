@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
-from carlasc.running.engines import Engine
+from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
@@ -86,10 +86,8 @@ def render(
     orbit: bool = False,
     still: bool = False,
     fps: float | None = None,
-    workers: int | None = 1,
-    executor: Engine | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> RenderResult:
     """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). No screen and no GPU are needed.
 
@@ -122,10 +120,8 @@ def render(
         orbit: whether the camera circles the scene once: while the frames follow each other, or around a single frame.
         still: whether the camera stays in one place of the world while the vehicle drives; needs poses.
         fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
-        workers: number of processes; None takes all cores. With an executor: the number of its workers.
-        executor: draws instead of processes of our own; it is not shut down.
         overwrite: whether an existing file is replaced.
-        progress: called with (pictures done, pictures in all).
+        run: how the work is spread over the pictures of a film, and who is told of its progress.
 
     Returns:
         What was drawn, and the file that it is in.
@@ -179,8 +175,8 @@ def render(
     tasks = _plan(drawer, pictures, viewpoint or Viewpoint(), orbit=orbit)
     if fps is None:
         fps = _ORBIT_FPS if orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(_render_task, tasks, workers=workers, executor=executor)) as drawn:
-        write_pictures(target, _reported(drawn, len(tasks), progress), fps, layout.dpi)
+    with closing(run_all(_render_task, tasks, run)) as drawn:
+        write_pictures(target, _reported(drawn, len(tasks), run.progress), fps, layout.dpi)
     if legend_file is not None and entries and layout.font_size is not None:
         write_pictures(legend_file, [draw_legend(entries, layout.font_size, layout.size[0])], fps, layout.dpi)
     return RenderResult(

@@ -8,6 +8,7 @@ from helpers.datasets.captures import read_tree
 from typer.testing import CliRunner
 
 import carlasc
+from carlasc import Run
 from carlasc.captures import Capture, Lidar, SimulatedCapture, simulate
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
@@ -25,8 +26,8 @@ HOW = {"count": 5, "first_frame": 3, "sensors": 3, "seed": 4, "traffic": "light"
 def written(tmp_path_factory):
     """A capture on disk, and the grids that are made from it."""
     root = tmp_path_factory.mktemp("written")
-    simulate(root / "town", **HOW, workers=1)
-    regrid(root / "town", SPEC, root / "grids", workers=1)
+    simulate(root / "town", **HOW, run=Run(workers=1))
+    regrid(root / "town", SPEC, root / "grids", run=Run(workers=1))
     return root
 
 
@@ -50,9 +51,9 @@ def test_it_returns_what_the_capture_on_disk_holds(written):
 def test_grids_are_made_without_files_in_between(written, tmp_path, kind):
     out = tmp_path / ("grids" if kind == "folder" else "grids.zarr")
     for part in (2, 1):
-        regrid(SimulatedCapture(**HOW), SPEC, out, part=Part(part, 2), workers=1)
+        regrid(SimulatedCapture(**HOW), SPEC, out, run=Run(part=Part(part, 2), workers=1))
     if kind == "zarr":
-        carlasc.unpack(out, tmp_path / "grids", workers=1)
+        carlasc.unpack(out, tmp_path / "grids", run=Run(workers=1))
     assert read_tree(tmp_path / "grids") == read_tree(written / "grids")
 
 
@@ -81,6 +82,6 @@ def test_the_command_writes_a_store_or_grids_if_it_is_asked_to(tmp_path, monkeyp
 def test_parts_of_a_simulation_write_the_bytes_of_one(written, tmp_path, order):
     for number in order:
         assert not (tmp_path / "raw" / "times0.txt").exists()
-        result = simulate(tmp_path, **HOW, part=Part(number, 3), workers=1)
+        result = simulate(tmp_path, **HOW, run=Run(part=Part(number, 3), workers=1))
         assert result.count == result.written
     assert read_tree(tmp_path / "raw") == read_tree(written / "town" / "raw")

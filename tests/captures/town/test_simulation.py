@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from carlasc import Run
 from carlasc.captures import Capture, Drive, Lidar, simulate
 from carlasc.core.tables import CARLA
 from carlasc.demo import demonstrate
@@ -35,7 +36,7 @@ def digests(root: Path) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("recorded")
-    simulate(out, **SMALL, workers=1)
+    simulate(out, **SMALL, run=Run(workers=1))
     return out
 
 
@@ -71,8 +72,8 @@ def test_another_process_with_two_workers_and_another_hash_seed_writes_the_same_
     recorded: Path, tmp_path: Path
 ) -> None:
     script = (
-        "from carlasc.captures import Lidar, simulate\n"
-        f"if __name__ == '__main__':\n    simulate({str(tmp_path / 'two')!r}, **{SMALL!r}, workers=2)\n"
+        "from carlasc import Run\nfrom carlasc.captures import Lidar, simulate\n"
+        f"if __name__ == '__main__':\n    simulate({str(tmp_path / 'two')!r}, **{SMALL!r}, run=Run(workers=2))\n"
     )
     (tmp_path / "run.py").write_text(script)
     subprocess.run([sys.executable, str(tmp_path / "run.py")], check=True, env={**os.environ, "PYTHONHASHSEED": "77"})
@@ -80,7 +81,7 @@ def test_another_process_with_two_workers_and_another_hash_seed_writes_the_same_
 
 
 def test_frames_do_not_depend_on_those_recorded_before(recorded: Path, tmp_path: Path) -> None:
-    simulate(tmp_path, **{**SMALL, "count": 1}, first_frame=2, workers=1)
+    simulate(tmp_path, **{**SMALL, "count": 1}, first_frame=2, run=Run(workers=1))
     alone, whole = digests(tmp_path / "raw"), digests(recorded / "raw")
     frames = {name for name in alone if name.endswith(("/2.npy", "/2.jpg"))}
     assert len(frames) == 11
@@ -88,11 +89,11 @@ def test_frames_do_not_depend_on_those_recorded_before(recorded: Path, tmp_path:
 
 
 def test_a_second_run_goes_on_and_ends_with_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
-    first = simulate(tmp_path, **{**SMALL, "count": 2}, workers=1)
+    first = simulate(tmp_path, **{**SMALL, "count": 2}, run=Run(workers=1))
     (tmp_path / "raw" / "labels1" / "1.npy").unlink()
-    second = simulate(tmp_path, **SMALL, executor=ThreadPoolExecutor(1))
+    second = simulate(tmp_path, **SMALL, run=Run(executor=ThreadPoolExecutor(1)))
     assert (first.written, second.written, second.count) == (2, 2, 3)
-    assert simulate(tmp_path, **SMALL, workers=1).written == 0
+    assert simulate(tmp_path, **SMALL, run=Run(workers=1)).written == 0
     ours, theirs = digests(tmp_path), digests(recorded)
     assert {k: v for k, v in ours.items() if "times" not in k} == {k: v for k, v in theirs.items() if "times" not in k}
     assert Capture(tmp_path).read_time(1, 1) == pytest.approx(0.1)
@@ -104,8 +105,8 @@ def test_an_interrupted_run_leaves_whole_files_and_is_finished_by_the_next(recor
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(tmp_path, **SMALL, workers=1, progress=interrupt)
-    simulate(tmp_path, **SMALL, workers=1)
+        simulate(tmp_path, **SMALL, run=Run(workers=1, progress=interrupt))
+    simulate(tmp_path, **SMALL, run=Run(workers=1))
     assert digests(tmp_path) == digests(recorded)
 
 
@@ -113,7 +114,7 @@ def test_a_capture_of_other_settings_is_refused_and_left_alone(recorded: Path) -
     before = digests(recorded)
     for change in ({"seed": 5}, {"traffic": "heavy"}, {"sensors": 3}, {"lidar": Lidar(4, 800)}, {"bev": False}):
         with pytest.raises(ConflictError, match=str(next(iter(change)))):
-            simulate(recorded, **{**SMALL, **change}, workers=1)
+            simulate(recorded, **{**SMALL, **change}, run=Run(workers=1))
     assert digests(recorded) == before
 
 
@@ -131,7 +132,6 @@ def test_a_capture_without_settings_is_refused(tmp_path: Path) -> None:
         ({"traffic": "none"}, "light, medium, heavy"),
         ({"seed": -1}, "seed"),
         ({"first_frame": -1}, "first_frame"),
-        ({"workers": 0}, "workers"),
     ],
 )
 def test_arguments_out_of_range_are_refused_before_anything_is_written(
@@ -169,7 +169,7 @@ def test_without_a_package_of_the_extra_nothing_is_written(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(DependencyError, match=rf"{package} .*pip install 'carlasc\[simulate\]'"):
-        run(tmp_path / "out", count=1, sensors=1, workers=1)
+        run(tmp_path / "out", count=1, sensors=1)
     assert not (tmp_path / "out").exists()
 
 
@@ -179,7 +179,7 @@ def test_pictures_need_pillow_and_captures_without_pictures_do_not(
     for name in [name for name in sys.modules if name.startswith("PIL.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "PIL", None)
-    assert simulate(tmp_path, **{**SMALL, "count": 1, "sensors": 1}, bev=False, workers=1).written == 1
+    assert simulate(tmp_path, **{**SMALL, "count": 1, "sensors": 1}, bev=False, run=Run(workers=1)).written == 1
 
 
 def test_a_frame_without_its_picture_or_its_times_is_completed(recorded: Path, tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_a_frame_without_its_picture_or_its_times_is_completed(recorded: Path, t
     raw = tmp_path / "copy" / "raw"
     (raw / "bev" / "1.jpg").unlink()
     (raw / "times1.txt").write_text("".join((raw / "times1.txt").read_text().splitlines(keepends=True)[:2]))
-    assert simulate(tmp_path / "copy", **SMALL, workers=1).written == 1
+    assert simulate(tmp_path / "copy", **SMALL, run=Run(workers=1)).written == 1
     assert (raw / "bev" / "1.jpg").read_bytes() == (recorded / "raw" / "bev" / "1.jpg").read_bytes()
     assert Capture(tmp_path / "copy").read_time(2, 1) == pytest.approx(0.2)
 
@@ -202,7 +202,7 @@ def test_a_capture_of_another_version_of_the_town_is_refused(recorded: Path, tmp
 
 
 def test_the_result_counts_the_points_that_were_written_by_class(tmp_path: Path) -> None:
-    result = simulate(tmp_path, **{**SMALL, "count": 1}, bev=False, workers=1)
+    result = simulate(tmp_path, **{**SMALL, "count": 1}, bev=False, run=Run(workers=1))
     scans = [Capture(tmp_path).read(sensor, 0).scan for sensor in (0, 1)]
     assert result.points == sum(map(len, scans)) == sum(result.classes.values())
     labels = np.concatenate([np.asarray(scan.labels) for scan in scans])
@@ -231,5 +231,5 @@ def test_a_run_that_was_killed_before_it_wrote_times_ends_with_the_same_bytes(re
         file = tmp_path / f"raw/times{sensor}.txt"
         file.write_text(file.read_text().splitlines(keepends=True)[1])
     (tmp_path / "raw/pose0/2.npy").unlink()
-    simulate(tmp_path, **SMALL, workers=1)
+    simulate(tmp_path, **SMALL, run=Run(workers=1))
     assert digests(tmp_path) == digests(recorded)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from carlasc import Run
 from carlasc.running.processes import run_all
 from carlasc.storage.files import write_atomic
 
@@ -56,7 +57,7 @@ def write_for_a_minute(path: Path) -> None:
 
 
 def write_in_two_workers(paths: list[Path]) -> None:
-    list(run_all(write_for_a_minute, paths, workers=2))
+    list(run_all(write_for_a_minute, paths, run=Run(workers=2)))
 
 
 def kill_itself_at_three(number: int) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import carlasc
+from carlasc import Run
 from carlasc.captures import find_captures
 from carlasc.converting import convert, load_converter
 from carlasc.converting.registry import exporter_names
@@ -104,13 +105,13 @@ def pack_again(root: Path, attempt: Attempt) -> None:
     """Pack a data set into a store of each kind."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
         for ending in (".zarr", ".h5", ".parquet"):
-            attempt(lambda ending=ending: carlasc.pack(root, Path(out) / f"a{ending}", workers=1))
+            attempt(lambda ending=ending: carlasc.pack(root, Path(out) / f"a{ending}", run=Run(workers=1)))
 
 
 def unpack_again(root: Path, attempt: Attempt) -> None:
     """Unpack the store in a folder."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
-        attempt(lambda: carlasc.unpack(the_only(root), Path(out) / "a", workers=1))
+        attempt(lambda: carlasc.unpack(the_only(root), Path(out) / "a", run=Run(workers=1)))
 
 
 def export_again(root: Path, attempt: Attempt) -> None:
@@ -123,7 +124,7 @@ def export_again(root: Path, attempt: Attempt) -> None:
 def regrid_captures(root: Path, attempt: Attempt) -> None:
     """Make the grids of a capture."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
-        attempt(lambda: carlasc.regrid(root, REGRID_SPEC, out, workers=1))
+        attempt(lambda: carlasc.regrid(root, REGRID_SPEC, out, run=Run(workers=1)))
 
 
 def read_captures(root: Path, attempt: Attempt) -> None:
@@ -210,7 +211,7 @@ def read_reports(root: Path, attempt: Attempt) -> None:
     """Read the reports of grids, write the page of them, and compare them with the files."""
     from carlasc.inspection.report_page import describe, write_report_page
 
-    result = attempt(lambda: carlasc.report(root, grid="made", workers=1))
+    result = attempt(lambda: carlasc.report(root, grid="made", run=Run(workers=1)))
     if result is not None:
         for report in result.reports.values():
             attempt(report.to_json)
@@ -225,8 +226,10 @@ def regrid_again(root: Path, attempt: Attempt) -> None:
     with tempfile.TemporaryDirectory(dir=root.parent) as folder:
         copy = shutil.copytree(root, Path(folder) / "copy")
         observe = carlasc.FromScans(window=(-1, 1))
-        attempt(lambda: carlasc.regrid(copy, REGRID_SPEC, observe=observe, name="made", workers=1))
-        attempt(lambda: carlasc.regrid(copy, REGRID_SPEC, observe=observe, name="made", overwrite=True, workers=1))
+        attempt(lambda: carlasc.regrid(copy, REGRID_SPEC, observe=observe, name="made", run=Run(workers=1)))
+        attempt(
+            lambda: carlasc.regrid(copy, REGRID_SPEC, observe=observe, name="made", overwrite=True, run=Run(workers=1))
+        )
 
 
 def tracks_in(root: Path, attempt: Attempt) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import carlasc
+from carlasc import Run
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import CARLA
@@ -200,8 +201,8 @@ def write_regridded(root: Path) -> None:
     write_split(root, "Val", ["Town01_Light"], 3)
     for frame in range(3):
         FolderSink(root).sequence("Val/Town01_Light/cartesian").write("boxes", frame, _boxes(frame).to_table())
-    carlasc.regrid(root, REGRID_SPEC, observe=carlasc.FromScans(window=(-1, 1)), name="made", workers=1)
-    carlasc.report(root, grid="made", holdout=True, save=True, workers=1)
+    carlasc.regrid(root, REGRID_SPEC, observe=carlasc.FromScans(window=(-1, 1)), name="made", run=Run(workers=1))
+    carlasc.report(root, grid="made", holdout=True, save=True, run=Run(workers=1))
 
 
 def write_archive(root: Path) -> None:

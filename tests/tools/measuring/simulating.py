@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from carlasc import Run
 from carlasc.captures.town.drive import Drive
 from carlasc.captures.town.simulation import simulate
 from measuring.figures import Figure
@@ -30,7 +31,7 @@ def measure_simulation(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]
 
     def frames(count: int) -> None:
         shutil.rmtree(folder / "capture", ignore_errors=True)
-        simulate(folder / "capture", count=count, traffic="heavy", workers=1)
+        simulate(folder / "capture", count=count, traffic="heavy", run=Run(workers=1))
 
     counts = {"one": lambda: frames(1), "more": lambda: frames(1 + _FRAMES)}
     times = by_turns(counts, size.slow_repeats, time.perf_counter)

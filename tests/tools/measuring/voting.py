@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks import test_bench_voting as bench
 from helpers.references.plain_voting import plain_grid, plain_votes
 
+from carlasc import Run
 from carlasc.captures.town.simulation import simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
@@ -93,7 +94,7 @@ def measure_regrid(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         os.environ[VARIABLE] = durable
-        assert not regrid(folder / "capture", spec, out / f"a{kind}", workers=workers).failures
+        assert not regrid(folder / "capture", spec, out / f"a{kind}", run=Run(workers=workers)).failures
 
     cases = {
         "regrid.folder": ("", "yes", 1),

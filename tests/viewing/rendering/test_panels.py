@@ -4,6 +4,7 @@ from helpers.readers.pictures import Image, read_mp4
 from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.scenes.road_blocks import write_blocks
 
+from carlasc import Run
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.viewing import ClassColors, Scene, render
@@ -81,7 +82,7 @@ def test_several_frames_of_several_sources_have_a_row_for_each_source(blocks, mo
 
 
 def test_a_film_shows_the_sources_beside_each_other(blocks, moved, tmp_path, captions):
-    result = render([blocks, moved], tmp_path / "a.mp4", size=(600, 330), workers=1, **OPTIONS)
+    result = render([blocks, moved], tmp_path / "a.mp4", size=(600, 330), run=Run(workers=1), **OPTIONS)
     _, frames = read_mp4(result.out)
     assert (result.frames, len(frames)) == ((0, 1, 2), 3)
     for frame in frames:

@@ -6,6 +6,7 @@ from helpers.readers.pictures import Image, count_gif, read_mp4
 from helpers.readers.pixels import BLUE, RED, blue_pixels, grid_with, middle_of, red_pixels
 from helpers.viewing import draw
 
+from carlasc import Run
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLASC11
@@ -61,7 +62,7 @@ def test_a_range_of_frames_becomes_a_film_that_follows_the_vehicle(drive, tmp_pa
     done = []
     result = draw(
         drive, tmp_path / "a.mp4", frames=(1, 4), view="bev", size=SIZE, ego=False, legend=False,
-        progress=lambda *step: done.append(step),
+        run=Run(1, progress=lambda *step: done.append(step)),
     )  # fmt: skip
     meta, frames = read_mp4(result.out)
     assert (result.frames, len(frames), meta["fps"]) == ((1, 2, 3), 3, 10.0)
@@ -88,7 +89,7 @@ def test_with_a_still_camera_a_static_block_stays_in_place(drive, tmp_path, view
 
 
 def test_two_processes_draw_what_one_draws(drive, tmp_path):
-    one, two = (draw(drive, tmp_path / f"{n}.gif", size=(160, 90), workers=n).out for n in (1, 2))
+    one, two = (draw(drive, tmp_path / f"{n}.gif", size=(160, 90), run=Run(n)).out for n in (1, 2))
     assert one.read_bytes() == two.read_bytes()
 
 
@@ -330,7 +331,7 @@ def test_ctrl_c_leaves_no_file(drive, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        draw(drive, tmp_path / "a.mp4", size=SIZE, progress=stop)
+        draw(drive, tmp_path / "a.mp4", size=SIZE, run=Run(1, progress=stop))
     assert list(tmp_path.iterdir()) == []
 
 

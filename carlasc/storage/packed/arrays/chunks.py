@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import CarlascError, FormatError, describe, import_extra
-from carlasc.running import count_workers
+from carlasc.running import count_cores
 from carlasc.running.interrupts import postponed_interrupts
 from carlasc.storage.arrays import check_size
 from carlasc.storage.transport.trees import Tree
@@ -220,5 +220,5 @@ _scratch = _Scratch()
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
     """Return the threads of this process: after a fork, the object exists in the child, but its threads do not."""
-    threads = 1 if multiprocessing.parent_process() is not None else min(8, count_workers(None))
+    threads = 1 if multiprocessing.parent_process() is not None else min(8, count_cores())
     return ThreadPoolExecutor(threads, thread_name_prefix="carlasc-codec")
