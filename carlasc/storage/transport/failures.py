@@ -19,6 +19,7 @@ TEMPORARY: Mapping[str, tuple[str, ...]] = {
     "requests.exceptions": ("ConnectionError", "ChunkedEncodingError"),
     "http.client": ("IncompleteRead",),
     "httpx": ("TransportError",),
+    "httpx2": ("TransportError",),
 }
 """Errors of the connection by module. Those of a module that no code has imported cannot have been raised."""
 

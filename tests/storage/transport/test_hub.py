@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.datasets.sequences import FRAMES, files_of, write_dataset
 from helpers.servers.hub_server import Hub, hub_server
-from storage.test_zipped import write_zip
+from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc
