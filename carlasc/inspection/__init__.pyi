@@ -2,6 +2,7 @@ from .cards.card import CardResult as CardResult
 from .cards.card import card as card
 from .findings import Finding as Finding
 from .findings import ValidationResult as ValidationResult
+from .heldout import EVERY as EVERY
 from .heldout import HoldoutResult as HoldoutResult
 from .heldout import holdout as holdout
 from .heldout_scores import HeldOutScores as HeldOutScores

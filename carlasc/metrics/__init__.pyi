@@ -35,6 +35,7 @@ from .sampling import Comparison as Comparison
 from .sampling import Interval as Interval
 from .sampling import bootstrap as bootstrap
 from .sampling import compare as compare
+from .scorer import Scoring as Scoring
 from .tables import Table as Table
 from .temporal import Consistency as Consistency
 from .temporal import Forecasting as Forecasting

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import PaletteName as PaletteName  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Color
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError
 from carlasc.metrics.comparison import Outcome
 
-PaletteName = Literal["class", "colorblind", "height"]
 PALETTES: tuple[str, ...] = get_args(PaletteName)
 
 ERRORS = ClassTable(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
 from carlasc.storage import layout
-from carlasc.storage.packed.tables.reading import FRAMES, ParquetSource, opened
+from carlasc.storage.parquet.parquet_source import FRAMES, ParquetSource, opened
 from carlasc.storage.protocol import Sequence
 
 HUB_SPLITS = {"Train": "train", "Val": "validation", "Test": "test"}

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
 from carlasc.core.evidence import VoxelFlag
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.viewing.colors import Entry, as_color, height_colors
 from carlasc.viewing.remapping import RemappedSequence
 from carlasc.viewing.rendering.drawings import Drawing, voxel_drawing
 from carlasc.viewing.scene import SceneReader
-
-GridColor = Literal["class", "confidence", "views", "votes", "inferred"]
-"""What the colours of a grid mean: its classes, or one of the kinds of evidence (see `docs/format.md#evidence`)."""
 
 GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 

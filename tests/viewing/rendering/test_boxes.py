@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.readers.pictures import Image
 from helpers.readers.pixels import RED
-from helpers.viewing import draw
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,6 +12,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z
 from carlasc.core.scans import Scan
 from carlasc.storage.folder import FolderSink
+from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
 from carlasc.viewing.rendering.boxes import box_edges, tight_boxes
 
 pytest.importorskip("embreex")
@@ -98,9 +98,12 @@ def test_annotated_boxes_are_drawn_where_they_are_and_only_in_the_picture(blocks
         np.array([1, 2], np.uint32), np.array([10, 10], np.uint32), poses, np.array([[6.0, 3.0, 2.0]] * 2)
     )
     FolderSink(folder.parent).sequence(folder.name).write("boxes", 0, boxes.to_table())
-    options = {"frames": (0, 1), "view": "bev", "size": (1536, 1536), "ego": False, "legend": False}
-    plain = pixels(draw(folder, tmp_path / "b.png", **options).out)
-    boxed = pixels(draw(folder, tmp_path / "a.png", boxes=True, **options).out)
+    options = {
+        "camera": CameraOptions(view="bev"),
+        "style": StyleOptions(size=(1536, 1536), ego=False, legend=False),
+    }
+    plain = pixels(render(Scene(folder, frames=(0, 1)), tmp_path / "b.png", **options).out)
+    boxed = pixels(render(Scene(folder, frames=(0, 1)), tmp_path / "a.png", boxes=True, **options).out)
     ink = (boxed.max(-1) < 40) & (plain.max(-1) > 100)
     rows, columns = np.flatnonzero(ink.any(1)), np.flatnonzero(ink.any(0))
     scale, middle = 1536 * 0.98 / 51.2, 768  # ahead is up, right is right
@@ -115,10 +118,10 @@ def test_boxes_are_drawn_over_any_content_and_named_in_the_legend(blocks, tmp_pa
     legends = []
     original = pictures.plan_page
     monkeypatch.setattr(pictures, "plan_page", lambda *a, **k: legends.append(k["legend"]) or original(*a, **k))
-    options = {"what": what, "frames": (0, 1), "size": (320, 180), "overwrite": True}
-    plain = pixels(draw(blocks, tmp_path / "a.png", **options).out)
+    options = {"what": what, "overwrite": True, "style": StyleOptions(size=(320, 180))}
+    plain = pixels(render(Scene(blocks, frames=(0, 1)), tmp_path / "a.png", **options).out)
     folder = with_instances(blocks, tmp_path)
-    boxed = pixels(draw(folder, tmp_path / "a.png", boxes=True, **options).out)
+    boxed = pixels(render(Scene(folder, frames=(0, 1)), tmp_path / "a.png", boxes=True, **options).out)
     assert "box, with a bar to its front" not in [entry.name for entry in legends[0]]
     assert legends[1][-1].name == "box, with a bar to its front"
     assert (np.abs(plain - boxed).max(-1) > 60).sum() > 30

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from helpers.readers.pictures import Image
 from helpers.readers.pixels import grid_with, has_color, middle_of
-from helpers.viewing import draw
 
 from carlasc.core.evidence import VoxelFlag
 from carlasc.core.grids import GridSpec
@@ -10,6 +9,7 @@ from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folder import FolderSink
+from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
 from carlasc.viewing.rendering.evidence import evidence_legend
 
 pytest.importorskip("embreex")
@@ -60,8 +60,12 @@ def colors_of(path, legend):
 
 @pytest.mark.parametrize("color", sorted(SHOWN))
 def test_each_block_has_the_colour_of_its_value(certain, tmp_path, color):
-    path = draw(
-        certain, tmp_path / "a.png", frames=(0, 1), color=color, view="bev", ego=False, legend=False, size=(400, 400)
+    path = render(
+        Scene(certain, frames=(0, 1)),
+        tmp_path / "a.png",
+        color=color,
+        camera=CameraOptions(view="bev"),
+        style=StyleOptions(ego=False, legend=False, size=(400, 400)),
     ).out
     columns = colors_of(path, evidence_legend(color))
     assert tuple(sorted(columns, key=columns.get)) == SHOWN[color]  # from left to right
@@ -72,7 +76,11 @@ def test_the_legend_names_what_the_colours_mean(certain, tmp_path, color):
     legend = evidence_legend(color)
     assert len({entry.name for entry in legend}) == len({entry.color for entry in legend}) == len(legend)
     shown = np.asarray(
-        Image.open(draw(certain, tmp_path / "a.png", frames=(0, 1), color=color, size=(900, 500)).out).convert("RGB")
+        Image.open(
+            render(
+                Scene(certain, frames=(0, 1)), tmp_path / "a.png", color=color, style=StyleOptions(size=(900, 500))
+            ).out
+        ).convert("RGB")
     )
     assert all(has_color(shown[400:], entry.color) for entry in legend)
 
@@ -80,30 +88,28 @@ def test_the_legend_names_what_the_colours_mean(certain, tmp_path, color):
 @pytest.mark.parametrize("color", ["confidence", "views", "votes", "inferred"])
 def test_a_frame_without_the_field_is_an_error_that_says_how_to_make_it(certain, tmp_path, color):
     with pytest.raises(MissingDataError, match="found none in 1 of 2 frames, such as frame 1") as caught:
-        draw(certain, tmp_path / "a.gif", frames=(0, 2), color=color)
+        render(Scene(certain, frames=(0, 2)), tmp_path / "a.gif", color=color)
     assert ("--keep-evidence" in str(caught.value)) is (color != "votes")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_colours_of_evidence_need_a_grid_and_a_known_name(certain, tmp_path, blocks):
     with pytest.raises(ArgumentError, match="color: expected class where no grid is shown"):
-        draw(blocks, tmp_path / "a.png", what="scan", color="votes")
+        render(blocks, tmp_path / "a.png", what="scan", color="votes")
     with pytest.raises(ArgumentError, match="color: expected one of"):
-        draw(certain, tmp_path / "a.png", color="entropy")
+        render(certain, tmp_path / "a.png", color="entropy")
 
 
 def test_a_scan_beside_the_grid_keeps_the_colours_of_its_classes(blocks, tmp_path):
     from helpers.readers.pixels import red_pixels
 
-    path = draw(
-        blocks,
+    path = render(
+        Scene(blocks, frames=(0, 1)),
         tmp_path / "a.png",
         what="grid,scan",
         color="votes",
-        view="bev",
-        size=(600, 330),
-        frames=(0, 1),
-        legend=False,
+        camera=CameraOptions(view="bev"),
+        style=StyleOptions(size=(600, 330), legend=False),
     ).out
     left, right = np.array_split(np.asarray(Image.open(path).convert("RGB")), 2, axis=1)
     assert red_pixels(right).any() and not red_pixels(left).any()
