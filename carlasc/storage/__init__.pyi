@@ -1,11 +1,11 @@
 from .downloading import download as download
-from .finishing import finish as finish
 from .folder import FolderSink as FolderSink
 from .folder import FolderSource as FolderSource
 from .metadata import Axes as Axes
 from .metadata import Metadata as Metadata
 from .opening import as_source as as_source
 from .opening import open as open
+from .packing import finish as finish
 from .packing import pack as pack
 from .protocol import Sequence as Sequence
 from .protocol import Source as Source
