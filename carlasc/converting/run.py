@@ -30,9 +30,8 @@ from carlasc.running.spreading import Part, Run
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.remote import check_shared
 from carlasc.storage.sinks import Sink
-from carlasc.storage.targets import LocalTarget
+from carlasc.storage.transport.targets import LocalTarget, check_shared
 
 Grids = GridOptions | Literal["voxels"] | None
 

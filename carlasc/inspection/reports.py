@@ -23,7 +23,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import write_output
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
 

@@ -26,7 +26,7 @@ from carlasc.inspection.trajectory import check_poses, check_times
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default

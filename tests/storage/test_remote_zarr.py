@@ -24,8 +24,7 @@ import carlasc
 from carlasc import Run
 from carlasc.errors import ConflictError
 from carlasc.storage.packing import pack
-from carlasc.storage.remote import RemoteTarget, target_of
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target, target_of
 from carlasc.storage.unpacking import unpack
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink

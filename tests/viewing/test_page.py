@@ -111,7 +111,7 @@ def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     from helpers.scenes.box_street import Street
 
     from carlasc.core.geometry import translation
-    from carlasc.storage.folders.folder import FolderSink
+    from carlasc.storage.folder import FolderSink
 
     rng = np.random.default_rng(0)
     points, labels = Street.random().scan(translation((0, 0, 1.8)), rng, channels=64, columns=2031)

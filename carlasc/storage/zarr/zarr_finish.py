@@ -26,8 +26,7 @@ from carlasc.storage.packed.array_layout import (
 )
 from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.stores import STORE, VERSION, check_names
-from carlasc.storage.remote import target_of
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.zarr.block_tables import block_of, parse_table
 from carlasc.storage.zarr.root import read_root, remove_replaced
 from carlasc.storage.zarr.shards import METADATA, array_metadata, column_metadata, encode_chunk, group_metadata

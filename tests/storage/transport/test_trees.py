@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc.storage.folders.names import leads_outside
-from carlasc.storage.folders.trees import LocalTree
+from carlasc.storage.files import leads_outside
+from carlasc.storage.transport.trees import LocalTree
 
 LARGE = (4 << 20) + 5000  # bytes: enough that a range is mapped
 

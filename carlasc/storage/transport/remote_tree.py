@@ -1,29 +1,22 @@
-"""Trees of files: a local folder or a remote one. They list folders and read ranges of bytes.
-
-No tree keeps a handle open, so that all of them can be pickled, and used on both sides of a fork.
-"""
+"""Folders and files behind a URL: the tree of them, and a remote file as a file object."""
 
 from __future__ import annotations
 
 import copy
-import mmap
+import io
 import os
-import stat
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from carlasc.errors import CarlascError, FormatError, MissingDataError, without_credentials
-from carlasc.storage.folders.blocks import RemoteFile
-from carlasc.storage.folders.bodies import WrongAnswerError
-from carlasc.storage.folders.ranges import check_length, check_size, map_range, shorter
-from carlasc.storage.folders.requests import Request, Requests, bucket_is_missing, fail
+from carlasc.errors import CarlascError, MissingDataError, without_credentials
+from carlasc.storage.transport.failures import WrongAnswerError, bucket_is_missing, fail
+from carlasc.storage.transport.requests import Request, Requests
+from carlasc.storage.transport.servers import check_size
+from carlasc.storage.transport.trees import LocalTree, Tree, check_length, is_url
 
-# Bytes from which on a range is mapped. Reading the megabyte of a scan is faster than touching its mapped pages.
-_MAPPED = 1 << 22
+_BLOCK = 1 << 18  # bytes of a block that a remote file fetches
+_KEPT = 64  # blocks
 
 # What file systems call a digest of a file's content, or the time of its last change.
 _CHANGES = (
@@ -39,135 +32,6 @@ _CHANGES = (
     "created",
     "blob_id",
 )
-
-
-class Tree(ABC):
-    """A folder of files. Paths in it are relative, their parts joined by "/"; "" is the folder itself.
-
-    Attributes:
-        location: its name in errors: a folder, a zip, a URL.
-    """
-
-    location: str
-
-    @abstractmethod
-    def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """Return the names in a folder, each with whether it is a folder; empty if the folder does not exist."""
-
-    @abstractmethod
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Return a file's bytes.
-
-        Args:
-            path: the file.
-            size: the bytes that it has if it is what it should be; None where nothing says it. A packed file of another size is not
-                unpacked.
-
-        Raises:
-            MissingDataError: the file does not exist.
-            FormatError: it cannot be read, or is damaged.
-        """
-
-    @abstractmethod
-    def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes [start, end) of a file; if start is negative, both are counted from the file's end.
-
-        Raises:
-            MissingDataError: the file does not exist.
-            FormatError: the file is shorter.
-        """
-
-    def is_file(self, path: str) -> bool:
-        """Whether a file exists."""
-        folder, _, name = path.rpartition("/")
-        return self.entries(folder).get(name) is False
-
-    def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Return several files' bytes, each of `size` (see `read`); remote trees request all of them at once."""
-        return [self.read(path, size) for path in paths]
-
-    def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
-        """Return several ranges; remote trees request all of them at once."""
-        return [self.read_range(*part) for part in ranges]
-
-    def refresh(self) -> None:  # noqa: B027 (most trees remember nothing)
-        """Forget listings: other processes may have written files since."""
-
-    def where(self, path: str) -> str:
-        """Return the name of a file of the tree in errors."""
-        return f"{self.location}/{path}" if path else self.location
-
-
-class LocalTree(Tree):
-    """A folder on this machine."""
-
-    def __init__(self, root: str | os.PathLike[str], *, mapped: bool = True) -> None:
-        """Take a folder.
-
-        Args:
-            root: the folder.
-            mapped: whether `read` maps files into memory, so that only what is used is read. A file must not be changed in place then.
-        """
-        self.root, self.mapped = Path(root), mapped
-        self.location = str(self.root)
-
-    def below(self, folder: str) -> LocalTree:
-        """Return the tree of a folder in this one."""
-        return LocalTree(self.root / folder, mapped=self.mapped)
-
-    def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """List the folder."""
-        try:
-            with os.scandir(self.root / folder) as found:
-                return {entry.name: entry.is_dir() for entry in found}
-        except (FileNotFoundError, NotADirectoryError):
-            return {}
-        except OSError as error:
-            raise CarlascError(self.where(folder), problem=f"cannot be listed: {error.strerror or error}") from error
-
-    def is_file(self, path: str) -> bool:
-        """Whether the file exists, without listing its folder."""
-        return (self.root / path).is_file()
-
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Read the file, or map it into memory: its bytes are read when they are used."""
-        with self._opened(path) as descriptor:
-            found = os.fstat(descriptor).st_size
-            if not self.mapped:
-                return os.pread(descriptor, found, 0)
-            if found == 0:
-                return b""  # an empty file, such as an empty scan, cannot be mapped
-            return memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
-
-    def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Read the range, or map it into memory if it is large."""
-        with self._opened(path) as descriptor:
-            size = os.fstat(descriptor).st_size
-            if start < 0:
-                start, end = max(0, size + start), size + end
-            if end > size:  # what a damaged table says may be more than fits into memory
-                raise shorter(end - start, max(0, size - start), self.where(path))
-            if end - start >= _MAPPED:
-                return map_range(descriptor, start, end)
-            data = os.pread(descriptor, end - start, start)
-        return check_length(data, end - start, self.where(path))
-
-    @contextmanager
-    def _opened(self, path: str) -> Iterator[int]:
-        path = f"{self.location}/{path}" if path else self.location
-        try:
-            # Opening a pipe would wait for a writer, which may never come.
-            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-            try:
-                if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                    raise FormatError(path, expected="a file", found="a folder, a pipe or a device")
-                yield descriptor
-            finally:
-                os.close(descriptor)
-        except (FileNotFoundError, NotADirectoryError) as error:
-            raise MissingDataError(path, expected="a file", found="nothing") from error
-        except OSError as error:
-            raise FormatError(path, problem=f"cannot be read: {error.strerror or error}") from error
 
 
 class RemoteTree(Tree):
@@ -226,7 +90,7 @@ class RemoteTree(Tree):
     def _own_name(self, folder: str) -> str:
         """Return how listings name the folder itself: object stores list it among its files."""
         place = f"{self._base}/{folder}" if folder else self._base
-        return (place if place.startswith("http") else self.requests.fs._strip_protocol(place)).strip("/")
+        return (place if place.startswith("http") else self.requests.path_of(place)).strip("/")
 
     def refresh(self) -> None:
         """Forget listings: other processes may have written files since."""
@@ -262,7 +126,7 @@ class RemoteTree(Tree):
             return {}
         if isinstance(found, Exception):
             fail(self.where(folder), found)
-        root = self.requests.fs._strip_protocol(self._base).rstrip("/") + "/"
+        root = self.requests.path_of(self._base).rstrip("/") + "/"
         sizes = {}
         for name, about in found.items():
             place = name if name.startswith("/") == root.startswith("/") else f"/{name}"
@@ -376,11 +240,6 @@ class RemoteTree(Tree):
         return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker lists what it needs
 
 
-def is_url(place: object) -> bool:
-    """Whether a place is a URL of another machine or of fsspec, rather than a path; `file://` is a path."""
-    return isinstance(place, str) and "://" in place and not place.startswith("file://")
-
-
 def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_options: Any) -> LocalTree | RemoteTree:
     """Return the tree of files at a path or a URL; nothing is read yet.
 
@@ -391,3 +250,65 @@ def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_opt
     """
     text = os.fspath(place)
     return RemoteTree(text, storage_options) if is_url(text) else LocalTree(text.removeprefix("file://"), mapped=mapped)
+
+
+class RemoteFile(io.RawIOBase):
+    """A remote file as a file object, for libraries that read one: h5py and pyarrow.
+
+    It reads the file block by block, and keeps the blocks that were used last.
+    """
+
+    def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
+        """Remember how to fetch the bytes [start, end) of the file, and its size in bytes; nothing is fetched yet."""
+        self._fetch, self._size, self._place = fetch, size, 0
+        self._blocks: dict[int, bytes] = {}  # the one that was used last is the last one
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move to a place, which is returned."""
+        self._place = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence])
+        return self._place
+
+    def tell(self) -> int:
+        """Return the place in the file."""
+        return self._place
+
+    def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
+        """Read bytes into a buffer, and return how many there were."""
+        view = memoryview(buffer).cast("B")
+        start, end = self._place, min(self._place + len(view), self._size)
+        if start >= end:
+            return 0
+        first, last = start // _BLOCK, (end - 1) // _BLOCK
+        self._load(first, last)
+        data = b"".join(self._blocks[number] for number in range(first, last + 1))
+        view[: end - start] = data[start - first * _BLOCK : end - first * _BLOCK]
+        self._place = end
+        for number in range(first, last + 1):
+            self._blocks[number] = self._blocks.pop(number)
+        while len(self._blocks) > _KEPT:
+            del self._blocks[next(iter(self._blocks))]
+        return end - start
+
+    def _load(self, first: int, last: int) -> None:
+        """Fetch the blocks from `first` to `last` that are not kept, each run of them in one request."""
+        number = first
+        while number <= last:
+            if number in self._blocks:
+                number += 1
+                continue
+            stop = number + 1
+            while stop <= last and stop not in self._blocks:
+                stop += 1
+            data = self._fetch(number * _BLOCK, min(stop * _BLOCK, self._size))
+            for place in range(number, stop):
+                offset = (place - number) * _BLOCK
+                self._blocks[place] = data[offset : offset + _BLOCK]
+            number = stop

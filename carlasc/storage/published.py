@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from carlasc.core.frames import compact, expand
 from carlasc.errors import MissingDataError
 from carlasc.storage import layout
-from carlasc.storage.folders.trees import Tree
 from carlasc.storage.protocol import Sequence, Source, identity_of
+from carlasc.storage.transport.trees import Tree
 
 _DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them, as some zips have it
 _CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage.arrays import check_ratio
-from carlasc.storage.folders.names import leads_outside
-from carlasc.storage.folders.trees import Tree
+from carlasc.storage.files import leads_outside
+from carlasc.storage.transport.trees import Tree
 
 _END = struct.Struct("<4s4H2LH")  # end of central directory record
 _END64_LOCATOR = struct.Struct("<4sLQL")

@@ -11,8 +11,8 @@ from helpers.datasets.sequences import files_of, write_dataset
 import carlasc
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import Source
-from carlasc.storage.folders.trees import LocalTree
-from carlasc.storage.folders.zipped import ZipTree
+from carlasc.storage.transport.trees import LocalTree
+from carlasc.storage.transport.zipped import ZipTree
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 

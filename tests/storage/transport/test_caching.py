@@ -20,10 +20,11 @@ from helpers.servers.range_server import Served, serve_folder
 
 import carlasc
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, StorageError
-from carlasc.storage import Cache, Source, caching
-from carlasc.storage.caching import CachedTree
-from carlasc.storage.folders.trees import RemoteTree
+from carlasc.storage import Cache, Source
 from carlasc.storage.packing import pack
+from carlasc.storage.transport import caching
+from carlasc.storage.transport.caching import CachedTree
+from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 

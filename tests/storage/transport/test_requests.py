@@ -21,13 +21,11 @@ import carlasc
 from carlasc import Run
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, StorageError, without_credentials
 from carlasc.storage import FolderSink
-from carlasc.storage.folders.blocks import RemoteFile
-from carlasc.storage.folders.requests import RemoteSettings
-from carlasc.storage.folders.trees import RemoteTree
 from carlasc.storage.opening import as_sink
 from carlasc.storage.packing import pack
-from carlasc.storage.remote import RemoteTarget, check_shared, target_of
-from carlasc.storage.targets import Target
+from carlasc.storage.transport.remote_tree import RemoteFile, RemoteTree
+from carlasc.storage.transport.requests import RemoteSettings
+from carlasc.storage.transport.targets import RemoteTarget, Target, check_shared, target_of
 from carlasc.testing import SinkContract
 
 pytest.importorskip("s3fs")

@@ -21,7 +21,8 @@ from typing import Any
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
 from carlasc.storage.durability import sync_file
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import LocalTree, Tree
 
 _PIECE = 4 << 20  # bytes of a range that is requested
 _AT_ONCE = 4  # ranges of a file that are requested side by side: they are in memory together
@@ -221,7 +222,7 @@ class CachedTree(Tree):
                 return None
             place = self.cache.path(name)
             try:
-                data = read(_Part(place.parent, self.where(path)), name)
+                data = read(_CacheFolder(place.parent, self.where(path)), name)
             except MissingDataError:
                 self._names.pop(path, None)  # removed to make room: fetched again
                 continue
@@ -281,7 +282,7 @@ class CachedTree(Tree):
         self._forget()
 
 
-class _Part(LocalTree):
+class _CacheFolder(LocalTree):
     """A folder of the cache. Its errors name the remote file."""
 
     def __init__(self, root: Path, named: str) -> None:

@@ -13,8 +13,7 @@ from typing import IO, BinaryIO
 
 from carlasc.errors import ConflictError, FormatError, StorageError, reading
 from carlasc.storage.arrays import check_ratio
-from carlasc.storage.files import remove_stale, write_many
-from carlasc.storage.folders.names import leads_outside
+from carlasc.storage.files import leads_outside, remove_stale, write_many
 
 _BLOCK = 1 << 20  # bytes that are read at once
 _TOGETHER = 32  # files that are synced together

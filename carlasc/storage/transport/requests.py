@@ -2,7 +2,8 @@
 
 Object stores answer some requests with "503 Slow Down", close connections, or send less than they announced. Such requests are sent
 again, after a random time that doubles at each attempt. s3fs and botocore retry too, each by rules of its own, which would multiply:
-their retries are turned off, so that this module alone decides how often and how long. Answers are compared with the range that was asked for.
+their retries are turned off, so that this module alone decides how often and how long. `carlasc.storage.transport.servers` does what differs
+between servers, `carlasc.storage.transport.failures` says which failures are temporary.
 """
 
 from __future__ import annotations
@@ -10,16 +11,28 @@ from __future__ import annotations
 import dataclasses
 import os
 import random
+import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any, TypeVar
 
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, StorageError, import_extra
-from carlasc.storage.folders.bodies import MOST_BYTES, WrongAnswerError, bounded_response, check_range, read_body
-from carlasc.storage.folders.hub import HUB, get_from_hub, is_offline
+from carlasc.errors import ArgumentError, CarlascError, import_extra
+from carlasc.storage.transport.failures import is_temporary
+from carlasc.storage.transport.servers import (
+    HTTP,
+    HUB,
+    S3,
+    bounded_response,
+    get,
+    get_from_hub,
+    http_answer,
+    read_piece,
+    status_error,
+)
 
 _EXTRAS = {  # the package that a scheme needs, and the extra that installs it
     "http": ("aiohttp", "remote"),
@@ -28,15 +41,10 @@ _EXTRAS = {  # the package that a scheme needs, and the extra that installs it
     "s3a": ("s3fs", "remote"),
     HUB: ("huggingface_hub", "hub"),
 }
-_S3, _HTTP = ("s3", "s3a"), ("http", "https")
 _RANDOM = random.SystemRandom()  # of its own: a failure must not change what a program draws, nor two forks wait alike
-_BUSY = frozenset({408, 409, 425, 429})  # of the statuses below 500, those of requests that may succeed later
-_BUSY_CODES = frozenset({"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"})
-_SENT_AGAIN = (  # names of errors of the connection, as aiohttp, botocore, requests and httpx have them
-    "ConnectionError", "ClientConnectionError", "ClientPayloadError", "HTTPClientError", "ResponseParserError", "FlexibleChecksumError",
-    "FSTimeoutError", "IncompleteRead", "IncompleteReadError", "HttpProcessingError", "ChunkedEncodingError",
-    "ResponseStreamingError", "TransferEncodingError", "TransportError",
-)  # fmt: skip
+_PIECE = 256 << 10  # bytes of a body that is read in pieces
+
+_Answer = TypeVar("_Answer")
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,10 @@ class RemoteSettings:
                 raise ArgumentError(name, expected=expected, found=repr(text))
         return cls(**given)
 
+    def draw_wait_s(self, attempts: int) -> float:
+        """Return the wait after so many attempts: at random, so that many clients do not come back at once."""
+        return _RANDOM.uniform(0, min(self.backoff_s * 2.0 ** (attempts - 1), self.longest_wait_s))
+
 
 @dataclass(frozen=True)
 class Request:
@@ -115,7 +127,7 @@ class Requests:
         """
         self.url, self.options = url, dict(options or {})
         self.scheme = url.partition("://")[0]
-        self.is_s3 = self.scheme in _S3
+        self.is_s3 = self.scheme in S3
         self.settings = RemoteSettings.from_environment()
         self._opened: tuple[int, Any] | None = None
         if self.scheme in _EXTRAS:
@@ -136,6 +148,12 @@ class Requests:
             self._opened = (os.getpid(), fs)
         return self._opened[1]
 
+    def path_of(self, url: str) -> str:
+        """Return how the file system names a URL in its listings."""
+        from fsspec.core import url_to_fs
+
+        return str(url_to_fs(url, **self._fsspec_options())[1])
+
     def _fsspec_options(self) -> dict[str, Any]:
         """Return the storage options, with the settings of s3fs and aiohttp that leave retries and listings to this package."""
         timeout, options = self.settings.timeout_s, dict(self.options)
@@ -143,9 +161,9 @@ class Requests:
             config = {"connect_timeout": timeout, "read_timeout": timeout, "retries": {"total_max_attempts": 1}}
             config["max_pool_connections"] = self.settings.requests
             options["config_kwargs"] = config | options.get("config_kwargs", {})
-        if self.scheme in (*_S3, "gs", "gcs"):
+        if self.scheme in (*S3, "gs", "gcs"):
             options.setdefault("use_listings_cache", False)  # trees keep listings, and know what was written
-        if self.scheme in _HTTP:
+        if self.scheme in HTTP:
             from aiohttp import ClientTimeout
 
             silence = ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
@@ -164,8 +182,7 @@ class Requests:
         waiting = list(range(len(requests)))
         for attempt in range(attempts):
             if attempt:
-                longest = min(self.settings.backoff_s * 2 ** (attempt - 1), self.settings.longest_wait_s)
-                time.sleep(_RANDOM.uniform(0, longest))  # at random, so that many clients do not come back at once
+                time.sleep(self.settings.draw_wait_s(attempt))
             for place, answer in zip(waiting, self._send_once([requests[i] for i in waiting]), strict=True):
                 answers[place] = answer
             waiting = [i for i in waiting if isinstance(answers[i], BaseException) and is_temporary(answers[i])]
@@ -175,6 +192,65 @@ class Requests:
             if isinstance(answer, BaseException) and not isinstance(answer, Exception):
                 raise answer  # an interruption
         return answers
+
+    def persist(
+        self, work: Callable[[], _Answer], count: Callable[[], int] = lambda: 0, stop: threading.Event | None = None
+    ) -> _Answer:
+        """Call a function that sends a request, and again after failures that may be temporary, as `send` does.
+
+        Args:
+            work: the function.
+            count: returns how many bytes have arrived: attempts count anew where there are more than before.
+            stop: ends the waiting when it is set.
+
+        Returns:
+            What `work` returns.
+
+        Raises:
+            Exception: the error of the last attempt.
+        """
+        attempts, before = 0, count()
+        while True:
+            try:
+                return work()
+            except Exception as error:
+                arrived = count()
+                attempts, before = (1 if arrived > before else attempts + 1), arrived
+                if attempts >= self.settings.attempts or not is_temporary(error):
+                    raise
+                if (stop or threading.Event()).wait(self.settings.draw_wait_s(attempts)):
+                    raise
+
+    @contextmanager
+    def answer(self, headers: Mapping[str, str]) -> Iterator[HttpAnswer]:
+        """Ask a web server for the file once, and yield its answer, of which the body is read in pieces.
+
+        Args:
+            headers: those of the request.
+
+        Raises:
+            CarlascError: the request was redirected in a circle, to no web server, or from https to http.
+            Exception: the server cannot be reached (an error of aiohttp).
+        """
+        from fsspec.asyn import sync
+
+        fs, answer = self.fs, None
+
+        async def begin() -> tuple[Any, bytes, Exception | None]:
+            found = await http_answer(fs, self.url, {"Accept-Encoding": "identity", **headers})
+            try:
+                return found, await read_piece(found.content, _PIECE), status_error(found)
+            except BaseException:
+                found.close()
+                raise
+
+        try:
+            answer, first, error = sync(fs.loop, begin)
+            more = partial(sync, fs.loop, read_piece, answer.content, _PIECE)
+            yield HttpAnswer(answer.status, answer.reason or "", answer.headers, first, more, error)
+        finally:
+            if answer is not None:
+                fs.loop.call_soon_threadsafe(answer.close)
 
     def _send_once(self, requests: Sequence[Request]) -> list[Any]:
         fs = self.fs
@@ -193,6 +269,34 @@ class Requests:
         return self.__dict__ | {"_opened": None}
 
 
+@dataclass(frozen=True)
+class HttpAnswer:
+    """The answer of a web server.
+
+    Attributes:
+        status: its status.
+        reason: what the server calls it.
+        headers: its headers; case does not matter.
+        first: the first bytes of the body.
+        more: returns the next bytes, none at the end of the body.
+        error: that of aiohttp, where the status is 400 or more.
+    """
+
+    status: int
+    reason: str
+    headers: Mapping[str, str]
+    first: bytes
+    more: Callable[[], bytes]
+    error: Exception | None
+
+    def pieces(self) -> Iterator[bytes]:
+        """Yield the body."""
+        piece = self.first
+        while piece:
+            yield piece
+            piece = self.more()
+
+
 async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings, scheme: str) -> list[Any]:
     import asyncio  # here, because it takes a twentieth of a second, which commands on local files need not wait
 
@@ -201,7 +305,7 @@ async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings
     async def one(request: Request) -> Any:
         async with gate:
             if request.name == "get":
-                answer = await _get(fs, scheme, str(request.url), settings.timeout_s, **request.options)
+                answer = await get(fs, scheme, str(request.url), settings.timeout_s, **request.options)
             else:
                 answer = await getattr(fs, f"_{request.name}")(*request.arguments(), **request.options)
             if request.check is not None:
@@ -223,163 +327,3 @@ def _plain_call(fs: Any, settings: RemoteSettings, request: Request) -> Any:
     except Exception as error:  # noqa: BLE001 (each file system raises its own types)
         return error
     return answer
-
-
-def _get(
-    fs: Any, scheme: str, url: str, patience_s: float, start: int | None = None, end: int | None = None
-) -> Awaitable[bytes]:
-    """Return the bytes [start, end) of a file, or the whole file; from a web server that sends them within reason."""
-    if scheme in _S3:
-        return _get_s3(fs, url, start, end)
-    if scheme in _HTTP:
-        return _get_http(fs, url, start, end, patience_s)
-    return fs._cat_file(url, start=start, end=end)
-
-
-async def _get_s3(fs: Any, url: str, start: int | None, end: int | None) -> bytes:
-    bucket, key, version = fs.split_path(fs._strip_protocol(url))
-    wanted: dict[str, Any] = {"Bucket": bucket, "Key": key} | ({"VersionId": version} if version else {})
-    if start is not None and end is not None:
-        wanted["Range"] = f"bytes={start}-{end - 1}"
-    try:
-        answer = await fs._call_s3("get_object", fs.req_kw, **wanted)
-    except OSError as error:
-        if _status_and_code(error)[0] == 416:  # the range starts behind the end of the file
-            return b""
-        raise
-    async with answer["Body"] as body:
-        data = bytes(await body.read())
-    if start is not None:
-        check_range(answer.get("ContentRange"), start, end)
-    return data
-
-
-async def _get_http(fs: Any, url: str, start: int | None, end: int | None, patience_s: float) -> bytes:
-    session = await fs.set_session()
-    settings = dict(fs.kwargs)
-    headers = dict(settings.pop("headers", {}))
-    if start is not None and end is not None:
-        headers["Range"] = f"bytes={start}-{end - 1}"
-    async with session.get(fs.encode_url(url), headers=headers, **settings) as answer:
-        if answer.status == 416:
-            return b""
-        fs._raise_not_found_for_status(answer, url)
-        if start is not None and answer.status != 206:
-            raise WrongAnswerError("the whole file instead of a range")
-        most = MOST_BYTES if start is None or end is None else end - start
-        data = await read_body(answer.content, most, patience_s)
-    if start is not None:
-        check_range(answer.headers.get("Content-Range"), start, end)
-    return data
-
-
-def is_temporary(error: BaseException) -> bool:
-    """Whether a request that failed with an error may succeed when it is sent again."""
-    if is_offline(error):
-        return False
-    if _is_of_connection(error):
-        return True
-    status, code = _status_and_code(error)
-    if code in _BUSY_CODES or status in _BUSY:
-        return True
-    if status is not None:
-        return status >= 500 and status != 501  # not implemented
-    return isinstance(error, WrongAnswerError | TimeoutError | ConnectionError)
-
-
-def _is_of_connection(error: BaseException) -> bool:
-    return any(kind.__name__ in _SENT_AGAIN for kind in type(error).__mro__)
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    found: BaseException | None = error
-    for _ in range(5):
-        if found is None:
-            return
-        yield found
-        found = found.__cause__
-
-
-def _status_and_code(error: BaseException) -> tuple[int | None, str]:
-    """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), where it has them."""
-    for cause in (
-        () if _is_of_connection(error) else _causes(error)
-    ):  # aiohttp's errors of payloads have a "code" of their own
-        answer = getattr(cause, "response", None)
-        if isinstance(answer, Mapping):  # botocore
-            status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode")
-            code = str(answer.get("Error", {}).get("Code", ""))
-            return (status if isinstance(status, int) else None), code
-        for holder, name in ((cause, "status"), (cause, "code"), (answer, "status_code")):
-            found = getattr(holder, name, None)
-            if isinstance(found, int) and 100 <= found < 600:
-                return found, ""
-    return None, ""
-
-
-def exists_error(error: object) -> bool:
-    """Whether a create-only put failed because the file exists."""
-    return isinstance(error, FileExistsError) or (
-        isinstance(error, BaseException) and _status_and_code(error)[0] == 412
-    )
-
-
-def bucket_is_missing(error: BaseException) -> bool:
-    """Whether the bucket of an S3 URL does not exist."""
-    return _status_and_code(error)[1] == "NoSuchBucket"
-
-
-def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn:
-    """Raise the error of a request as one line that holds no credentials.
-
-    The messages of other libraries are left out: they may hold a URL's signature or a key. For the same reason, the error has no cause.
-
-    Raises:
-        MissingDataError: the file or the bucket does not exist.
-        StorageError: it cannot be written (where `writing`).
-        CarlascError: anything else.
-    """
-    if isinstance(error, CarlascError):
-        raise error
-    status, code = _status_and_code(error)
-    kind: type[CarlascError] = StorageError if writing else CarlascError
-    verb = "cannot be written" if writing else "cannot be read"
-    if code == "NoSuchBucket":
-        raise (StorageError if writing else MissingDataError)(
-            where, expected="a bucket that exists", found="no such bucket", advice="check its name, or create it"
-        ) from None
-    if isinstance(error, FileNotFoundError) and not writing:
-        raise MissingDataError(where, expected="a file", found="nothing") from None
-    if isinstance(error, PermissionError) or status in (401, 403):
-        raise kind(
-            where,
-            problem=f"{verb}: access was refused ({code or status or 'no permission'})",
-            advice="check the credentials and what they are permitted to do",
-        ) from None
-    if "Credential" in type(error).__name__:
-        raise kind(
-            where,
-            problem=f"{verb}: no credentials were found",
-            advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a public bucket",
-        ) from None
-    if is_offline(error):
-        raise kind(where, problem=f"{verb}: HF_HUB_OFFLINE is set", advice="unset it to use the network") from None
-    if is_temporary(error):
-        raise kind(
-            where,
-            problem=f"{verb}: the server failed at each attempt, last with {_describe(error)}",
-            advice="try again later",
-        ) from None
-    raise kind(where, problem=f"{verb}: {_describe(error)}") from None
-
-
-def _describe(error: BaseException) -> str:
-    status, code = _status_and_code(error)
-    if isinstance(error, WrongAnswerError):
-        return str(error)
-    parts = [str(status) if status else "", code if code != str(status) else ""]
-    if text := " ".join(part for part in parts if part):
-        return text
-    reason = getattr(error, "strerror", None)
-    name = type(error).__name__
-    return f"{name} ({reason})" if isinstance(reason, str) and type(error).__module__ == "builtins" else name

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
 from helpers.servers.object_store import faulty_server
-from storage.test_zipped import write_zip
+from storage.transport.test_zipped import write_zip
 
 import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError

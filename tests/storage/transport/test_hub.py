@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from helpers.datasets.sequences import FRAMES, files_of, write_dataset
 from helpers.servers.hub_server import Hub, hub_server
-from storage.test_zipped import write_zip
+from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, DependencyError, MissingDataError
 from carlasc.storage import FolderSource, Source
-from carlasc.storage.remote import RemoteTarget
+from carlasc.storage.transport.targets import RemoteTarget
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 

@@ -1,23 +1,104 @@
-"""`download`: fetches the published zips and, if asked to, extracts them."""
+"""`download`: fetches the published zips and, if asked to, extracts them.
+
+`ARCHIVES` is the table of the published zips (see the format page, `docs/format.md#layout`).
+"""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeGuard
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError
-from carlasc.storage.downloads.archives import SEQUENCES, Archive, choose_archives
-from carlasc.storage.downloads.extraction import check_space, extract_zip, extracted_size
-from carlasc.storage.downloads.http import RemoteFile
-from carlasc.storage.downloads.transfer import TransferSettings, discard_record, find_file, remaining_bytes, transfer
 from carlasc.storage.durability import make_folder, remove_file
+from carlasc.storage.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.files import parse_json, remove_stale, write_json, writing
+from carlasc.storage.transport.fetching import FileFetch
 
 Progress = Callable[[int, int], None]
+
+
+_S3 = "https://curly-dataset-public.s3.us-east-2.amazonaws.com/CARLA"
+SEQUENCES = "sequences"
+
+
+@dataclass(frozen=True)
+class Archive:
+    """One zip.
+
+    Attributes:
+        name: file name.
+        what: "sequences" (scans, poses, coarse Cartesian grids), or grids alone: "fine", "cylindrical".
+        split: "train", "val", "test"; None if it holds all of them.
+        url: its URL.
+        gigabytes: its approximate size.
+    """
+
+    name: str
+    what: str
+    split: str | None
+    url: str
+    gigabytes: float
+
+    @property
+    def folder(self) -> str:
+        """Folder that it is extracted to, inside the one that the user chose.
+
+        The grids' zips have folders of their own: in them, the grids have the same names as the coarse grids of the sequences.
+        """
+        return "." if self.what == SEQUENCES else self.name.removesuffix(".zip")
+
+
+ARCHIVES = (
+    Archive("train_cartesian_13.zip", SEQUENCES, "train", f"{_S3}/train_cartesian_13.zip", 40.3),
+    Archive("train_cartesian_46.zip", SEQUENCES, "train", f"{_S3}/train_cartesian_46.zip", 39.7),
+    Archive("val_cartesian.zip", SEQUENCES, "val", f"{_S3}/val_cartesian.zip", 14.9),
+    Archive("test_cartesian.zip", SEQUENCES, "test", f"{_S3}/test_cartesian.zip", 14.6),
+    Archive("eval_fine.zip", "fine", None, f"{_S3}/eval_fine.zip", 4.3),
+    Archive(
+        "eval_cylindrical.zip",
+        "cylindrical",
+        None,
+        "https://www.dropbox.com/s/eb074zjfilri1ka/eval_cylindrical.zip?dl=1",
+        3.8,
+    ),
+)
+
+
+def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
+    """Return the zips of some splits, or of some grids.
+
+    Args:
+        splits: "train", "val", "test" or "all", in any case; none for grids, whose zips hold all splits.
+        what: "sequences", "fine" or "cylindrical".
+
+    Raises:
+        ArgumentError: `splits` or `what` is unknown, or a split is given for grids.
+    """
+    kinds = tuple(dict.fromkeys(archive.what for archive in ARCHIVES))
+    if what not in kinds:
+        raise ArgumentError("what", expected=f"one of {', '.join(kinds)}", found=repr(what))
+    known = tuple(dict.fromkeys(archive.split for archive in ARCHIVES if archive.split))
+    wanted = {split.lower() for split in splits}
+    if unknown := wanted - {*known, "all"}:
+        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found=", ".join(sorted(unknown)))
+    if what != SEQUENCES and wanted - {"all"}:
+        raise ArgumentError(
+            "split",
+            expected=f"none with {what} grids",
+            found=", ".join(sorted(wanted)),
+            advice="leave it out: one zip holds the grids of all splits",
+        )
+    if what == SEQUENCES and not wanted:
+        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found="none")
+    return tuple(
+        archive
+        for archive in ARCHIVES
+        if archive.what == what and (archive.split is None or archive.split in wanted or "all" in wanted)
+    )
 
 
 @dataclass(frozen=True)
@@ -62,7 +143,7 @@ def download(
     extract: bool = False,
     keep: bool = False,
     base_url: str | None = None,
-    settings: TransferSettings | None = None,
+    connections: int = 4,
     progress: Progress | None = None,
 ) -> DownloadResult:
     """Fetch the published zips of one or more splits, or of the other grids. Called again, it continues where it stopped.
@@ -76,14 +157,14 @@ def download(
         extract: extract each zip into `out` (grids into a folder of their own there), then remove it.
         keep: with `extract`, keep the zip too.
         base_url: fetch from `<base_url>/<name>`, a mirror.
-        settings: number of connections, size of blocks, waiting times.
+        connections: number of blocks of a zip that are fetched at once.
         progress: called with the bytes done and their total, zip by zip: first those fetched, then those extracted.
 
     Returns:
         What was fetched, and where it is.
 
     Raises:
-        ArgumentError: `split`, `what` or `keep` make no sense.
+        ArgumentError: `split`, `what`, `keep` or `connections` make no sense.
         MissingDataError: the server does not have the file.
         ConflictError: another file has the name of a zip.
         FormatError: what the server sends is not a zip, or keeps changing.
@@ -91,7 +172,8 @@ def download(
         CarlascError: the server cannot be reached; what was fetched stays, and the next call continues with it.
     """
     began = time.perf_counter()
-    settings = settings or TransferSettings()
+    if connections < 1:
+        raise ArgumentError("connections", expected="1 or more", found=str(connections))
     if keep and not extract:
         raise ArgumentError("keep", expected="`extract=True` with it", found="it alone", advice="zips are kept anyway")
     archives = choose_archives([split] if isinstance(split, str) else split, what)
@@ -101,8 +183,8 @@ def download(
         remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
     pending = [archive for archive in archives if done.get(archive) is None]
-    files = {archive: find_file(_url(archive, base_url), settings) for archive in pending}
-    _check_space(folder, files, extract, settings)
+    fetches = {archive: FileFetch(_url(archive, base_url), folder / archive.name, connections) for archive in pending}
+    _check_space(folder, fetches, extract)
     results = []
     for archive in archives:
         before = done.get(archive)
@@ -111,23 +193,25 @@ def download(
                 _remove_left(folder / archive.name, before.size)
             results.append(before)
             continue
-        fetched = _fetch(folder / archive.name, files[archive], settings, progress, 2e9 * archive.gigabytes)
-        result = Downloaded(archive.name, str(folder / archive.name), files[archive].size, fetched)
+        fetch = fetches[archive]
+        fetched = _fetch(folder / archive.name, fetch, progress, 2e9 * archive.gigabytes)
+        result = Downloaded(archive.name, str(folder / archive.name), fetch.file.size, fetched)
         results.append(_extract(result, folder, archive, keep, progress) if extract else result)
     return DownloadResult(tuple(results), time.perf_counter() - began)
 
 
-def _fetch(path: Path, file: RemoteFile, settings: TransferSettings, progress: Progress | None, most: float) -> int:
+def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float) -> int:
     """Fetch a zip of at most `most` bytes unless it exists; returns the number of bytes fetched."""
+    size = fetch.file.size
     if path.exists():
-        if file.size is not None and path.stat().st_size != file.size:
+        if size is not None and path.stat().st_size != size:
             raise ConflictError(
                 path,
-                expected=f"nothing, or the zip of {file.size} bytes",
+                expected=f"nothing, or the zip of {size} bytes",
                 found=f"{path.stat().st_size} bytes",
                 advice="move it away, or choose another folder",
             )
-        discard_record(path)  # of a run that was ended before it could
+        fetch.discard_record()  # of a run that was ended before it could
         return 0
     count = 0
 
@@ -135,9 +219,9 @@ def _fetch(path: Path, file: RemoteFile, settings: TransferSettings, progress: P
         nonlocal count
         count += number
         if progress is not None:
-            progress(count, file.size or count)
+            progress(count, fetch.file.size or count)
 
-    resumed = transfer(file, path, settings, advance, most)
+    resumed = fetch.run(advance, most)
     return path.stat().st_size - resumed
 
 
@@ -190,13 +274,12 @@ def _record(folder: Path, archive: Archive) -> Path:
     return folder / f"{archive.name}.unpacked.json"
 
 
-def _check_space(folder: Path, files: dict[Archive, RemoteFile], extract: bool, settings: TransferSettings) -> None:
+def _check_space(folder: Path, fetches: dict[Archive, FileFetch], extract: bool) -> None:
     """Check the free space for all bytes to fetch; the extracted files of a zip take about as much again."""
     needed = 0
-    for archive, file in files.items():
-        path = folder / archive.name
-        needed += 0 if path.exists() else remaining_bytes(file, path, settings)
-        needed += (file.size or 0) if extract else 0
+    for archive, fetch in fetches.items():
+        needed += 0 if (folder / archive.name).exists() else fetch.remaining()
+        needed += (fetch.file.size or 0) if extract else 0
     check_space(folder, needed, "for the zips and the files in them" if extract else "for the zips")
 
 
