@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.reporting.actors import Actor
+from carlasc.groundtruth.reporting.facts import ActorTrack
 from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
 from carlasc.inspection.reports import ReportResult
 from carlasc.storage.files import write_output
@@ -73,7 +73,7 @@ def describe(report: Report) -> list[tuple[str, str]]:
     return rows
 
 
-def _count(actors: Sequence[Actor]) -> str:
+def _count(actors: Sequence[ActorTrack]) -> str:
     if not actors:
         return "none that moves"
     labels = [actor.label for actor in actors]
@@ -146,7 +146,7 @@ def _bars(rows: Sequence[tuple[str, float]]) -> str:
     return _svg(720, len(rows) * _ROW, lines)
 
 
-def _timeline(actors: Sequence[Actor], frames: Sequence[int]) -> str:
+def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
     """Return one line per actor, from its first to its last sighting; it is the paler the more frames in between do not show it."""
     first = min([*(actor.first for actor in actors), *frames[:1]])
     last = max([*(actor.last for actor in actors), *frames[-1:]])
@@ -172,7 +172,7 @@ def _svg(width: int, height: int, lines: Sequence[str]) -> str:
     )
 
 
-def _actor_table(actors: Sequence[Actor]) -> str:
+def _actor_table(actors: Sequence[ActorTrack]) -> str:
     header = [
         "class",
         "instance",

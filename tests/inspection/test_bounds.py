@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.grids import GridSpec
-from carlasc.inspection.bounds import GroundBelow
+from carlasc.inspection.agreement import GroundBelow
 from carlasc.inspection.validation import validate
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.testing.drives import SimulatedDrive

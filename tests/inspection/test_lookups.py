@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.inspection.lookups import KNOWN, OCCUPIED, RIGHT, Voxels
+from carlasc.inspection.agreement import KNOWN, OCCUPIED, RIGHT, Voxels
 
 PI32 = float(np.float32(np.pi))
 SPECS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
-from carlasc.inspection.matching import add_squares, flat_cells, match
+from carlasc.inspection.misfit import add_squares, flat_cells, match
 
 POINTS = np.random.default_rng(0).uniform(-9, 9, (3000, 3)) * (1, 1, 0.2)
 

@@ -7,8 +7,7 @@ import pytest
 
 from carlasc.core.geometry import invert, rotation_z, slerp, translation
 from carlasc.inspection.alignment import diagnose_poses
-from carlasc.inspection.matching import match, residual
-from carlasc.inspection.misfit import LeverArm, Misfit, describe_misfit
+from carlasc.inspection.misfit import LeverArm, Misfit, describe_misfit, match, residual
 from carlasc.inspection.structure import upright
 from carlasc.testing.drives import SimulatedDrive, Thing
 

@@ -7,8 +7,7 @@ import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.inspection.alignment import choose_pairs, diagnose_poses
-from carlasc.inspection.overlap import occupancy, overlap
-from carlasc.inspection.structure import MAX_RANGE_M, MIN_RANGE_M, within
+from carlasc.inspection.structure import MAX_RANGE_M, MIN_RANGE_M, occupancy, overlap, within
 
 POINTS = np.random.default_rng(0).uniform(-32, 32, (20_000, 3)) * (1, 1, 0.05)
 

@@ -32,7 +32,7 @@ from carlasc.groundtruth.inputs import (
     scan_fields,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting.actors import Residual
+from carlasc.groundtruth.reporting.facts import Residual
 from carlasc.motion import LONGEST_M
 from carlasc.running.options import Run
 from carlasc.storage import as_source, layout

@@ -14,9 +14,8 @@ from carlasc.errors import ArgumentError, ConflictError, DependencyError, Format
 from carlasc.inspection.cards.croissant import WRITER, croissant
 from carlasc.inspection.cards.facts import Details, Facts, gather
 from carlasc.inspection.cards.licenses import license_given
-from carlasc.inspection.cards.places import place_of
+from carlasc.inspection.cards.places import place_of, tables_of
 from carlasc.inspection.cards.readme import readme
-from carlasc.inspection.cards.tables import tables_of
 from carlasc.running.options import Run
 from carlasc.storage import as_source
 from carlasc.storage.files import parse_json, write_output

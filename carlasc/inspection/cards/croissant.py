@@ -9,9 +9,8 @@ from typing import Any
 from urllib.parse import quote
 
 from carlasc.inspection.cards.facts import MOTIONSC, Details, Facts, shares
-from carlasc.inspection.cards.places import Place
+from carlasc.inspection.cards.places import Place, PublishedTable, split_of
 from carlasc.inspection.cards.responsibility import collection, made, responsibility
-from carlasc.inspection.cards.tables import Table, split_of
 from carlasc.storage import layout
 
 Json = dict[str, Any]
@@ -42,7 +41,9 @@ _TYPES = {  # of columns, by their names in pyarrow
 }  # fmt: skip
 
 
-def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Table], description: str) -> bytes:
+def croissant(
+    facts: Facts, details: Details, place: Place, tables: Sequence[PublishedTable], description: str
+) -> bytes:
     """Return the bytes of croissant.json."""
     licenses = [license_.url for license_ in facts.licenses]
     content: Json = {
@@ -89,7 +90,7 @@ def _activity(label: str, text: str) -> Json:
     return {"@type": "prov:Activity", "prov:label": label, "sc:description": text}
 
 
-def _files(facts: Facts, place: Place, tables: Sequence[Table]) -> Iterable[Json]:
+def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iterable[Json]:
     """Yield the files: each whole file with its checksum, and sets of files by their patterns."""
     inside: Json = {}
     if place.repository:
@@ -221,7 +222,7 @@ def _inline(name: str, meaning: str, fields: Sequence[tuple[str, str, str]], row
     }
 
 
-def _record_set(table: Table) -> Json:
+def _record_set(table: PublishedTable) -> Json:
     """Return the record set of a table: one field per column."""
     return {
         "@type": "cr:RecordSet",

@@ -10,7 +10,7 @@ from typing import Any
 
 from carlasc.errors import printable
 from carlasc.inspection.cards.facts import MOTIONSC, Details, Facts, shares
-from carlasc.inspection.cards.places import Place
+from carlasc.inspection.cards.places import Place, PublishedTable
 from carlasc.inspection.cards.responsibility import (
     annotation,
     biases,
@@ -21,7 +21,6 @@ from carlasc.inspection.cards.responsibility import (
     responsibility,
     uses,
 )
-from carlasc.inspection.cards.tables import Table
 from carlasc.inspection.overview import GridOverview, SequenceOverview
 from carlasc.storage.layout import EVALUATION
 
@@ -33,7 +32,7 @@ def readme(
     facts: Facts,
     details: Details,
     place: Place,
-    tables: Sequence[Table],
+    tables: Sequence[PublishedTable],
     description: str,
     pictures: Sequence[tuple[str, str]],
 ) -> bytes:
@@ -54,7 +53,7 @@ def readme(
     return (_front_matter(facts, details, place, tables) + "\n\n".join(sections) + "\n").encode()
 
 
-def _front_matter(facts: Facts, details: Details, place: Place, tables: Sequence[Table]) -> str:
+def _front_matter(facts: Facts, details: Details, place: Place, tables: Sequence[PublishedTable]) -> str:
     names = list(dict.fromkeys(license_.hub for license_ in facts.licenses))
     others = [license_ for license_ in facts.licenses if license_.hub == "other"]
     values: dict[str, Any] = {"license": names[0] if len(names) == 1 else names}
@@ -145,7 +144,7 @@ def _grid(grid: GridOverview) -> str:
     )
 
 
-def _opening(facts: Facts, place: Place, tables: Sequence[Table]) -> str:
+def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> str:
     name, first = place.name or ".", facts.overview.sequences[0]
     extra = {"zarr": "[zarr]", "hdf5": "[hdf5]", "parquet": "[parquet]"}.get(facts.overview.store, "")
     target = place.repository and f"hf://datasets/{place.repository.partition('/datasets/')[2]}" + (
