@@ -62,6 +62,7 @@ def card(
     """
     from carlasc.errors import MissingDataError
     from carlasc.inspection.cards.card import card as write
+    from carlasc.inspection.cards.facts import CardDetails
 
     if citation is not None and not citation.is_file():
         raise MissingDataError(citation, expected="a BibTeX file", found="nothing")
@@ -69,15 +70,17 @@ def card(
         result = write(
             source,
             out,
-            name=name,
-            description=description,
-            authors=author or (),
-            license=license,
-            citation=None if citation is None else citation.read_text(errors="replace"),
-            url=url,
-            contact=contact,
-            version=version,
-            published=published,
+            about=CardDetails(
+                name=name,
+                description=description,
+                authors=author or (),
+                license=license,
+                citation=None if citation is None else citation.read_text(errors="replace"),
+                url=url,
+                contact=contact,
+                version=version,
+                published=published,
+            ),
             pictures=pictures,
             every=every,
             run=Run(workers=workers or 1, progress=progress),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.plain import from_plain
+from carlasc.core.versions import carlasc_version
 from carlasc.errors import FormatError, reading
 from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, actors_of, digest_of_bytes
 from carlasc.storage.files import parse_json, to_json
@@ -336,10 +337,8 @@ def _digests(rows: list[FrameFacts], name: str) -> Digests:
 def _versions() -> dict[str, str]:
     import numba
 
-    from carlasc import __version__
-
     return {
-        "carlasc": __version__,
+        "carlasc": carlasc_version(),
         "numpy": np.__version__,
         "numba": numba.__version__,
         "python": platform.python_version(),
