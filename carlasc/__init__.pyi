@@ -13,6 +13,7 @@ from . import testing as testing
 from . import viewing as viewing
 from .captures import record as record
 from .captures import simulate as simulate
+from .converting import LayoutOptions as LayoutOptions
 from .converting import convert as convert
 from .converting import export as export
 from .core import Boxes as Boxes
@@ -38,6 +39,7 @@ from .inspection import info as info
 from .inspection import report as report
 from .inspection import stats as stats
 from .inspection import validate as validate
+from .metrics import Scoring as Scoring
 from .metrics import evaluate as evaluate
 from .metrics import scores as scores
 from .running import Run as Run
@@ -49,7 +51,9 @@ from .storage import finish as finish
 from .storage import open as open
 from .storage import pack as pack
 from .storage import unpack as unpack
+from .viewing import CameraOptions as CameraOptions
 from .viewing import Scene as Scene
+from .viewing import StyleOptions as StyleOptions
 from .viewing import render as render
 from .viewing import view as view
 

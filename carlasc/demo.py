@@ -17,7 +17,7 @@ from carlasc.running.options import Run
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
     from carlasc.inspection.statistics import Statistics
-    from carlasc.viewing import Scene
+    from carlasc.viewing import CameraOptions, Scene
 
 Progress = Callable[[int, int], None]
 """Takes (done, total)."""
@@ -112,8 +112,8 @@ def demonstrate(
     pictures = []
     with step("draw") as progress:
         jobs = _list_pictures(out, grids, count - 1)
-        for number, (path, scene, what, side) in enumerate(jobs, 1):
-            render(scene, path, what=what, view=side, overwrite=True)
+        for number, (path, scene, what, camera) in enumerate(jobs, 1):
+            render(scene, path, what=what, camera=camera, overwrite=True)
             pictures.append(path)
             progress(number, len(jobs))
     page = out / "page.html"
@@ -132,17 +132,17 @@ def _demo_grids() -> dict[str, GridSpec]:
     }
 
 
-def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, str]]:
-    """Return file, scene, contents and view of each picture."""
-    from carlasc.viewing import Scene
+def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, CameraOptions]]:
+    """Return file, scene, contents and camera of each picture."""
+    from carlasc.viewing import CameraOptions, Scene
 
     coarse, fine, cylindrical = (Scene(grid, frames=(frame, frame + 1)) for grid in grids)
     return [
-        (out / "coarse.png", coarse, "grid", "perspective"),
-        (out / "fine.png", fine, "grid", "perspective"),
-        (out / "cylindrical.png", cylindrical, "grid", "perspective"),
-        (out / "birdseye.png", fine, "grid", "bev"),
-        (out / "scan.png", coarse, "scan", "perspective"),
+        (out / "coarse.png", coarse, "grid", CameraOptions()),
+        (out / "fine.png", fine, "grid", CameraOptions()),
+        (out / "cylindrical.png", cylindrical, "grid", CameraOptions()),
+        (out / "birdseye.png", fine, "grid", CameraOptions(view="bev")),
+        (out / "scan.png", coarse, "scan", CameraOptions()),
     ]
 
 

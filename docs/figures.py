@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from carlasc.captures import Drive
+from carlasc.captures import TownDrive
 from carlasc.core.geometry import relative_to
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, REMAPS
@@ -139,7 +139,7 @@ FIGURES: dict[str, Callable[[], bytes]] = {
 @cache
 def _observations() -> list[Observation]:
     """Return what twenty LiDARs see of one simulated frame."""
-    drive = Drive(seed=2, traffic="heavy")
+    drive = TownDrive(seed=2, traffic="heavy")
     recordings = [drive.record(FRAME, sensor) for sensor in range(SENSORS)]
     ego = recordings[0].world_T_sensor
     return [

@@ -21,6 +21,7 @@ from carlasc_converters.exporters.opensceneflow import CATEGORIES
 from typer.models import ArgumentInfo, ParameterInfo
 
 from carlasc import cli
+from carlasc.cli.flags import flatten
 from carlasc.core.benchmarks import IGNORED, OCC3D, SSCBENCH, TO_OCC3D, TO_SSCBENCH
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
@@ -59,7 +60,7 @@ def command_names() -> list[str]:
 
 def options_of(command: str) -> str:
     """Return the section of a command's page that lists its arguments and options, by the panels of its `--help`."""
-    function = getattr(importlib.import_module(f"carlasc.cli.{command}"), command)
+    function = flatten(getattr(importlib.import_module(f"carlasc.cli.{command}"), command))
     panels: dict[str, list[str]] = {}
     for row, panel in _parameters(function):
         panels.setdefault(panel, []).append(row)

@@ -12,8 +12,8 @@ import carlasc
 from carlasc import Run
 from carlasc.converting import Cloud, Sensor
 from carlasc.converting.assembling import Rig, assemble
-from carlasc.converting.scans import make_fields
-from carlasc.converting.target import Target
+from carlasc.converting.layout_options import AxesAndClasses
+from carlasc.converting.scan_stage import make_fields
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans
@@ -95,7 +95,7 @@ def test_a_converter_passes_it_on(rings):
     numbers = np.arange(5, dtype=np.uint16)
     cloud = Cloud(np.ones((5, 4), np.float32), others={"rings": numbers, "flow": np.ones((5, 3), np.float32)})
     scan = assemble([cloud], Rig((Sensor(),), np.eye(4)), None, "a")
-    fields = make_fields(scan, Target(CARLA, None, mirrored=True), "a")
+    fields = make_fields(scan, AxesAndClasses(CARLA, None, mirrored=True), "a")
     assert np.array_equal(fields["rings"], numbers)
     assert fields["flow"].tolist() == [[1, -1, 1]] * 5
 

@@ -59,6 +59,15 @@ def test_no_room_imports_one_below_it():
             assert not below, f"{path.relative_to(ROOT)} imports {', '.join(below)}"
 
 
+def test_rooms_import_rooms_and_not_the_top_package():
+    for room in ("converting", "testing"):
+        for path in (PACKAGE / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = {alias.name for alias in node.names} if isinstance(node, ast.Import | ast.ImportFrom) else set()
+                from_top = isinstance(node, ast.ImportFrom) and node.module == "carlasc" and not names <= set(rooms())
+                assert not (isinstance(node, ast.Import) and "carlasc" in names) and not from_top, path
+
+
 def test_converters_and_examples_use_no_private_name():
     for path in [*(ROOT / "converters").rglob("*.py"), *(ROOT / "examples").rglob("*.py")]:
         private = re.findall(r"from carlasc[\w.]* import .*\b_\w+", path.read_text())

@@ -37,14 +37,15 @@ GOOD = {
         for path, sequence in source.sequences().items():
             voxels: int = sequence.grid("evaluation", 0).labels.size
         spec = GridSpec.published().with_resolution([0.2])
-        result = carlasc.regrid("CarlaSC", spec, workers=1)
+        result = carlasc.regrid("CarlaSC", spec, run=carlasc.Run(workers=1))
         made: int = result.made
         carlasc.render("CarlaSC", "scene.png")
         """,
     "convert": """
         import carlasc
 
-        result = carlasc.convert("kitti", "SemanticKITTI", "out", classes="semantickitti", axes="right", grids="none")
+        layout = carlasc.LayoutOptions(classes="semantickitti", axes="right")
+        result = carlasc.convert("kitti", "SemanticKITTI", "out", layout=layout, grids=None)
         failed: list[str] = [failure.message for failure in result.failures]
         written: dict[str, str] = carlasc.export("kitti", "out", "back").sequences
         """,
@@ -55,7 +56,7 @@ BAD = {  # every line from the third is an error
 
         carlasc.Dataset("CarlaSC", histroy=5)
         carlasc.convert("kitti", "in", "out", axis="left")
-        carlasc.convert("kitti", "in", "out", axes="up")
+        carlasc.LayoutOptions(axes="up")
         carlasc.regrid("CarlaSC", worker=1)
         carlasc.no_such_name
         """

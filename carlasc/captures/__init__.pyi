@@ -1,13 +1,13 @@
 from .carla.recording import RecordResult as RecordResult
 from .carla.recording import record as record
 from .carla.server import ServerError as ServerError
-from .lidar import Lidar as Lidar
 from .raw import Capture as Capture
-from .raw import Recording as Recording
+from .raw import SensorRecording as SensorRecording
 from .raw import find_captures as find_captures
+from .settings import Lidar as Lidar
 from .settings import TrafficLevel as TrafficLevel
-from .town.actors import Actor as Actor
-from .town.drive import Drive as Drive
+from .town.actors import TownActor as TownActor
+from .town.drive import TownDrive as TownDrive
 from .town.simulated import SimulatedCapture as SimulatedCapture
 from .town.simulation import SimulationResult as SimulationResult
 from .town.simulation import simulate as simulate

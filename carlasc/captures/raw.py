@@ -1,6 +1,8 @@
 """The raw capture: recordings of many sensors, from which ground truth is made (see the format page, `docs/format.md#raw-capture`).
 
-Sensor 0 is the ego sensor. `carlasc.captures.names` has the names of the files, `carlasc.captures.writing` writes them.
+Sensor 0 is the ego sensor. The files in the folder raw/, which `carlasc.captures.writing` writes, are:
+
+velodyne{s}/{f}.npy  labels{s}/  instances{s}/  velocities{s}/  pose{s}/  times{s}.txt  bev/{f}.jpg
 """
 
 from __future__ import annotations
@@ -15,20 +17,76 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.names import FOLDERS, FORMATS, RAW, array_path, bev_path, parse_times, times_path
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.scans import Scan, check_finite
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc.storage.arrays import parse_npy
+from carlasc.storage.arrays import ArrayFormat, parse_npy
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, tree_of
+
+RAW = "raw"
+"""Name of the folder that holds a capture, in the folder of its sequence."""
+
+FOLDERS = {  # value -> folder, to which the sensor's number is appended
+    "points": "velodyne",
+    "labels": "labels",
+    "instances": "instances",
+    "velocities": "velocities",
+    "pose": "pose",
+}
+FORMATS = {
+    "points": ArrayFormat(("<f4",), (None, 3)),
+    "labels": ArrayFormat(("<u4",), (None,)),
+    "instances": ArrayFormat(("<u4",), (None,)),
+    "velocities": ArrayFormat(("<f8",), (None, 4)),
+    "pose": ArrayFormat(("<f8",), (4, 4)),
+}
+_BEV = "bev"
+
+
+def array_path(name: str, sensor: int, frame: int) -> str:
+    """Return the path of one value, such as "points", of a sensor in a frame."""
+    return f"{FOLDERS[name]}{sensor}/{frame}.npy"
+
+
+def times_path(sensor: int) -> str:
+    """Return the path of a sensor's times file."""
+    return f"times{sensor}.txt"
+
+
+def bev_path(frame: int) -> str:
+    """Return the path of a frame's bird's-eye picture."""
+    return f"{_BEV}/{frame}.jpg"
+
+
+def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, str]]:
+    """Return the time in seconds and the line of each frame of a times file. Where a frame has several lines, the last one is valid.
+
+    Raises:
+        FormatError: a line of the file is not in CARLA's form; `where` names the file.
+    """
+    found: dict[int, tuple[float, str]] = {}
+    for number, line in enumerate(bytes(data).decode(errors="replace").splitlines(), 1):
+        match = re.match(r"\s*([0-9]{1,18})\s*,.*\belapsed_seconds=([-+0-9.eE]+)", line)
+        try:
+            if match is None:
+                raise ValueError("another form")
+            found[int(match[1])] = float(match[2]), line
+        except ValueError as error:
+            raise FormatError(
+                where,
+                expected="'<frame>, Timestamp(...,elapsed_seconds=...)'",
+                found=f"{line[:60]!r} in line {number}",
+            ) from error
+    return found
+
 
 _SEARCH_DEPTH = 3  # levels: <root>/<split>/<sequence>, and one folder around them
 
 
 @dataclass(frozen=True)
-class Recording:
+class SensorRecording:
     """What one sensor recorded in one frame.
 
     Attributes:
@@ -119,7 +177,7 @@ class Capture:
             raise MissingDataError(self.location, expected="frames such as velodyne0/100.npy", found="none")
         return np.array(sorted(found), np.int64)
 
-    def read(self, sensor: int, frame: int) -> Recording:
+    def read(self, sensor: int, frame: int) -> SensorRecording:
         """Read what a sensor recorded in a frame; its files are requested together. The arrays may be read-only.
 
         Raises:
@@ -141,7 +199,7 @@ class Capture:
                     found=str(len(arrays[name])),
                 )
         scan = Scan(arrays["points"], labels=arrays["labels"], instances=arrays["instances"])
-        return Recording(scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"])
+        return SensorRecording(scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"])
 
     def read_pose(self, sensor: int, frame: int) -> Transform:
         """Return the (4, 4) float64 world_T_sensor of a frame.

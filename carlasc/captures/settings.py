@@ -1,14 +1,17 @@
-"""Settings that the simulated town and a CARLA server share."""
+"""What the simulated town and a CARLA server share: the model of the LiDARs and where they are mounted, traffic, bird's-eye pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, get_args
+from dataclasses import dataclass
+from functools import cached_property
+from typing import get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.choices import TrafficLevel as TrafficLevel  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError
-
-TrafficLevel = Literal["light", "medium", "heavy"]
-"""How much traffic a town has."""
 
 TRAFFIC: Mapping[TrafficLevel, int] = {"light": 25, "medium": 50, "heavy": 100}
 """Number of moving vehicles per level of traffic, and of pedestrians."""
@@ -43,3 +46,82 @@ def check_traffic(traffic: str) -> None:
     """
     if traffic not in TRAFFIC:
         raise ArgumentError("traffic", expected=f"one of {', '.join(get_args(TrafficLevel))}", found=repr(traffic))
+
+
+EGO_SENSOR_M = (-0.5, 0.0, 1.8)
+"""Offset of sensor 0, the ego sensor, in the vehicle's frame."""
+
+MAX_OFFSET_M = 20.0
+"""The other sensors are at most this far from the vehicle's origin, along x and along y."""
+
+HEIGHTS_M = (1.0, 5.0)
+"""Lowest and highest z of the other sensors, in the vehicle's frame."""
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """The model of a spinning LiDAR. The defaults are those of the data set (see the format page, `docs/format.md#raw-capture`).
+
+    Attributes:
+        channels: number of channels, one above the other.
+        points: number of rays per scan, all channels together. Every channel has the same number.
+        range_m: greatest distance of a return.
+        upper_deg: elevation of the highest channel.
+        lower_deg: elevation of the lowest channel.
+        noise_m: greatest error of a coordinate. Errors are uniform.
+
+    Raises:
+        ArgumentError: a value is out of its range.
+    """
+
+    channels: int = 64
+    points: int = 130_000
+    range_m: float = 50.0
+    upper_deg: float = 2.0
+    lower_deg: float = -25.0
+    noise_m: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.channels < 1:
+            raise ArgumentError("channels", expected="at least 1", found=str(self.channels))
+        if self.points < self.channels:
+            raise ArgumentError(
+                "points", expected=f"at least one per channel ({self.channels})", found=str(self.points)
+            )
+        if not 0 < self.range_m < 1000:
+            raise ArgumentError("range_m", expected="more than 0 and less than 1000 m", found=str(self.range_m))
+        if not -90 <= self.lower_deg <= self.upper_deg <= 90:
+            raise ArgumentError(
+                "upper_deg",
+                expected="-90 <= lower_deg <= upper_deg <= 90",
+                found=f"{self.lower_deg} and {self.upper_deg}",
+            )
+        if not 0 <= self.noise_m < np.inf:
+            raise ArgumentError("noise_m", expected="0 m or more", found=str(self.noise_m))
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """(R, 3) unit vectors of the rays in the sensor's frame.
+
+        Channels follow each other from the highest to the lowest. The azimuth of a channel's rays grows from -pi: x towards y.
+        """
+        elevation = np.radians(np.linspace(self.upper_deg, self.lower_deg, self.channels))[:, None]
+        columns = self.points // self.channels
+        azimuth = np.linspace(-np.pi, np.pi, columns, endpoint=False)[None, :]
+        rays = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
+        return np.stack(rays, axis=-1).reshape(-1, 3)
+
+
+def sensor_offsets(sensors: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw where the sensors are mounted.
+
+    Args:
+        sensors: number of sensors.
+        rng: source of the random numbers.
+
+    Returns:
+        (sensors, 3) float64 offsets in the vehicle's frame, metres. The first is the ego sensor's, which is always the same; the
+        others are uniform in their box.
+    """
+    low, high = (-MAX_OFFSET_M, -MAX_OFFSET_M, HEIGHTS_M[0]), (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1])
+    return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (sensors - 1, 3))])

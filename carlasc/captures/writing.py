@@ -11,8 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.names import FOLDERS, FORMATS, RAW, array_path, bev_path, parse_times, times_path
-from carlasc.captures.raw import Recording
+from carlasc.captures.raw import FOLDERS, FORMATS, RAW, SensorRecording, array_path, bev_path, parse_times, times_path
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
@@ -105,7 +104,7 @@ class CaptureWriter:
         """
         return frozenset.intersection(*(frozenset(self._times_of(sensor)) for sensor in range(sensors)))
 
-    def write(self, sensor: int, frame: int, recording: Recording) -> None:
+    def write(self, sensor: int, frame: int, recording: SensorRecording) -> None:
         """Write what a sensor recorded in a frame. Existing files are replaced.
 
         Raises:

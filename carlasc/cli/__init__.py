@@ -5,15 +5,19 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator, MutableMapping
-from typing import Annotated, Any
+from collections.abc import Iterator, MutableMapping, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
-from carlasc.cli.common import CommandGroup, echo
-from carlasc.cli.late_help import load_help
-from carlasc.first_use import note_compiling
+from carlasc.cli.commands import Command, CommandGroup
+from carlasc.cli.common import echo
+from carlasc.cli.flags import flatten
+from carlasc.core.first_use import note_compiling
+
+if TYPE_CHECKING:
+    from carlasc.converting import OptionDeclaration
 
 _COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
     "demo",
@@ -40,7 +44,8 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
 
 _SETTINGS: dict[str, Any] = {
     "pretty_exceptions_enable": False,
-    "context_settings": {"help_option_names": ["-h", "--help"]},
+    "rich_markup_mode": None,  # help is plain text, which takes half the time
+    "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 120},
 }
 
 
@@ -54,9 +59,7 @@ class _Commands(MutableMapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         if self._loaded[name] is None:
-            single = typer.Typer(add_completion=False, **_SETTINGS)
-            single.command(name, cls=_Command)(_function(name))
-            self._loaded[name] = _without_flag_types(typer.main.get_command(single))
+            self._loaded[name] = make_command(name)
         return self._loaded[name]
 
     def __setitem__(self, name: str, command: Any) -> None:
@@ -72,50 +75,54 @@ class _Commands(MutableMapping[str, Any]):
         return len(self._loaded)
 
 
-def _function(name: str) -> Callable[..., None]:
-    """Return the function of a command."""
-    function: Callable[..., None] = getattr(importlib.import_module(f"carlasc.cli.{name}"), name)
-    return function
+def make_command(name: str, declared: Sequence[OptionDeclaration] = ()) -> Any:
+    """Return a command.
+
+    Args:
+        name: its name.
+        declared: the options that a converter or an exporter declares.
+    """
+    module = _module(name)
+    takes_declared = hasattr(module, "declared_options")
+    single = typer.Typer(add_completion=False, **_SETTINGS)
+    cls = _DeclaringCommand if takes_declared and not declared else Command
+    single.command(name, cls=cls)(flatten(getattr(module, name), declared))
+    return typer.main.get_command(single)
 
 
-def _without_flag_types(command: Any) -> Any:
-    """Remove the type from the help of flags: "--overwrite <bool>" would mean that a value follows."""
-    for parameter in command.params:
-        if getattr(parameter, "is_flag", False):
-            parameter.metavar = ""
-    return command
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"carlasc.cli.{name}")
 
 
-class _Command(TyperCommand):
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        load_help()
-        super().format_help(ctx, formatter)
+class _DeclaringCommand(Command):
+    """A command that has the options of the converter or exporter that it is given, beside its own."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read the arguments, with the options of the converter or exporter that they name."""
+        name = self.name or ""
+        declared = _module(name).declared_options(args)
+        if not declared:
+            return super().make_context(info_name, args, parent, **extra)
+        return make_command(name, declared).make_context(info_name, args, parent, **extra)
 
 
 class _Group(CommandGroup):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.commands = _Commands()
-        _without_flag_types(self)
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)
 
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help. It shows the first lines of commands alone, so their options are not made."""
-        load_help()
-        commands, self.commands = (
-            self.commands,
-            {name: _Command(name, help=_function(name).__doc__) for name in self.commands},
-        )
-        super().format_help(ctx, formatter)
-        self.commands = commands
+    def summary(self, name: str) -> str:
+        """Return what a command does. Its options are not made for that."""
+        text: str = getattr(_module(name), name).__doc__
+        return " ".join(text.partition("\n\n")[0].split())
 
 
 app = typer.Typer(
     name="carlasc",
     cls=_Group,
-    no_args_is_help=True,
     **_SETTINGS,
     help="Read, convert, regenerate and score CarlaSC data: complete, trace-free semantic scenes.",
 )

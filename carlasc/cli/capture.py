@@ -3,41 +3,64 @@
 from __future__ import annotations
 
 import signal
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import typer
 
-from carlasc.cli.capture_options import (
-    BevOption,
-    ChannelsOption,
-    CountOption,
-    OutArgument,
-    PointsOption,
-    RangeOption,
-    SeedOption,
-    SensorsOption,
-    TrafficOption,
-)
-from carlasc.cli.common import Json, echo, print_json, progress_bar
+import carlasc
+from carlasc.cli.common import Json, echo, place_argument, print_json, progress_bar
+from carlasc.cli.flags import Flags
+from carlasc.core.choices import TrafficLevel
+
+OutArgument = Annotated[
+    str, place_argument("Folder of the sequence, or its URL: the capture is written to OUT/raw.", "OUT")
+]
+
+
+@dataclass(frozen=True)
+class SensorFlags(Flags):
+    """What drives and what records it: the same in `simulate` and in `capture`."""
+
+    heading: ClassVar[str] = "Traffic and sensors"
+
+    sensors: Annotated[int, typer.Option(help="Number of LiDARs. The first is the ego sensor.", min=1)] = 20
+    seed: Annotated[int, typer.Option(help="Seed of all random choices: traffic, sensor positions, noise.", min=0)] = 0
+    traffic: Annotated[
+        TrafficLevel,
+        typer.Option(help="Amount of traffic: 25, 50 or 100 moving vehicles, and as many pedestrians."),
+    ] = "medium"
+    channels: Annotated[int, typer.Option(help="Number of channels of each LiDAR.", min=1)] = 64
+    points: Annotated[int, typer.Option(help="Number of rays per scan, all channels together.", min=1)] = 130_000
+    range_m: Annotated[float, typer.Option("--range", help="Range of each LiDAR in metres.")] = 50.0
+    bev: Annotated[bool, typer.Option("--bev/--no-bev", help="Write bird's-eye pictures.")] = True
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of `carlasc.simulate` and `carlasc.record` that they give."""
+        lidar = carlasc.captures.Lidar(self.channels, self.points, self.range_m)
+        return {"sensors": self.sensors, "seed": self.seed, "traffic": self.traffic, "lidar": lidar, "bev": self.bev}
+
+
+@dataclass(frozen=True)
+class ServerFlags(Flags):
+    """The CARLA server."""
+
+    heading: ClassVar[str] = "CARLA server"
+
+    host: Annotated[str, typer.Option(help="Host of the CARLA server.")] = "127.0.0.1"
+    port: Annotated[int, typer.Option(help="RPC port of the server.", min=1, max=65535)] = 2000
+    traffic_port: Annotated[int, typer.Option(help="Port of the traffic manager.", min=1, max=65535)] = 8000
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", help="Longest time that the server may take to answer, in seconds.", min=1)
+    ] = 60.0
+    town: Annotated[str, typer.Option(help="Map to drive in.")] = "Town01"
 
 
 def capture(
+    server: ServerFlags,
+    sensors: SensorFlags,
     out: OutArgument,
-    host: Annotated[str, typer.Option(help="Host of the CARLA server.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="RPC port of the server.", min=1, max=65535)] = 2000,
-    traffic_port: Annotated[int, typer.Option(help="Port of the traffic manager.", min=1, max=65535)] = 8000,
-    timeout_s: Annotated[
-        float, typer.Option("--timeout", help="Longest time that the server may take to answer, in seconds.", min=1)
-    ] = 60.0,
-    town: Annotated[str, typer.Option(help="Map to drive in.")] = "Town01",
-    count: CountOption = 2000,
-    sensors: SensorsOption = 20,
-    seed: SeedOption = 0,
-    traffic: TrafficOption = "medium",
-    channels: ChannelsOption = 64,
-    points: PointsOption = 130_000,
-    range_m: RangeOption = 50.0,
-    bev: BevOption = True,
+    count: Annotated[int, typer.Option(help="Number of frames, 0.1 s apart.", min=1)] = 2000,
     json: Json = False,
 ) -> None:
     """Record a drive on a running CARLA server as a raw capture.
@@ -45,25 +68,9 @@ def capture(
     A second run with the same options replays the drive and writes only the frames that are missing. At the end, also after an
     error or Ctrl-C, the actors are destroyed and the settings of the server are restored.
     """
-    from carlasc import captures
-
     signal.signal(signal.SIGTERM, _interrupt)  # clean up the server also when a batch system ends the command
     with progress_bar("capture") as progress:
-        result = captures.record(
-            out,
-            host=host,
-            port=port,
-            traffic_port=traffic_port,
-            timeout_s=timeout_s,
-            town=town,
-            count=count,
-            sensors=sensors,
-            seed=seed,
-            traffic=traffic,
-            lidar=captures.Lidar(channels, points, range_m),
-            bev=bev,
-            progress=progress,
-        )
+        result = carlasc.record(out, **vars(server), count=count, **sensors.arguments(), progress=progress)
     if json:
         print_json(result)
         return

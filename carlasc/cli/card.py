@@ -2,16 +2,59 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
-from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, progress_bar, report_failures
-from carlasc.running.options import Run
+import carlasc
+from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, report_failures
+from carlasc.cli.flags import Flags, OneWorkerFlags
+from carlasc.errors import MissingDataError
+
+
+@dataclass(frozen=True)
+class DetailFlags(Flags):
+    """What the data themselves do not say."""
+
+    heading: ClassVar[str] = "What the data do not say"
+
+    name: Annotated[str | None, typer.Option(help="Name of the data set; that of the source if not given.")] = None
+    description: Annotated[str | None, typer.Option(help="What it is, in a sentence or two.")] = None
+    authors: Annotated[
+        list[str] | None, typer.Option("--author", help="Who publishes it; give it once for each author.")
+    ] = None
+    license: Annotated[
+        str | None,
+        typer.Option(
+            help="Licence of the sequences whose carlasc.json names none, such as cc-by-4.0, or the address of its text."
+        ),
+    ] = None
+    citation: Annotated[
+        Path | None, file_option("--citation", metavar="FILE", text="A BibTeX file that says how to cite the data.")
+    ] = None
+    url: Annotated[
+        str | None,
+        typer.Option(help="Page where the data are published, such as https://huggingface.co/datasets/ORG/NAME."),
+    ] = None
+    contact: Annotated[str | None, typer.Option(help="Whom to ask.")] = None
+    version: Annotated[str, typer.Option("--data-version", help="Version of the data.")] = "1.0.0"
+    published: Annotated[
+        str | None, typer.Option(metavar="YYYY-MM-DD", help="Date of the publication; today if not given.")
+    ] = None
+
+    def details(self) -> carlasc.CardDetails:
+        """Return what the card says of them."""
+        if self.citation is not None and not self.citation.is_file():
+            raise MissingDataError(self.citation, expected="a BibTeX file", found="nothing")
+        citation = None if self.citation is None else self.citation.read_text(errors="replace")
+        return carlasc.CardDetails(**{**vars(self), "authors": self.authors or (), "citation": citation})
 
 
 def card(
+    details: DetailFlags,
+    work: OneWorkerFlags,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     out: Annotated[
         Path | None,
@@ -23,36 +66,10 @@ def card(
             " folder that they are in.",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the data set; that of the source if not given.")] = None,
-    description: Annotated[str | None, typer.Option(help="What it is, in a sentence or two.")] = None,
-    author: Annotated[
-        list[str] | None, typer.Option("--author", help="Who publishes it; give it once for each author.")
-    ] = None,
-    license: Annotated[
-        str | None,
-        typer.Option(
-            help="Licence of the sequences whose carlasc.json names none, such as cc-by-4.0, or the address of its text."
-        ),
-    ] = None,
-    citation: Annotated[
-        Path | None, file_option("--citation", metavar="FILE", text="A BibTeX file that says how to cite the data.")
-    ] = None,
-    url: Annotated[
-        str | None,
-        typer.Option(help="Page where the data are published, such as https://huggingface.co/datasets/ORG/NAME."),
-    ] = None,
-    contact: Annotated[str | None, typer.Option(help="Whom to ask.")] = None,
-    version: Annotated[str, typer.Option("--data-version", help="Version of the data.")] = "1.0.0",
-    published: Annotated[
-        str | None, typer.Option(metavar="YYYY-MM-DD", help="Date of the publication; today if not given.")
-    ] = None,
     pictures: Annotated[
         bool, typer.Option("--pictures/--no-pictures", help="Draw a grid and a scan, with the extra `render`.")
     ] = True,
     every: Annotated[int, typer.Option(metavar="N", help="Count the classes of every N-th frame.")] = 1,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)
-    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing card.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -60,32 +77,9 @@ def card(
 
     The licence of data that were converted holds for what was made from them; data whose licence forbids passing them on are refused.
     """
-    from carlasc.errors import MissingDataError
-    from carlasc.inspection.cards.card import card as write
-    from carlasc.inspection.cards.facts import CardDetails
-
-    if citation is not None and not citation.is_file():
-        raise MissingDataError(citation, expected="a BibTeX file", found="nothing")
-    with progress_bar("Counting") as progress:
-        result = write(
-            source,
-            out,
-            about=CardDetails(
-                name=name,
-                description=description,
-                authors=author or (),
-                license=license,
-                citation=None if citation is None else citation.read_text(errors="replace"),
-                url=url,
-                contact=contact,
-                version=version,
-                published=published,
-            ),
-            pictures=pictures,
-            every=every,
-            run=Run(workers=workers or 1, progress=progress),
-            overwrite=overwrite,
-        )
+    about = details.details()
+    with work.spread("Counting", usual=1) as run:
+        result = carlasc.card(source, out, about=about, pictures=pictures, every=every, overwrite=overwrite, run=run)
     if as_json:
         print_json(result.to_dict())
     else:

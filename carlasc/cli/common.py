@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
-from typer.core import TyperGroup
 
-from carlasc.errors import ArgumentError, CarlascError, printable
+from carlasc.errors import ArgumentError, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
     from carlasc.core.frames import FrameRange
-    from carlasc.running import Engine, Part
 else:
     FrameRange = object  # only an annotation here: importing it loads NumPy, for which `--help` would wait
 
@@ -30,10 +27,6 @@ _Number = TypeVar("_Number", int, float)
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
-_INTERRUPTED = "interrupted: files written so far are complete; run the same command again to continue"
-_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
-
-_OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also one that lost a slash; a drive has one letter
 
 
@@ -102,95 +95,7 @@ def file_option(*flags: str, text: str, **settings: Any) -> Any:
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
-Workers = Annotated[
-    int | None, typer.Option(help="Processes that work side by side; if not given, one per core.", min=1)
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        "--cluster",
-        metavar="WHERE",
-        help="Work on a Dask cluster: local or local:N (processes here), tcp://HOST:PORT (a scheduler), slurm (with --workers jobs),"
-        " or the dotted path of a class that starts one.",
-    ),
-]
-PartOption = Annotated[
-    str | None,
-    typer.Option(
-        "--part",
-        metavar="I/N",
-        help="Do only the I-th of N parts; other commands do the others, on any machine that reaches the output.",
-    ),
-]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
-
-
-class CommandGroup(TyperGroup):
-    """Turns errors of the library into one line on stderr and an exit code."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run a command. Exit codes: 1 if the work failed, 2 for a wrong argument, 130 if it was interrupted."""
-        try:
-            return super().invoke(ctx)
-        except CarlascError as error:
-            options, shown = self._options(ctx), copy.copy(error)
-            if isinstance(error, ArgumentError):
-                shown.where = options.get(error.where, error.where)
-            message = _replace_arguments(str(shown), options)
-            fail(message, WRONG_USAGE if isinstance(error, ArgumentError) else FAILED)
-        except _BatchError as error:
-            for message in error.messages:
-                echo(f"carlasc: {_replace_arguments(message, self._options(ctx))}", err=True)
-            fail(str(error))
-        except KeyboardInterrupt:
-            fail(_INTERRUPTED, INTERRUPTED)
-        except (SystemError, ValueError) as error:
-            # Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
-            if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
-                raise
-            fail(_INTERRUPTED, INTERRUPTED)
-        except BrokenPipeError:  # `carlasc info | head`
-            sys.stderr.close()
-            raise typer.Exit(FAILED) from None
-        except OSError as error:  # of a file that the library reads or writes in passing
-            fail(f"{error.filename or 'the file system'}: {error.strerror or error}")
-
-    def _options(self, ctx: Any) -> dict[str, str]:
-        """Return what a user types for each parameter of the command that runs, by its name."""
-        command = self.commands.get(ctx.invoked_subcommand or "")
-        return {} if command is None else {p.name: _typed(p) for p in command.params if p.name}
-
-
-def parse_part(text: str | None) -> Part:
-    """Return the part that `--part` names, or the whole.
-
-    Raises:
-        ArgumentError: it is not of the form I/N.
-    """
-    from carlasc.running import Part
-
-    return Part() if text is None else Part.parse(text)
-
-
-def _typed(parameter: Any) -> str:
-    """Return what a user types for a parameter: `--frames`, or `SOURCE`."""
-    longest = max(parameter.opts, key=len)
-    return longest if longest.startswith("-") else (parameter.metavar or longest).upper()
-
-
-def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
-    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite` ``, where there is such an option."""
-
-    def replace(match: re.Match[str]) -> str:
-        name, value = match[1], match[2]
-        if name not in options:
-            return match[0]
-        if value in ("True", None):
-            return f"`{options[name]}`"
-        value = _OPTIONS.sub(r"\1", value).strip('"')
-        return f"`{options[name]} {value}`"
-
-    return _ARGUMENT.sub(replace, text)
 
 
 def echo(text: object, *, err: bool = False, nl: bool = True) -> None:
@@ -211,7 +116,7 @@ def fail(message: str, code: int = FAILED) -> None:
     raise typer.Exit(code)
 
 
-class _BatchError(Exception):
+class BatchError(Exception):
     """Parts of a batch failed; `messages` say which and why."""
 
     def __init__(self, summary: str, messages: list[str]) -> None:
@@ -229,19 +134,7 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
     """
     if failures:
         summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
-        raise _BatchError(summary, [message for _, message in failures])
-
-
-@contextmanager
-def engine(cluster: str | None, workers: int | None) -> Iterator[Engine | None]:
-    """Yield what does the work: the cluster of the option `--cluster`, or None for processes on this machine."""
-    if cluster is None:
-        yield None
-    else:
-        from carlasc.running import open_cluster
-
-        with open_cluster(cluster, workers=workers) as opened:
-            yield opened
+        raise BatchError(summary, [message for _, message in failures])
 
 
 @contextmanager
@@ -340,19 +233,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, set | frozenset):
         return sorted(value)
     raise TypeError(f"no JSON for {type(value).__name__}")
-
-
-def parse_options(given: list[str] | None) -> dict[str, str]:
-    """Return the values of options given as NAME=VALUE, by name. A dash in a name is an underscore, as in other options.
-
-    Raises:
-        ArgumentError: one has no =, or is given twice.
-    """
-    options: dict[str, str] = {}
-    for entry in given or []:
-        text, equals, value = entry.partition("=")
-        name = text.strip().replace("-", "_")
-        if not equals or not name or name in options:
-            raise ArgumentError("--option", expected="NAME=VALUE, each name once", found=repr(entry))
-        options[name] = value
-    return options

@@ -2,158 +2,102 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+import carlasc
 from carlasc.cli.common import (
-    Cluster,
     Json,
-    PartOption,
-    Workers,
     echo,
-    engine,
     file_argument,
-    parse_options,
-    parse_part,
     place_argument,
     print_json,
-    progress_bar,
     report_failures,
 )
-from carlasc.cli.grid_options import (
-    BoundsOption,
-    CoordinatesOption,
-    DynamicOption,
-    PresetOption,
-    ResOption,
-    RuleOption,
-    SizeOption,
-    StrideOption,
-    WindowMOption,
-    WindowOption,
-    parse_grid_or_published,
-    scans_of,
-)
+from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags
+from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
+from carlasc.core.choices import Axes, FlowSource, SplitName
 from carlasc.errors import ArgumentError
 
 
-class Split(StrEnum):
-    """Parts of a data set."""
+@dataclass(frozen=True)
+class LayoutFlags(Flags):
+    """In which classes and axes sequences are written, and with what flow."""
 
-    train = "train"
-    val = "val"
-    test = "test"
-    all = "all"
+    classes: Annotated[
+        str,
+        typer.Option(
+            help="carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: keep its ids."
+        ),
+    ] = "carla"
+    axes: Annotated[
+        Axes,
+        typer.Option(
+            help="left: y is mirrored into CarlaSC's left-handed axes. right: right-handed, as in the data set."
+        ),
+    ] = "left"
+    flow: Annotated[
+        FlowSource,
+        typer.Option(
+            help="auto: the velocity of each actor, from its tracked boxes or else from its points. none: no flow."
+        ),
+    ] = "auto"
+    allow_unknown: Annotated[bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")] = (
+        False
+    )
+
+    def options(self) -> carlasc.converting.LayoutOptions:
+        """Return how sequences are written."""
+        return carlasc.converting.LayoutOptions(self.classes, self.axes, self.flow, self.allow_unknown)
 
 
-class Grids(StrEnum):
-    """What grids are made from."""
-
-    scans = "scans"
-    voxels = "voxels"
-    none = "none"
-
-
-class Axes(StrEnum):
-    """Handedness of the axes that are written."""
-
-    left = "left"
-    right = "right"
-
-
-class PoseSource(StrEnum):
-    """Where poses come from."""
-
-    auto = "auto"
-    file = "file"
-    kiss_icp = "kiss-icp"
-
-
-class Flow(StrEnum):
-    """Whether flow is written."""
-
-    auto = "auto"
-    none = "none"
+def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
+    """Return the options of the converter that the arguments name, if they name one."""
+    named = [argument for argument in arguments if not argument.startswith("-")]
+    if not named:  # of which the library need not be loaded
+        return ()
+    known = set(carlasc.converting.converter_names())
+    name = next((argument for argument in named if argument in known), None)
+    return () if name is None else carlasc.converting.option_declarations(carlasc.converting.load_converter(name))
 
 
 def _print_list(wanted: bool) -> None:
     if wanted:
-        from carlasc.converting import converter_names, load_converter
-
-        for name in converter_names():
-            echo(f"{name}: {load_converter(name).title}")
+        for name in carlasc.converting.converter_names():
+            echo(f"{name}: {carlasc.converting.load_converter(name).title}")
         raise typer.Exit
 
 
 def convert(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The data set: kitti, argoverse2, ... (see --list).")],
+    options: DeclaredOptions,
+    layout: LayoutFlags,
+    poses: PoseFlags,
+    making: GroundTruthFlags,
+    run: RunFlags,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="The data set: kitti, argoverse2, ... (see --list). NAME --help shows its own options."
+        ),
+    ],
     source: Annotated[Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")],
     out: Annotated[str, place_argument("Folder to write to, or its URL.", "OUT")],
     sequences: Annotated[
         str | None,
         typer.Option(help="Names of sequences or the last parts of them, separated by commas: 00,08. Default: all."),
     ] = None,
-    split: Annotated[Split, typer.Option(help="Only sequences of this split.")] = Split.all,
-    classes: Annotated[
-        str,
-        typer.Option(
-            help="carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: keep its ids."
-        ),
-    ] = "carla",
-    axes: Annotated[
-        Axes,
-        typer.Option(
-            help="left: y is mirrored into CarlaSC's left-handed axes. right: right-handed, as in the data set."
-        ),
-    ] = Axes.left,
+    split: Annotated[SplitName, typer.Option(help="Only sequences of this split.")] = "all",
     grids: Annotated[
-        Grids,
+        Literal["scans", "voxels", "none"],
         typer.Option(
             help="scans: made from scans merged over time (the coarse grid if no other is given). voxels: the data set's own."
             " none: no grids."
         ),
-    ] = Grids.scans,
-    poses: Annotated[
-        PoseSource,
-        typer.Option(
-            help="file: those of the data set. kiss-icp: estimated from the scans. auto: the file if it exists, else estimated."
-        ),
-    ] = PoseSource.auto,
-    flow: Annotated[
-        Flow,
-        typer.Option(
-            help="auto: the velocity of each actor, from its tracked boxes or else from its points. none: no flow."
-        ),
-    ] = Flow.auto,
-    allow_unknown: Annotated[
-        bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")
-    ] = False,
-    force: Annotated[
-        bool,
-        typer.Option("--force", help="Accept poses under which scans do not overlap, or whose calibration is missing."),
-    ] = False,
-    preset: PresetOption = None,
-    res: ResOption = None,
-    size: SizeOption = None,
-    coordinates: CoordinatesOption = None,
-    bounds: BoundsOption = None,
-    rule: RuleOption = None,
-    window: WindowOption = None,
-    window_m: WindowMOption = None,
-    stride: StrideOption = None,
-    dynamic: DynamicOption = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE", help="An option of this data set, see its page. May be given several times."
-        ),
-    ] = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    part: PartOption = None,
+    ] = "scans",
     json: Json = False,
     _list: Annotated[
         bool,
@@ -164,43 +108,33 @@ def convert(
 
     Run it again to continue where it stopped: frames that exist are skipped.
     """
-    from carlasc.converting import convert as convert_recordings
-    from carlasc.groundtruth import Voting
-
-    observe = scans_of(window=window, window_m=window_m, stride=stride, dynamic=dynamic)
-    asked = any(value is not None for value in (preset, res, size, coordinates, bounds, rule, observe))
-    if asked and grids is not Grids.scans:
-        raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids.value)
-    if part is not None and grids is Grids.scans and bounds is None:
+    if making.is_given and grids != "scans":
+        raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids)
+    bounded = making.grid.bounds is not None
+    if run.part is not None and grids == "scans" and not bounded:
         raise ArgumentError(
             "--part",
             expected="--bounds or --grids none with it, because the height of grids is found from the ground of all sequences",
             found="neither",
         )
-    spec = parse_grid_or_published(res, size, preset, coordinates, bounds) if grids is Grids.scans else None
-    with progress_bar(f"convert {name}") as progress, engine(cluster, workers) as executor:
-        result = convert_recordings(
+    made = carlasc.groundtruth.GridOptions(
+        making.grid.spec_or_published(),
+        making.scans.from_scans(poses.options()),
+        making.votes.voting(),
+        follow_ground=not bounded,
+    )
+    with run.spread(f"convert {name}") as spread:
+        result = carlasc.convert(
             name,
             source,
             out,
             sequences=None if sequences is None else sequences.split(","),
-            split=split.value,
-            classes=classes,
-            axes=axes.value,
-            grids=grids.value,
-            spec=spec,
-            observe=observe,
-            voting=None if rule is None else Voting(rule.value),
-            follow_ground=bounds is None,
-            poses=poses.value,
-            flow=flow.value,
-            allow_unknown=allow_unknown,
-            force=force,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
-            options=parse_options(option),
+            split=split,
+            layout=layout.options(),
+            poses=poses.options(),
+            grids=made if grids == "scans" else "voxels" if grids == "voxels" else None,
+            options=options.values,
+            run=spread,
         )
     if json:
         print_json(result)

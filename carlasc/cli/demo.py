@@ -11,23 +11,24 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import FAILED, Workers, echo, file_argument, progress_bar
+from carlasc.cli.common import FAILED, echo, file_argument, progress_bar
+from carlasc.cli.flags import WorkFlags
 from carlasc.cli.stats import print_statistics
 from carlasc.cli.validate import print_result
-from carlasc.running.options import Run
 
 
 def demo(
+    work: WorkFlags,
     out: Annotated[Path, file_argument("Folder to write to.")] = Path("carlasc-demo"),
     count: Annotated[int, typer.Option(help="Number of frames.", min=1)] = 4,
     sensors: Annotated[int, typer.Option(help="Number of LiDARs.", min=1)] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
-    workers: Workers = None,
 ) -> None:
     """Simulate a drive, make its ground truth in three grids, check it, and draw it in pictures and a page. This takes a minute or two."""
     from carlasc.demo import demonstrate
 
-    result = demonstrate(out, count=count, sensors=sensors, seed=seed, run=Run(workers=workers), step=_show_step)
+    with work.spread("demo", shown=False) as run:
+        result = demonstrate(out, count=count, sensors=sensors, seed=seed, run=run, step=_show_step)
     print_statistics(result.statistics)
     print_result(result.validation)
     echo(f"\ndone in {result.elapsed_s:.0f} s")

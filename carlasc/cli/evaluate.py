@@ -2,47 +2,100 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+import carlasc
 from carlasc.cli.common import (
-    Cluster,
     FramesOption,
     Json,
     console,
     echo,
-    engine,
     file_option,
     line,
     place_argument,
     place_option,
     print_json,
-    progress_bar,
     report_failures,
 )
-from carlasc.running.options import Run
+from carlasc.cli.flags import Flags, OneWorkerFlags
+from carlasc.core.choices import BreakdownName, Voxels
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
 
 
-class Part(StrEnum):
-    """What a score can be broken down by."""
+@dataclass(frozen=True)
+class GridChoiceFlags(Flags):
+    """The grids and the frames that are compared, and the classes of the predictions."""
 
-    distance = "distance"
-    height = "height"
-    visibility = "visibility"
-    motion = "motion"
+    grid: Annotated[
+        str | None, typer.Option(help="Grid with the predictions; if not given, the name of the true grid.")
+    ] = None
+    truth_grid: Annotated[
+        str | None, typer.Option(help="Grid with the ground truth; if not given, evaluation, or the only grid.")
+    ] = None
+    source_classes: Annotated[
+        str | None,
+        typer.Option(help="Class table of SOURCE's labels, if the data do not name one: carla, carlasc11, ..."),
+    ] = None
+    frames: FramesOption = None
 
 
-_OUTPUT, _PART = "Output", "Part of the grid"
+@dataclass(frozen=True)
+class ScoringFlags(Flags):
+    """What is scored of each frame."""
+
+    heading: ClassVar[str] = "Part of the grid"
+
+    voxels: Annotated[Voxels, typer.Option(help="Voxels that count: those that the truth evaluated, or all.")] = "known"
+    near_m: Annotated[
+        float, typer.Option("--near", help="Score only voxels at this distance from the sensor or farther, metres.")
+    ] = 0.0
+    far_m: Annotated[
+        float | None, typer.Option("--far", help="Score only voxels nearer to the sensor than this, metres.")
+    ] = None
+    fov: Annotated[
+        float, typer.Option(help="Score only voxels in this angle about the forward axis, degrees.", min=1, max=360)
+    ] = 360.0
+    by: Annotated[
+        list[BreakdownName] | None,
+        typer.Option(help="Also score parts of the grid; may be given several times."),
+    ] = None
+    rays: Annotated[
+        bool, typer.Option("--rays", help="Also score what rays meet first: RayIoU. Needs poses and a Cartesian grid.")
+    ] = False
+
+    def options(self) -> carlasc.Scoring:
+        """Return what is scored."""
+        whole = (self.near_m, self.far_m, self.fov) == (0.0, None, 360.0)
+        region = None if whole else _Region(self.near_m, self.far_m, self.fov)
+        return carlasc.Scoring(self.voxels, region, self.by or (), self.rays)
+
+
+@dataclass(frozen=True)
+class OutputFlags(Flags):
+    """What is printed and written."""
+
+    heading: ClassVar[str] = "Output"
+
+    per_frame: Annotated[
+        Path | None, file_option("--per-frame", text="Write the scores of each frame to this CSV file.")
+    ] = None
+    plot: Annotated[Path | None, file_option("--plot", text="Draw the scores of each frame to this PNG file.")] = None
+    as_json: Json = False
+    latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX.")] = False
+    csv: Annotated[bool, typer.Option("--csv", help="Print the tables as CSV.")] = False
 
 
 def evaluate(
+    choice: GridChoiceFlags,
+    scoring: ScoringFlags,
+    output: OutputFlags,
+    work: OneWorkerFlags,
     source: Annotated[
         str,
         place_argument(
@@ -62,123 +115,48 @@ def evaluate(
     all_conventions: Annotated[
         bool, typer.Option("--all-conventions", help="Print one row for each convention instead of the tables.")
     ] = False,
-    grid: Annotated[
-        str | None, typer.Option(help="Grid with the predictions; if not given, the name of the true grid.")
-    ] = None,
-    truth_grid: Annotated[
-        str | None, typer.Option(help="Grid with the ground truth; if not given, evaluation, or the only grid.")
-    ] = None,
-    source_classes: Annotated[
-        str | None,
-        typer.Option(help="Class table of SOURCE's labels, if the data do not name one: carla, carlasc11, ..."),
-    ] = None,
     compare: Annotated[
         str | None,
         place_option(
             "--compare", text="Other predictions of the same sequences: compare SOURCE with them by a paired test."
         ),
     ] = None,
-    voxels: Annotated[
-        Literal["known", "all"],
-        typer.Option(help="Voxels that count: those that the truth evaluated, or all.", rich_help_panel=_PART),
-    ] = "known",
-    near_m: Annotated[
-        float,
-        typer.Option(
-            "--near",
-            help="Score only voxels at this distance from the sensor or farther, metres.",
-            rich_help_panel=_PART,
-        ),
-    ] = 0.0,
-    far_m: Annotated[
-        float | None,
-        typer.Option("--far", help="Score only voxels nearer to the sensor than this, metres.", rich_help_panel=_PART),
-    ] = None,
-    fov: Annotated[
-        float,
-        typer.Option(
-            help="Score only voxels in this angle about the forward axis, degrees.",
-            min=1,
-            max=360,
-            rich_help_panel=_PART,
-        ),
-    ] = 360.0,
-    frames: FramesOption = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)
-    ] = None,
-    cluster: Cluster = None,
-    by: Annotated[
-        list[Part] | None,
-        typer.Option(help="Also score parts of the grid; may be given several times.", rich_help_panel=_PART),
-    ] = None,
-    rays: Annotated[
-        bool, typer.Option("--rays", help="Also score what rays meet first: RayIoU. Needs poses and a Cartesian grid.")
-    ] = False,
     name: Annotated[
-        str | None,
-        typer.Option(
-            help="What to call the predictions in the tables; SOURCE's name if not given.", rich_help_panel=_OUTPUT
-        ),
+        str | None, typer.Option(help="What to call the predictions in the tables; SOURCE's name if not given.")
     ] = None,
-    per_frame: Annotated[
-        Path | None,
-        file_option("--per-frame", text="Write the scores of each frame to this CSV file.", rich_help_panel=_OUTPUT),
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        file_option("--plot", text="Draw the scores of each frame to this PNG file.", rich_help_panel=_OUTPUT),
-    ] = None,
-    as_json: Json = False,
-    latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX.", rich_help_panel=_OUTPUT)] = False,
-    csv: Annotated[bool, typer.Option("--csv", help="Print the tables as CSV.", rich_help_panel=_OUTPUT)] = False,
 ) -> None:
     """Score predicted grids by the rules of a benchmark: IoU of each class, their mean, and completeness.
 
     Benchmarks differ in the voxels that count, in the classes, and in the classes of the mean: scores by different conventions cannot be
     compared. Intersections and unions are summed over all frames before they are divided.
     """
-    from carlasc.metrics import evaluate as score
-    from carlasc.metrics import evaluate_by_all_conventions
-
-    if plot is not None:
+    if output.plot is not None:
         from carlasc.inspection.charts import check_plot
 
-        check_plot(plot)  # before anything is counted
-    common: dict[str, Any] = {
-        "grid": grid, "truth_grid": truth_grid, "source_classes": source_classes, "frames": frames,
-    }  # fmt: skip
-    name = name or Path(source).name
+        check_plot(output.plot)  # before anything is counted
+    name, common = name or Path(source).name, vars(choice)
     if all_conventions:
-        with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
-            found = evaluate_by_all_conventions(
-                source, truth, name=name, run=Run(workers or 1, executor, progress=progress), **common
-            )
-        _print_conventions(found, as_json)
+        with work.spread("Scoring", usual=1) as run:
+            found = carlasc.metrics.evaluate_by_all_conventions(source, truth, name=name, run=run, **common)
+        _print_conventions(found, output.as_json)
         return
-
-    common |= {"convention": convention, "voxels": voxels}
-    common["region"] = None if (near_m, far_m, fov) == (0.0, None, 360.0) else _Region(near_m, far_m, fov)
-    with progress_bar("Scoring") as progress, engine(cluster, workers) as executor:
-        parts = [part.value for part in by or ()]
-        result = score(
-            source, truth, by=parts, rays=rays, name=name, run=Run(workers or 1, executor, progress=progress), **common
-        )
+    common = {**common, "convention": convention}
+    with work.spread("Scoring", usual=1) as run:
+        result = carlasc.evaluate(source, truth, scoring=scoring.options(), name=name, run=run, **common)
     other = None
     if compare is not None:
-        with progress_bar("Scoring the other") as progress, engine(cluster, workers) as executor:
-            other = score(
-                compare, truth, name=Path(compare).name, run=Run(workers or 1, executor, progress=progress), **common
-            )
-    if per_frame is not None:
+        whole = replace(scoring, by=None, rays=False).options()
+        with work.spread("Scoring the other", usual=1) as run:
+            other = carlasc.evaluate(compare, truth, scoring=whole, name=Path(compare).name, run=run, **common)
+    if output.per_frame is not None:
         from carlasc.storage.files import write_output
 
-        write_output(per_frame, result.to_csv().encode())
-    if plot is not None:
+        write_output(output.per_frame, result.to_csv().encode())
+    if output.plot is not None:
         from carlasc.inspection.charts import draw_frame_scores
 
-        draw_frame_scores(result, plot)
-    _print(result, other, as_json=as_json, latex=latex, csv=csv)
+        draw_frame_scores(result, output.plot)
+    _print(result, other, output)
     report_failures(result.failures, result.frames + len(result.failures))
 
 
@@ -199,16 +177,16 @@ class _Region:
         return band & field_of_view(spec, math.radians(self.fov))
 
 
-def _print(result: Evaluation, other: Evaluation | None, *, as_json: bool, latex: bool, csv: bool) -> None:
+def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) -> None:
     comparison = None if other is None else result.compare(other)
-    if as_json:
+    if output.as_json:
         values = result.to_dict()
         if other is not None and comparison is not None:
             values["comparison"] = {"with": other.name, **comparison.to_dict()}
         print_json(values)
         return
-    if latex or csv:
-        echo("\n".join(table.to_latex() if latex else table.to_csv() for table in result.tables()), nl=False)
+    if output.latex or output.csv:
+        echo("\n".join(table.to_latex() if output.latex else table.to_csv() for table in result.tables()), nl=False)
         return
     from carlasc.cli.tables import print_table
 

@@ -2,66 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import (
-    Cluster,
-    Json,
-    PartOption,
-    Workers,
-    echo,
-    engine,
-    file_argument,
-    parse_options,
-    parse_part,
-    place_argument,
-    print_json,
-    progress_bar,
-    report_failures,
-)
+import carlasc
+from carlasc.cli.common import Json, echo, file_argument, place_argument, print_json, report_failures
+from carlasc.cli.flags import DeclaredOptions, RunFlags
+
+
+def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
+    """Return the options of the exporter that the arguments name, if they name one."""
+    named = [argument for argument in arguments if not argument.startswith("-")]
+    if not named:  # of which the library need not be loaded
+        return ()
+    known = set(carlasc.converting.exporter_names())
+    name = next((argument for argument in named if argument in known), None)
+    return () if name is None else carlasc.converting.option_declarations(carlasc.converting.load_exporter(name))
 
 
 def _print_list(wanted: bool) -> None:
     if wanted:
-        from carlasc.converting import exporter_names, load_exporter, option_names
-
-        for name in exporter_names():
-            exporter = load_exporter(name)
-            options = ", ".join(option_names(exporter))
+        for name in carlasc.converting.exporter_names():
+            exporter = carlasc.converting.load_exporter(name)
+            options = ", ".join(option.name for option in carlasc.converting.option_declarations(exporter))
             echo(f"{name}: {exporter.title}" + (f" (options: {options})" if options else ""))
         raise typer.Exit
 
 
 def export(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The other data set: kitti, occ3d, ... (see --list).")],
+    options: DeclaredOptions,
+    run: RunFlags,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="The other data set: kitti, occ3d, ... (see --list). NAME --help shows its own options.",
+        ),
+    ],
     source: Annotated[str, place_argument("Folder, zip, store or URL of one or more sequences.")],
     out: Annotated[Path, file_argument("Folder to write to.")],
     sequences: Annotated[
         str | None, typer.Option(help="Names of sequences, separated by commas. Default: all.")
     ] = None,
-    grid: Annotated[
-        str | None,
-        typer.Option(
-            help="Grid that is exported. Default: the one with exactly the voxels of the other data set, else the one of the smallest voxels."
-        ),
-    ] = None,
-    predictions: Annotated[
-        bool,
-        typer.Option("--predictions", help="SOURCE holds the output of a network: grids without counts."),
-    ] = False,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE", help="Another option of the exporter (see --list); may be given several times."
-        ),
-    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write frames again that exist.")] = False,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    part: PartOption = None,
     json: Json = False,
     _list: Annotated[
         bool,
@@ -72,23 +58,15 @@ def export(
 
     Run it again to continue where it stopped: frames that exist are skipped.
     """
-    from carlasc.converting import export as export_sequences
-
-    options: dict[str, Any] = {**parse_options(option)}
-    options |= {} if grid is None else {"grid": grid}
-    options |= {"predictions": True} if predictions else {}
-    with progress_bar(f"export {name}") as progress, engine(cluster, workers) as executor:
-        result = export_sequences(
+    with run.spread(f"export {name}") as spread:
+        result = carlasc.export(
             name,
             source,
             out,
             sequences=None if sequences is None else sequences.split(","),
             overwrite=overwrite,
-            workers=workers,
-            executor=executor,
-            part=parse_part(part),
-            progress=progress,
-            **options,
+            options=options.values,
+            run=spread,
         )
     if json:
         print_json(result)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json
 
 
@@ -20,9 +21,7 @@ def finish(
 
     The last part of a run does this by itself. It is needed where a part failed, or was never run.
     """
-    from carlasc.storage import finish as finish_store
-
-    result = finish_store(out, incomplete=incomplete)
+    result = carlasc.finish(out, incomplete=incomplete)
     if json:
         print_json(result)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
+import carlasc
 from carlasc.cli.common import Json, console, line, place_argument, print_json
 
 if TYPE_CHECKING:
@@ -17,9 +18,7 @@ def info(
     as_json: Json = False,
 ) -> None:
     """List what a data set holds: splits, sequences, frames, fields, grids and how they were made. No frame is read."""
-    from carlasc.inspection.overview import info as look
-
-    overview = look(source)
+    overview = carlasc.info(source)
     if as_json:
         print_json(overview.to_dict())
     else:

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import (
-    Cluster,
-    Json,
-    PartOption,
-    Workers,
-    console,
-    echo,
-    engine,
-    line,
-    parse_part,
-    place_argument,
-    print_json,
-    progress_bar,
-)
-from carlasc.running.options import Run
-
-if TYPE_CHECKING:
-    from carlasc.storage.packing import PackResult
+import carlasc
+from carlasc.cli.common import Json, console, echo, line, place_argument, print_json
+from carlasc.cli.flags import RunFlags
 
 
 def pack(
+    run: RunFlags,
     source: Annotated[str, place_argument("Folder, zip or URL with one or more sequences.")],
     out: Annotated[str, place_argument("Store to write; its ending says which kind: .zarr, .h5 or .parquet.", "OUT")],
     small: Annotated[
@@ -36,9 +22,6 @@ def pack(
     lossy_mm: Annotated[
         float | None, typer.Option(help="Quantise points to this many millimetres. Without it, every bit is kept.")
     ] = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    part: PartOption = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a store that exists at OUT.")] = False,
     json: Json = False,
 ) -> None:
@@ -46,26 +29,17 @@ def pack(
 
     If it is interrupted, run the same command again to finish it.
     """
-    from carlasc.storage.packing import pack as pack_sequences
-
-    with progress_bar("Packing", "files") as progress, engine(cluster, workers) as executor:
-        result = pack_sequences(
-            source,
-            out,
-            small=small,
-            lossy_mm=lossy_mm,
-            overwrite=overwrite,
-            run=Run(workers=workers, executor=executor, part=parse_part(part), progress=progress),
-        )
+    with run.spread("Packing", "files") as spread:
+        result = carlasc.pack(source, out, small=small, lossy_mm=lossy_mm, overwrite=overwrite, run=spread)
     if json:
         print_json(result)
     elif result.is_finished:
         _print(result)
     else:
-        echo(f"{result.out}: part {part} is packed; the last part finishes the store")
+        echo(f"{result.out}: part {run.part} is packed; the last part finishes the store")
 
 
-def _print(result: PackResult) -> None:
+def _print(result: carlasc.storage.packing.PackResult) -> None:
     from rich.table import Table
 
     echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")

@@ -2,69 +2,33 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import typer
 
+import carlasc
 from carlasc.cli.common import (
-    Cluster,
     FramesOption,
     Json,
     Overwrite,
-    PartOption,
-    Workers,
     echo,
-    engine,
-    parse_part,
     place_argument,
     place_option,
     print_json,
-    progress_bar,
     report_failures,
 )
-from carlasc.cli.grid_options import (
-    SCANS,
-    BoundsOption,
-    CompleteOption,
-    CoordinatesOption,
-    DynamicOption,
-    MotionOption,
-    NoOwnPathOption,
-    PresetOption,
-    ResOption,
-    RuleOption,
-    SizeOption,
-    StrideOption,
-    WindowMOption,
-    WindowOption,
-    parse_grid,
-    scans_of,
-)
+from carlasc.cli.flags import RunFlags
+from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
 from carlasc.errors import ArgumentError
-from carlasc.running.options import Run
 
-if TYPE_CHECKING:
-    from carlasc.groundtruth import FromScans, Observe
-
-
-class Observed(StrEnum):
-    """What grids are made from."""
-
-    capture = "capture"
-    scans = "scans"
-    grid = "grid"
-
-
-class Poses(StrEnum):
-    """Where poses come from."""
-
-    auto = "auto"
-    file = "file"
-    kiss_icp = "kiss-icp"
+Observed = Literal["capture", "scans", "grid"]
+"""What grids are made from."""
 
 
 def regrid(
+    making: GroundTruthFlags,
+    poses: PoseFlags,
+    run: RunFlags,
     source: Annotated[
         str,
         place_argument(
@@ -80,35 +44,6 @@ def regrid(
             text="Folder or URL to write to, each sequence at its path below SOURCE; default: SOURCE itself.",
         ),
     ] = None,
-    res: ResOption = None,
-    size: SizeOption = None,
-    preset: PresetOption = None,
-    coordinates: CoordinatesOption = None,
-    bounds: BoundsOption = None,
-    free_step_m: Annotated[float, typer.Option(help="Distance between two free samples on a ray, in metres.")] = 1.5,
-    rule: RuleOption = None,
-    frames: FramesOption = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    part: PartOption = None,
-    keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False,
-    keep_evidence: Annotated[
-        bool,
-        typer.Option(
-            "--keep-evidence",
-            help="Also write how certain each voxel is: probabilities, flags and number of scans.",
-            rich_help_panel=SCANS,
-        ),
-    ] = False,
-    min_confidence: Annotated[
-        float,
-        typer.Option(
-            help="Voxels that are neither free nor occupied with at least this probability become unknown.",
-            rich_help_panel=SCANS,
-        ),
-    ] = 0.0,
-    name: Annotated[str | None, typer.Option(help="Name of the grid's folder; default: a name by its size.")] = None,
-    overwrite: Overwrite = False,
     observe: Annotated[
         Observed | None,
         typer.Option(
@@ -119,29 +54,9 @@ def regrid(
     from_grid: Annotated[
         str | None, typer.Option(help="Name of the finer grid, with --observe grid; default: the finest one.")
     ] = None,
-    window: WindowOption = None,
-    window_m: WindowMOption = None,
-    stride: StrideOption = None,
-    dynamic: DynamicOption = None,
-    motion: MotionOption = None,
-    complete: CompleteOption = None,
-    no_own_path: NoOwnPathOption = False,
-    min_range_m: Annotated[
-        float | None, typer.Option(help="Leave out nearer points, in metres.", rich_help_panel=SCANS)
-    ] = None,
-    max_range_m: Annotated[
-        float | None, typer.Option(help="Leave out farther points, in metres.", rich_help_panel=SCANS)
-    ] = None,
-    poses: Annotated[
-        Poses | None,
-        typer.Option(
-            help="file: from poses.txt; kiss-icp: estimated from the scans; auto: from the file if it exists, else estimated (default).",
-            rich_help_panel=SCANS,
-        ),
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Continue if poses jump between frames.", rich_help_panel=SCANS)
-    ] = False,
+    frames: FramesOption = None,
+    name: Annotated[str | None, typer.Option(help="Name of the grid's folder; default: a name by its size.")] = None,
+    overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Make ground truth at any resolution: from a raw capture, from the scans of one sensor merged over time, or from a finer grid.
@@ -149,35 +64,18 @@ def regrid(
     Existing frames are skipped, so the same command continues an interrupted run. Inside a sequence's folder, `carlasc regrid --res 0.2` is
     enough.
     """
-    from carlasc.groundtruth import Voting
-    from carlasc.groundtruth import regrid as regrid_sequences
-
-    spec = parse_grid(res, size, preset, coordinates, bounds)
-    voting = Voting(None if rule is None else rule.value, free_step_m, keep, keep_evidence, min_confidence)
-    scans = scans_of(
-        window=window,
-        window_m=window_m,
-        stride=stride,
-        dynamic=dynamic,
-        motion=motion,
-        complete=complete,
-        own_path=False if no_own_path else None,
-        min_range_m=min_range_m,
-        max_range_m=max_range_m,
-        poses=None if poses is None else poses.value,
-        force=force or None,
-    )
-    with progress_bar("regrid") as progress, engine(cluster, workers) as executor:
-        result = regrid_sequences(
+    spec, voting, chosen = making.grid.spec(), making.votes.voting(), _observe(observe, making, poses, from_grid)
+    with run.spread("regrid") as spread:
+        result = carlasc.regrid(
             source,
             spec,
             out,
-            observe=_observe(observe, scans, from_grid),
+            observe=chosen,
             voting=voting,
             frames=frames,
             name=name,
             overwrite=overwrite,
-            run=Run(workers=workers, executor=executor, part=parse_part(part), progress=progress),
+            run=spread,
         )
     if json:
         print_json(result)
@@ -192,21 +90,22 @@ def regrid(
     report_failures(failures, result.made + result.skipped + len(failures))
 
 
-def _observe(kind: Observed | None, scans: FromScans | None, grid: str | None) -> Observe | None:
+def _observe(
+    kind: Observed | None, making: GroundTruthFlags, poses: PoseFlags, grid: str | None
+) -> carlasc.groundtruth.Observe | None:
     """Return the `observe` argument. Options for scans and for a finer grid say what is meant if --observe is not given."""
-    from carlasc.groundtruth import FromCapture, FromGrid, FromScans
-
-    if kind is None and (scans or grid) is not None:
-        kind = Observed.scans if scans is not None else Observed.grid
-    if scans is not None and kind is not Observed.scans:
+    for_scans = making.scans.is_given or poses.is_given
+    if kind is None and (for_scans or grid is not None):
+        kind = "scans" if for_scans else "grid"
+    if for_scans and kind != "scans":
         raise ArgumentError("observe", expected="scans with the options for scans", found=str(kind))
-    if grid is not None and kind is not Observed.grid:
+    if grid is not None and kind != "grid":
         raise ArgumentError("observe", expected="grid with --from-grid", found=str(kind))
     match kind:
-        case Observed.capture:
-            return FromCapture()
-        case Observed.scans:
-            return scans or FromScans()
-        case Observed.grid:
-            return FromGrid(grid)
+        case "capture":
+            return carlasc.FromCapture()
+        case "scans":
+            return making.scans.from_scans(poses.options())
+        case "grid":
+            return carlasc.FromGrid(grid)
     return None

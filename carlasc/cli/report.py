@@ -7,21 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from carlasc.cli.common import (
-    Cluster,
-    Json,
-    Workers,
-    console,
-    echo,
-    engine,
-    file_option,
-    line,
-    place_argument,
-    print_json,
-    progress_bar,
-    report_failures,
-)
-from carlasc.running.options import Run
+import carlasc
+from carlasc.cli.common import Json, console, echo, file_option, line, place_argument, print_json, report_failures
+from carlasc.cli.flags import WorkFlags
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.reporting.facts import ActorTrack
@@ -31,6 +19,7 @@ _SHOWN = 12
 
 
 def report(
+    work: WorkFlags,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     grid: Annotated[str | None, typer.Option(help="Only the grid of this name; default: all grids.")] = None,
     html: Annotated[
@@ -47,8 +36,6 @@ def report(
         bool, typer.Option("--save", help="Write the reports beside their grids, if carlasc made these.")
     ] = False,
     everything: Annotated[bool, typer.Option("--all", help="Print all actors, not only the first twelve.")] = False,
-    workers: Workers = None,
-    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Print the report of each grid: what is in it, how it was made, how well actors were tracked, how it changes with fewer scans.
@@ -56,17 +43,9 @@ def report(
     `carlasc regrid` leaves a report beside each grid. Grids without one are read and measured.
     """
     from carlasc.inspection.report_page import write_report_page
-    from carlasc.inspection.reports import report as read_reports
 
-    with progress_bar("report", unit="steps") as progress, engine(cluster, workers) as executor:
-        result = read_reports(
-            source,
-            grid=grid,
-            remake=remake,
-            holdout=holdout,
-            save=save,
-            run=Run(workers=workers, executor=executor, progress=progress),
-        )
+    with work.spread("report", "steps") as run:
+        result = carlasc.report(source, grid=grid, remake=remake, holdout=holdout, save=save, run=run)
     if html is not None:
         write_report_page(result, html)
     if as_json:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+import carlasc
 from carlasc.cli.common import Overwrite, console, echo
 
 
@@ -26,9 +27,8 @@ def scores(
 ) -> None:
     """Put the results of several evaluations into one table."""
     from carlasc.errors import ConflictError
-    from carlasc.metrics.leaderboard import scores as read
 
-    table = read(files, mixed=mixed)
+    table = carlasc.scores(files, mixed=mixed)
     if format is None and out is not None:
         endings = {".md": "markdown", ".tex": "latex", ".html": "html", ".htm": "html"}
         format = endings.get(out.suffix.lower(), "text")  # type: ignore[assignment]

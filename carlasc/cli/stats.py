@@ -7,20 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import (
-    Cluster,
-    Json,
-    console,
-    echo,
-    engine,
-    file_option,
-    line,
-    place_argument,
-    print_json,
-    progress_bar,
-    report_failures,
-)
-from carlasc.running.options import Run
+import carlasc
+from carlasc.cli.common import Json, console, echo, file_option, line, place_argument, print_json, report_failures
+from carlasc.cli.flags import OneWorkerFlags
 
 if TYPE_CHECKING:
     from carlasc.core import ClassTable
@@ -30,6 +19,7 @@ _KINDS: tuple[Kind, ...] = ("points", "voxels")
 
 
 def stats(
+    work: OneWorkerFlags,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
@@ -45,26 +35,15 @@ def stats(
     plot: Annotated[
         Path | None, file_option("--plot", text="Draw the histograms to a .png, .svg or .pdf file.")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)
-    ] = None,
-    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Count the classes of points and of known voxels, and compute class weights: as tables, a plot or JSON."""
     from carlasc.inspection.charts import check_plot, draw_histograms
-    from carlasc.inspection.statistics import stats as count
 
     if plot is not None:  # counting may take hours: a mistake in this option is reported before
         check_plot(plot)
-    with progress_bar("Counting") as progress, engine(cluster, workers) as executor:
-        result = count(
-            source,
-            grid=grid,
-            remap=None if remap == "none" else remap,
-            every=every,
-            run=Run(workers=workers or 1, executor=executor, progress=progress),
-        )
+    with work.spread("Counting", usual=1) as run:
+        result = carlasc.stats(source, grid=grid, remap=None if remap == "none" else remap, every=every, run=run)
     if plot is not None:
         draw_histograms(result, plot)
     if as_json:

@@ -6,27 +6,15 @@ from typing import Annotated
 
 import typer
 
-from carlasc.cli.common import (
-    Cluster,
-    Json,
-    PartOption,
-    Workers,
-    echo,
-    engine,
-    parse_part,
-    place_argument,
-    print_json,
-    progress_bar,
-)
-from carlasc.running.options import Run
+import carlasc
+from carlasc.cli.common import Json, echo, place_argument, print_json
+from carlasc.cli.flags import RunFlags
 
 
 def unpack(
+    run: RunFlags,
     source: Annotated[str, place_argument("Packed store, zip or URL.")],
     out: Annotated[str, place_argument("Folder to write.", "OUT")],
-    workers: Workers = None,
-    cluster: Cluster = None,
-    part: PartOption = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that exists, and replace files of the same names.")
     ] = False,
@@ -36,15 +24,8 @@ def unpack(
 
     If it is interrupted, run the same command again to finish it.
     """
-    from carlasc.storage.unpacking import unpack as unpack_sequences
-
-    with progress_bar("Unpacking", "files") as progress, engine(cluster, workers) as executor:
-        result = unpack_sequences(
-            source,
-            out,
-            overwrite=overwrite,
-            run=Run(workers=workers, executor=executor, part=parse_part(part), progress=progress),
-        )
+    with run.spread("Unpacking", "files") as spread:
+        result = carlasc.unpack(source, out, overwrite=overwrite, run=spread)
     if json:
         print_json(result)
     else:

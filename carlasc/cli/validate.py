@@ -2,36 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
+import carlasc
 from carlasc.cli.common import (
     FAILED,
-    Cluster,
     Json,
     console,
-    engine,
     line,
     place_argument,
     print_json,
-    progress_bar,
     report_failures,
 )
-from carlasc.cli.grid_options import (
-    BoundsOption,
-    DynamicOption,
-    MotionOption,
-    PresetOption,
-    ResOption,
-    SizeOption,
-    WindowOption,
-    parse_grid,
-    scans_of,
-)
+from carlasc.cli.flags import Flags, OneWorkerFlags
+from carlasc.cli.grid_flags import GridFlags, WindowFlags
 from carlasc.errors import ArgumentError
-from carlasc.running.options import Run
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
@@ -39,11 +27,33 @@ if TYPE_CHECKING:
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
 
 _SHOWN = 3
-_HELD_OUT = "Held-out rays"
 _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 
+@dataclass(frozen=True)
+class HoldoutFlags(Flags):
+    """Which scans are left out, and the grids that the others give."""
+
+    heading: ClassVar[str] = "Held-out rays"
+
+    holdout: Annotated[
+        bool,
+        typer.Option(
+            "--holdout",
+            help="Also leave scans out, and follow their rays through the grids that the other scans give, in one process per core if"
+            " --workers is not given.",
+        ),
+    ] = False
+    holdout_every: Annotated[
+        int | None, typer.Option(metavar="N", min=2, help="Leave every N-th scan out; default: 10.")
+    ] = None
+
+
 def validate(
+    holdout: HoldoutFlags,
+    grid: GridFlags,
+    scans: WindowFlags,
+    work: OneWorkerFlags,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     every: Annotated[
         int | None,
@@ -55,32 +65,6 @@ def validate(
     everything: Annotated[
         bool, typer.Option("--all", help="Print all findings, not only the first three of each kind.")
     ] = False,
-    holdout: Annotated[
-        bool,
-        typer.Option(
-            "--holdout",
-            help="Also leave scans out, and follow their rays through the grids that the other scans give.",
-            rich_help_panel=_HELD_OUT,
-        ),
-    ] = False,
-    holdout_every: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=2, help="Leave every N-th scan out; default: 10.", rich_help_panel=_HELD_OUT),
-    ] = None,
-    res: ResOption = None,
-    size: SizeOption = None,
-    preset: PresetOption = None,
-    bounds: BoundsOption = None,
-    window: WindowOption = None,
-    dynamic: DynamicOption = None,
-    motion: MotionOption = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            help="Processes that work side by side; if not given, one, and one per core for held-out rays.", min=1
-        ),
-    ] = None,
-    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids. The exit code is 1 if there is an error.
@@ -88,36 +72,18 @@ def validate(
     It finds files of the wrong size, labels without votes, unknown classes, poses that are not rigid or jump, and gaps. From the
     scans it recognizes a mirrored y axis, poses of a camera, transposed rotations, and a grid that is shifted by a cell.
     """
-    from carlasc.core.grids import GridSpec
-    from carlasc.groundtruth import FromScans
-    from carlasc.inspection.validation import validate as examine
-    from carlasc.motion import PoseOptions
-
     if full and every is not None:
         raise ArgumentError("every", expected="only one of --every and --full", found="both")
-    grid, others = (res, size, preset, bounds), (holdout_every, window, dynamic, motion)
-    if not holdout and any(value is not None for value in (*grid, *others)):
+    if not holdout.holdout and (holdout.is_given or grid.is_given or scans.is_given):
         raise ArgumentError("holdout", expected="given with the options of held-out rays", found="not given")
-    spec = parse_grid(res, size, preset, None, bounds) if any(grid) else GridSpec.published()
-    scans = replace(scans_of(window=window, dynamic=dynamic, motion=motion) or FromScans(), poses=PoseOptions("file"))
+    spec, observe = grid.spec_or_published(), scans.from_scans(carlasc.motion.PoseOptions("file"))
     rays = None
-    with engine(cluster, workers) as executor:
-        with progress_bar("Validating", unit="steps") as progress:
-            result = examine(
-                source, every=1 if full else every, run=Run(workers=workers or 1, executor=executor, progress=progress)
-            )
-        if holdout:
-            from carlasc.inspection.heldout import EVERY
-            from carlasc.inspection.heldout import holdout as hold_out
-
-            with progress_bar("Leaving scans out") as progress:
-                rays = hold_out(
-                    source,
-                    spec,
-                    observe=scans,
-                    every=holdout_every or EVERY,
-                    run=Run(workers=workers, executor=executor, progress=progress),
-                )
+    with work.spread("Validating", "steps", usual=1) as run:
+        result = carlasc.validate(source, every=1 if full else every, run=run)
+    if holdout.holdout:
+        left_out = holdout.holdout_every or carlasc.inspection.EVERY
+        with work.spread("Leaving scans out") as run:
+            rays = carlasc.inspection.holdout(source, spec, observe=observe, every=left_out, run=run)
     if as_json:
         print_json(result.to_dict() | ({} if rays is None else {"holdout": rays.to_dict()}))
     else:

@@ -2,29 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import FramesOption, Json, echo, file_option, place_option, print_json, progress_bar
-from carlasc.cli.scene_options import (
-    ClassesOption,
-    EveryOption,
-    GridOption,
-    OverwriteOption,
-    SequenceOption,
-    SourceArgument,
-    SourceClassesOption,
-    TruthGridOption,
-    TruthOption,
-    describe_frames,
+import carlasc
+from carlasc.cli.common import (
+    FramesOption,
+    Json,
+    echo,
+    file_option,
+    place_argument,
+    place_option,
+    print_json,
+    progress_bar,
 )
+from carlasc.cli.flags import Flags
+from carlasc.core.choices import PaletteName
 from carlasc.errors import ArgumentError
 
 
+@dataclass(frozen=True)
+class SceneFlags(Flags):
+    """The choice of a scene: the same in `render` and in `view`."""
+
+    frames: FramesOption = None
+    every: Annotated[int, typer.Option(help="Take every N-th frame.", min=1)] = 1
+    sequence: Annotated[
+        str | None, typer.Option(help="Name of the sequence if there are several. Default: the first.")
+    ] = None
+    grid: Annotated[str | None, typer.Option(help="Name of the grid. Default: `evaluation`, or the first grid.")] = None
+    truth: Annotated[
+        str | None,
+        place_option("--truth", text="Ground truth: SOURCE is then a prediction, shown with it and with its errors."),
+    ] = None
+    truth_grid: Annotated[str | None, typer.Option(help="Name of the ground truth's grid. Default: as for --grid.")] = (
+        None
+    )
+    classes: Annotated[
+        str | None,
+        typer.Option(help="Class table to show, such as carlasc11 (the paper's eleven). Default: that of the data."),
+    ] = None
+    source_classes: Annotated[
+        str | None, typer.Option(help="Class table of the labels in SOURCE, if its metadata do not say it.")
+    ] = None
+
+    def scene(self, source: str, palette: PaletteName) -> carlasc.Scene:
+        """Return the scene of a source."""
+        return carlasc.Scene(source, **vars(self), palette=palette)
+
+
+def describe_frames(frames: tuple[int, ...]) -> str:
+    """Return "frame 3" or "12 frames"."""
+    return f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"
+
+
 def view(
-    source: SourceArgument,
+    scene: SceneFlags,
+    source: Annotated[
+        str,
+        place_argument(
+            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame."
+        ),
+    ],
     out: Annotated[
         Path | None,
         file_option(
@@ -35,14 +77,6 @@ def view(
             " Foxglove. A name without an ending: the folder of a page for a web server.",
         ),
     ] = None,
-    frames: FramesOption = None,
-    every: EveryOption = 1,
-    grid: GridOption = None,
-    truth: TruthOption = None,
-    truth_grid: TruthGridOption = None,
-    sequence: SequenceOption = None,
-    classes: ClassesOption = None,
-    source_classes: SourceClassesOption = None,
     palette: Annotated[
         Literal["class", "colorblind"],
         typer.Option(help="Colours of the class table, or colours for colour-blind readers."),
@@ -65,7 +99,7 @@ def view(
         str | None,
         typer.Option("--beside-grid", help="Name of its grid. Without --beside: another grid of SOURCE, shown so."),
     ] = None,
-    overwrite: OverwriteOption = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Show a sequence in a window (Open3D), or write it as a page for any browser or as a recording for Rerun or Foxglove (--out).
@@ -73,30 +107,17 @@ def view(
     All can be rotated and zoomed, step through the frames, and show or hide the grid, points, scene flow and classes.
     Without --frames, a file shows the first 60 frames; a window and the folder of a page show all.
     """
-    from carlasc import viewing
-
-    scene = viewing.Scene(
-        source,
-        sequence=sequence,
-        frames=frames,
-        every=every,
-        grid=grid,
-        truth=truth,
-        truth_grid=truth_grid,
-        classes=classes,
-        source_classes=source_classes,
-        palette=palette,
-    )
+    shown = scene.scene(source, palette)
     if out is None:
         if as_json:
             raise ArgumentError("--json", problem="a window has no figures to print", advice="write a page with `out`")
         if beside is not None or beside_grid is not None:
             raise ArgumentError("--beside", problem="a window shows one run", advice="write a page with `out`")
-        viewing.view(scene, report=echo)
+        carlasc.view(shown, report=echo)
         return
     with progress_bar("Writing the file") as progress:
-        result = viewing.view(
-            scene,
+        result = carlasc.view(
+            shown,
             out,
             thin_m=thin_m,
             beside=beside,

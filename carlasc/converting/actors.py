@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.running.engines import Engine
 from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 
@@ -47,17 +46,18 @@ class ActorSighting:
 
 def find_actors(
     points: NDArray[np.float32],
-    labels: NDArray[np.unsignedinteger] | None,
-    instances: NDArray[np.uint32] | None,
+    labels: NDArray[np.unsignedinteger],
+    instances: NDArray[np.uint32],
     classes: ClassTable,
 ) -> tuple[ActorSighting, ...]:
-    """Return the numbered actors of a scan that may move, of its (N, 4) points, (N,) class ids and (N,) numbers.
+    """Return the numbered actors of a scan that may move: those of moving classes, or of movable classes if the table has no moving ones.
 
-    If the class table has classes of moving actors, these are the actors of these classes. If it has none, they are those of all movable
-    classes.
+    Args:
+        points: (N, 4) x, y, z in metres and remission.
+        labels: (N,) class ids.
+        instances: (N,) number of each point's actor, 0 for none.
+        classes: table of the ids.
     """
-    if labels is None or instances is None:
-        return ()
     wanted = np.flatnonzero((instances > 0) & np.isin(labels, sorted(classes.moving or classes.movable)))
     wanted = wanted[(np.abs(points[wanted, :3]) < _FARTHEST_M).all(axis=1)]
     order = wanted[np.argsort(instances[wanted], kind="stable")]
@@ -71,7 +71,7 @@ def find_actors(
 
 
 @dataclass
-class _Chain:
+class _SightingChain:
     """The sightings of one actor without a long gap."""
 
     actor: int
@@ -92,12 +92,12 @@ class _Chain:
 
 
 @dataclass(frozen=True)
-class _Estimate:
+class _VelocityEstimate:
     """Estimates the velocities of an actor, in a worker."""
 
     classes: ClassTable
 
-    def __call__(self, chain: _Chain) -> list[Velocity]:
+    def __call__(self, chain: _SightingChain) -> list[Velocity]:
         """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
         poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
         sightings = [transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)]
@@ -115,14 +115,13 @@ class ActorMotion:
 
     Args:
         classes: table of the labels.
-        workers: number of actors that are worked on at the same time.
-        executor: runs the work instead of processes of our own.
+        run: how the work is spread.
     """
 
-    def __init__(self, classes: ClassTable, workers: int = 1, executor: Engine | None = None) -> None:
-        self._estimate, self._workers, self._executor = _Estimate(classes), workers, executor
-        self._chains: dict[int, _Chain] = {}
-        self._ended: list[_Chain] = []
+    def __init__(self, classes: ClassTable, run: Run = Run(workers=1)) -> None:  # noqa: B008 (frozen)
+        self._estimate, self._run_options = _VelocityEstimate(classes), run
+        self._chains: dict[int, _SightingChain] = {}
+        self._ended: list[_SightingChain] = []
         self._velocities: dict[int, dict[int, Velocity]] = {}
 
     def add(self, frame: int, seconds: float, first_T_sensor: Transform, actors: Iterable[ActorSighting]) -> None:
@@ -130,33 +129,31 @@ class ActorMotion:
         for sighting in actors:
             chain = self._chains.get(sighting.actor)
             if chain is None or frame - chain.frames[-1] > _MAX_GAP or len(chain.frames) >= _MAX_SIGHTINGS:
-                self._end(chain)
-                chain = self._chains[sighting.actor] = _Chain(sighting.actor)
+                self._ended += [] if chain is None else [chain]
+                chain = self._chains[sighting.actor] = _SightingChain(sighting.actor)
             chain.label_counts[sighting.label] = chain.label_counts.get(sighting.label, 0) + 1
             chain.frames.append(frame)
             chain.seconds.append(seconds)
             chain.poses.append(first_T_sensor)
             chain.points.append(sighting.points)
         for actor in [actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP]:
-            self._end(self._chains.pop(actor))
+            self._ended.append(self._chains.pop(actor))
         if len(self._ended) >= _BATCH:
             self._run()
 
     def finish(self) -> Mapping[int, Mapping[int, Velocity]]:
         """Return the velocity by frame number and actor."""
-        for actor in list(self._chains):
-            self._end(self._chains.pop(actor))
+        self._ended += self._chains.values()
+        self._chains = {}
         self._run()
         return self._velocities
 
-    def _end(self, chain: _Chain | None) -> None:
-        if chain is not None:
-            self._ended.append(chain)
-
     def _run(self) -> None:
-        chains = sorted(self._ended, key=_Chain.size, reverse=True)  # so that no worker has a long one left at the end
+        chains = sorted(
+            self._ended, key=_SightingChain.size, reverse=True
+        )  # so that no worker has a long one left at the end
         self._ended = []
-        with closing(run_all(self._estimate, chains, Run(self._workers, self._executor))) as estimates:
+        with closing(run_all(self._estimate, chains, self._run_options)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):
                 for frame, velocity in zip(chain.frames, velocities, strict=True):
                     self._velocities.setdefault(frame, {})[chain.actor] = velocity

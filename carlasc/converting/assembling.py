@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.protocol import Cloud, Sensor, Trajectory
+from carlasc.converting.protocol import Cloud, FrameHandle, Sensor, Trajectory
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import FormatError
+from carlasc.errors import CarlascError, FormatError, describe
+from carlasc.storage import layout
 
 _TICK_S = 1e-4  # points of so short a time have the same pose: at 30 m/s this is 3 mm
 _APART_M = 0.25  # places of one sensor within a sweep that are nearer to each other count as one
@@ -36,7 +37,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Motion:
+class VehicleMotion:
     """The motion of the vehicle around a frame.
 
     Attributes:
@@ -65,7 +66,27 @@ class Assembled:
     fields: dict[str, NDArray[Any]]
 
 
-def assemble(clouds: Sequence[Cloud], rig: Rig, motion: Motion | None, where: str) -> Assembled:
+def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> Assembled:
+    """Read a frame, and put its clouds together as `assemble` does.
+
+    Args:
+        handle: the frame.
+        rig: the sensors.
+        motion: the motion of the vehicle around the frame; None if it is not known.
+
+    Raises:
+        CarlascError: the frame cannot be read. Whatever else a converter raises becomes a FormatError, because its author may be anybody.
+    """
+    try:
+        clouds = handle.read()
+    except (CarlascError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        raise FormatError(handle.location, problem=f"the converter failed: {describe(error)}") from error
+    return assemble(clouds, rig, motion, handle.location)
+
+
+def assemble(clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, where: str) -> Assembled:
     """Put the clouds of a frame together, in their order. Every point is kept.
 
     Points that were taken one after the other are moved to where they would be at the time of the frame, if their times and the motion of
@@ -118,13 +139,13 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
         raise FormatError(f"{where}: times of points", expected="finite numbers", found=found)
 
 
-def _follows_motion(cloud: Cloud, rig: Rig, motion: Motion | None) -> bool:
+def _follows_motion(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> bool:
     """Return whether it is known where the sensor was at each point of a cloud."""
     sensor = rig.sensors[cloud.sensor]
     return cloud.seconds is not None and motion is not None and (sensor.calibrated or not sensor.deskewed)
 
 
-def _place(cloud: Cloud, rig: Rig, motion: Motion | None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _place(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the (N, 4) points and the (N, 3) origins of their rays, in the frame of the scan."""
     sensor = rig.sensors[cloud.sensor]
     scan_T_vehicle = invert(rig.vehicle_T_scan)
@@ -199,8 +220,6 @@ def _joined(parts: Sequence[NDArray[Any] | None], clouds: Sequence[Cloud], dtype
 
 
 def _other(cloud: Cloud, name: str, rig: Rig, where: str) -> NDArray[Any]:
-    from carlasc.storage import layout
-
     if name not in cloud.others:
         sensor = rig.sensors[cloud.sensor].name
         raise FormatError(where, expected=f"the field {name} from all sensors", found=f"none from {sensor}")

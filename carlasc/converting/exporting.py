@@ -2,54 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting.exporter import Exported, Exporter, FrameExporter, SequenceExporter
-from carlasc.converting.options import make_exporter
-from carlasc.converting.places import check_outside
-from carlasc.converting.records import ExportRecord
-from carlasc.converting.registry import load_exporter
-from carlasc.converting.results import Failure, Progress, Steps
-from carlasc.errors import CarlascError, FormatError, MissingDataError, StorageError
-from carlasc.running.engines import Engine
+from carlasc.converting.exporter import Exported, Exporter, FrameExporter, SequenceExporter, SequenceFile
+from carlasc.converting.registry import load_exporter, read_options
+from carlasc.converting.results import ExportResult, Failure, StepCounter, check_outside
+from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.options import Run
 from carlasc.running.parts import Part
 from carlasc.running.processes import one_pool, run_all
 from carlasc.storage.durability import make_folder, rename, sync_tree
-from carlasc.storage.files import has_content, remove_stale, write_many
+from carlasc.storage.files import has_content, parse_json, remove_stale, to_json, write_atomic, write_many
 
-
-@dataclass(frozen=True)
-class ExportResult:
-    """The result of `export`.
-
-    Attributes:
-        out: root of the data set that was written.
-        sequences: the folder of each sequence in it, or its file where a format has one, by the sequence's path in the source.
-        made: number of frames that were written.
-        skipped: number of frames that existed already.
-        failures: frames that could not be written.
-        notes: remarks about the result, one line each.
-        elapsed_s: duration in seconds.
-    """
-
-    out: Path
-    sequences: dict[str, str]
-    made: int
-    skipped: int
-    failures: tuple[Failure, ...]
-    notes: tuple[str, ...]
-    elapsed_s: float
+RECORD = "carlasc-export.json"
+"""The file that says what exports wrote to a folder."""
 
 
 def export(
@@ -59,11 +35,8 @@ def export(
     *,
     sequences: Collection[str] | None = None,
     overwrite: bool = False,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    part: Part = Part(),  # noqa: B008 (frozen)
-    progress: Progress | None = None,
-    **options: Any,
+    options: Mapping[str, Any] | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ExportResult:
     """Write sequences of the layout as another data set's files, so that its tools can read them.
 
@@ -76,12 +49,10 @@ def export(
         out: folder to write to.
         sequences: names of the sequences to export; None exports all.
         overwrite: write frames again that exist.
-        workers: number of frames that are made at the same time; None uses all cores.
-        executor: runs the work instead of processes of our own; it is not shut down.
-        part: exports only this part of the frames, or of the sequences where each is one file; other commands export the others. The part
-            that finds that nothing is missing any more writes what the data set has once.
-        progress: called with the number of finished frames and the number of all frames.
-        **options: of the exporter: the arguments of its constructor, such as `grid`. Text is read as the type of the option.
+        options: of the exporter, by name, such as `{"grid": "evaluation"}`; text is read as the type of the option (see
+            `option_declarations`).
+        run: how the work is spread. A part exports a share of the frames, or of the sequences where each is one file; the part that finds
+            that nothing is missing any more writes what the data set has once.
 
     Returns:
         What was written, what was skipped, and what failed.
@@ -93,7 +64,8 @@ def export(
         StorageError: the output cannot be written. The files written so far are complete.
     """
     start = time.perf_counter()
-    exporter = make_exporter(load_exporter(name), options)
+    kind = load_exporter(name)
+    exporter = kind(**read_options(kind, options))
     opened, root = storage.as_source(source), Path(out)
     check_outside(root, opened.location)
     every = _by_name(opened)
@@ -110,55 +82,25 @@ def export(
         record.check(places, exporter.settings)
     record.write(places, exporter.settings)
     remove_stale(root)
-    ours = _deal(exporter, chosen, part)
-    steps = Steps(progress, sum(len(exported.frames) for exported in ours))
-    with one_pool(Run(workers, executor)) as pooled:
-        run = partial(run_all, run=pooled, lost=_fail)
-        done = _Done([], 0, [])
+    ours = _deal(exporter, chosen, run.part)
+    steps = StepCounter(run.progress, sum(len(exported.frames) for exported in ours))
+    with one_pool(run) as pooled:
+        writing = _SequenceExport(exporter, root, overwrite, pooled, steps)
         for exported in ours:
-            folder = root / exported.folder
-            remove_stale(folder)
-            documents = exporter.documents(exported.sequence)
-            write_many({folder / document: data for document, data in documents.items()})
-            done += _export_sequence(exporter, exported, folder, overwrite, run, steps)
-    if part.count == 1 or all(_is_whole(exporter, exported, root / exported.folder) for exported in chosen):
-        index = exporter.index(root, done.exported if part.count == 1 else chosen)
+            writing.add(exported)
+    if run.part.count == 1 or all(_is_whole(exporter, exported, root / exported.folder) for exported in chosen):
+        index = exporter.index(root, writing.exported if run.part.count == 1 else chosen)
         write_many({root / file: data for file, data in index.items()})
-    written = sum(len(exported.frames) for exported in done.exported)
+    written = sum(len(exported.frames) for exported in writing.exported)
     return ExportResult(
         root,
         {exported.sequence.path: _place(exporter, exported) for exported in chosen},
-        written - done.skipped,
-        done.skipped,
-        tuple(done.failures),
+        written - writing.skipped,
+        writing.skipped,
+        tuple(writing.failures),
         tuple(dict.fromkeys(notes)),
         time.perf_counter() - start,
     )
-
-
-@dataclass(frozen=True)
-class _Done:
-    """What exists after some sequences were exported."""
-
-    exported: list[Exported]
-    skipped: int
-    failures: list[Failure]
-
-    def __add__(self, other: _Done) -> _Done:
-        return _Done(self.exported + other.exported, self.skipped + other.skipped, self.failures + other.failures)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """A frame to make."""
-
-    exporter: FrameExporter | SequenceExporter
-    sequence: storage.Sequence
-    frame: int
-    folder: Path
-
-
-_Run = Callable[[Callable[[_Job], Any], Sequence[_Job]], Generator[Any, None, None]]
 
 
 def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
@@ -222,45 +164,122 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
         path = folder / exporter.file(sequence)
         return has_content(path) and set(exported.frames) <= set(exporter.frames_in(path, sequence))
     assert isinstance(exporter, FrameExporter)
-    files = (file for frame in exported.frames for file in exporter.frame_files(sequence, frame))
-    return all(has_content(folder / file) for file in files)
+    return all(_exists(exporter, sequence, frame, folder) for frame in exported.frames)
 
 
-def _export_sequence(
-    exporter: Exporter, exported: Exported, folder: Path, overwrite: bool, run: _Run, steps: Steps
-) -> _Done:
-    if isinstance(exporter, FrameExporter):
-        return _export_frames(exporter, exported, folder, overwrite, run, steps)
-    assert isinstance(exporter, SequenceExporter)
-    return _export_file(exporter, exported, folder, overwrite, run, steps)
+def _exists(exporter: FrameExporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
+    """Whether all files of a frame exist."""
+    return all(has_content(folder / file) for file in exporter.frame_files(sequence, frame))
 
 
-def _export_frames(
-    exporter: FrameExporter, exported: Exported, folder: Path, overwrite: bool, run: _Run, steps: Steps
-) -> _Done:
-    """Write the frames of a sequence that do not exist yet, each in files of its own."""
-    sequence = exported.sequence
-    jobs = [
-        _Job(exporter, sequence, frame, folder)
-        for frame in exported.frames
-        if overwrite or not all(has_content(folder / file) for file in exporter.frame_files(sequence, frame))
-    ]
-    steps(len(exported.frames) - len(jobs))
-    failures = []
-    with closing(run(_write_frame, jobs)) as results:
-        for job, problem in zip(jobs, results, strict=True):
-            if problem is not None:
-                failures.append(Failure(sequence.location, job.frame, problem))
-            steps()
-    return _done(exported, len(exported.frames) - len(jobs), failures)
+@dataclass(frozen=True)
+class ExportJob:
+    """A frame to make."""
+
+    exporter: FrameExporter | SequenceExporter
+    sequence: storage.Sequence
+    frame: int
+    folder: Path
 
 
-def _fail(job: _Job, message: str) -> str:
+@dataclass
+class _SequenceExport:
+    """The export of sequences, one after the other.
+
+    Attributes:
+        exporter: what makes the files.
+        root: folder of the other data set.
+        overwrite: whether frames are written again that exist.
+        run: how the work is spread.
+        steps: is called after each frame.
+        exported: what exists after the export.
+        skipped: number of frames that existed already.
+        failures: frames that could not be written.
+    """
+
+    exporter: Exporter
+    root: Path
+    overwrite: bool
+    run: Run
+    steps: StepCounter
+    exported: list[Exported] = field(default_factory=list)
+    skipped: int = 0
+    failures: list[Failure] = field(default_factory=list)
+
+    def add(self, exported: Exported) -> None:
+        """Export the frames of a sequence."""
+        sequence, folder = exported.sequence, self.root / exported.folder
+        remove_stale(folder)
+        write_many({folder / document: data for document, data in self.exporter.documents(sequence).items()})
+        write = self._write_frames if isinstance(self.exporter, FrameExporter) else self._write_file
+        failures = write(exported, folder)
+        self.failures += [Failure(sequence.location, frame, message) for frame, message in failures.items()]
+        self.exported.append(replace(exported, frames=tuple(f for f in exported.frames if f not in failures)))
+
+    def _write_frames(self, exported: Exported, folder: Path) -> dict[int, str]:
+        """Write the frames of a sequence that do not exist yet, each in files of its own; return the messages of those that failed."""
+        exporter, sequence = self.exporter, exported.sequence
+        assert isinstance(exporter, FrameExporter)
+        jobs = [
+            ExportJob(exporter, sequence, frame, folder)
+            for frame in exported.frames
+            if self.overwrite or not _exists(exporter, sequence, frame, folder)
+        ]
+        self._skip(len(exported.frames) - len(jobs))
+        failures = {}
+        with closing(self._made(_write_frame, jobs)) as results:
+            for job, problem in zip(jobs, results, strict=True):
+                if problem is not None:
+                    failures[job.frame] = problem
+                self.steps()
+        return failures
+
+    def _write_file(self, exported: Exported, folder: Path) -> dict[int, str]:
+        """Write the file of a sequence, unless it exists with all frames; return the messages of those that failed.
+
+        A file that lacks frames is made anew.
+        """
+        exporter, sequence = self.exporter, exported.sequence
+        assert isinstance(exporter, SequenceExporter)
+        if not self.overwrite and _is_whole(exporter, exported, folder):
+            self._skip(len(exported.frames))
+            return {}
+        path = folder / exporter.file(sequence)
+        part = path.with_name(f"{path.name}.part")
+        jobs = [ExportJob(exporter, sequence, frame, folder) for frame in exported.frames]
+        failures = {}
+        try:
+            make_folder(path.parent)
+            part.unlink(missing_ok=True)  # of a run that was killed
+            with closing(self._made(_make_frame, jobs)) as results, exporter.open(part, sequence) as file:
+                for frame, made in zip(exported.frames, results, strict=True):
+                    problem = made if isinstance(made, str) else _add(file, frame, made)
+                    if problem is not None:
+                        failures[frame] = problem
+                    self.steps()
+            if len(failures) < len(exported.frames):
+                sync_tree(part)
+                rename(part, path)
+        except OSError as error:
+            raise StorageError(path, problem=f"cannot be written: {error.strerror or error}") from error
+        finally:
+            part.unlink(missing_ok=True)
+        return failures
+
+    def _skip(self, frames: int) -> None:
+        self.skipped += frames
+        self.steps(frames)
+
+    def _made(self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]) -> Generator[Any, None, None]:
+        return run_all(function, jobs, self.run, lost=_fail)
+
+
+def _fail(job: ExportJob, message: str) -> str:
     """Return the result of a frame that no worker could finish."""
     return message
 
 
-def _write_frame(job: _Job) -> str | None:
+def _write_frame(job: ExportJob) -> str | None:
     """Write one frame's files; return the error message if it cannot be done."""
     assert isinstance(job.exporter, FrameExporter)
     try:
@@ -273,37 +292,7 @@ def _write_frame(job: _Job) -> str | None:
     return None
 
 
-def _export_file(
-    exporter: SequenceExporter, exported: Exported, folder: Path, overwrite: bool, run: _Run, steps: Steps
-) -> _Done:
-    """Write the file of a sequence, unless it exists with all frames. A file that lacks frames is made anew."""
-    sequence, path = exported.sequence, folder / exporter.file(exported.sequence)
-    if not overwrite and _is_whole(exporter, exported, folder):
-        steps(len(exported.frames))
-        return _done(exported, len(exported.frames), [])
-    part = path.with_name(f"{path.name}.part")
-    jobs = [_Job(exporter, sequence, frame, folder) for frame in exported.frames]
-    failures = []
-    try:
-        make_folder(path.parent)
-        part.unlink(missing_ok=True)  # of a run that was killed
-        with closing(run(_make_frame, jobs)) as results, exporter.open(part, sequence) as file:
-            for frame, made in zip(exported.frames, results, strict=True):
-                problem = made if isinstance(made, str) else _add(file.add, frame, made)
-                if problem is not None:
-                    failures.append(Failure(sequence.location, frame, problem))
-                steps()
-        if len(failures) < len(exported.frames):
-            sync_tree(part)
-            rename(part, path)
-    except OSError as error:
-        raise StorageError(path, problem=f"cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
-    return _done(exported, 0, failures)
-
-
-def _make_frame(job: _Job) -> Mapping[str, NDArray[Any]] | str:
+def _make_frame(job: ExportJob) -> Mapping[str, NDArray[Any]] | str:
     """Return the arrays of a frame, or the error message if it cannot be done."""
     assert isinstance(job.exporter, SequenceExporter)
     try:
@@ -312,15 +301,64 @@ def _make_frame(job: _Job) -> Mapping[str, NDArray[Any]] | str:
         return str(error)
 
 
-def _add(add: Callable[[int, Any], None], frame: int, content: Mapping[str, NDArray[Any]]) -> str | None:
+def _add(file: SequenceFile, frame: int, content: Mapping[str, NDArray[Any]]) -> str | None:
     try:
-        add(frame, content)
+        file.add(frame, content)
     except CarlascError as error:
         return str(error)
     return None
 
 
-def _done(exported: Exported, skipped: int, failures: list[Failure]) -> _Done:
-    failed = {failure.frame for failure in failures}
-    frames = tuple(frame for frame in exported.frames if frame not in failed)
-    return _Done([replace(exported, frames=frames)], skipped, failures)
+class ExportRecord:
+    """The record of one exporter's product in a folder.
+
+    Args:
+        root: folder of the other data set.
+        name: name of the exporter.
+        product: what it writes.
+    """
+
+    def __init__(self, root: Path, name: str, product: str) -> None:
+        self._path, self._name, self._product = root / RECORD, name, product
+        self._all = parse_json(self._path.read_bytes(), str(self._path)) if has_content(self._path) else {}
+
+    def check(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
+        """Check that the places of sequences, which are paths in the folder, are new, or hold them, exported with the same settings.
+
+        Raises:
+            ConflictError: one holds something else.
+        """
+        known, wanted = self._all.get(self._name, {}).get(self._product, {}), _plain(settings)
+        for place, sequence in sequences.items():
+            found = known.get(place)
+            if found is None:
+                continue
+            where = self._path.parent / place
+            if found["sequence"] != sequence.path:
+                raise ConflictError(
+                    where,
+                    expected=f"the sequence {sequence.path or '.'}",
+                    found=f"{found['sequence'] or '.'}, which was exported earlier",
+                    advice="write to another folder, or replace it with `overwrite=True`",
+                )
+            if found["settings"] != wanted:
+                raise ConflictError(
+                    where,
+                    expected=f"frames that were exported with {_listed(wanted)}",
+                    found=_listed(found["settings"]),
+                    advice="write to another folder, or replace them with `overwrite=True`",
+                )
+
+    def write(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
+        """Add sequences to the record, by their places."""
+        part = self._all.setdefault(self._name, {}).setdefault(self._product, {})
+        part |= {place: {"sequence": s.path, "settings": _plain(settings)} for place, s in sequences.items()}
+        write_atomic(self._path, to_json(self._all))
+
+
+def _plain(settings: Mapping[str, Any]) -> Any:
+    return json.loads(json.dumps(dict(settings), default=str))
+
+
+def _listed(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value}" for name, value in settings.items()) or "no options"

@@ -5,38 +5,38 @@ from __future__ import annotations
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-import carlasc
-from carlasc.converting.assembling import Motion, Rig
+from carlasc.converting.assembling import Rig, VehicleMotion
+from carlasc.converting.layout_options import AxesAndClasses
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
-from carlasc.converting.target import Target
 from carlasc.converting.trajectory import (
     FILE,
     KISS_ICP,
-    PoseSource,
     at_frames,
     check_poses,
     frame_times,
+    jitter_note,
     read_trajectory,
     scan_poses,
 )
 from carlasc.core.axes import mirror_poses, mirror_spec
 from carlasc.core.boxes import Boxes
+from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
 from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError
+from carlasc.motion.options import PoseOptions
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
 from carlasc.storage.sinks import SequenceWriter, Sink
 
-SplitName = Literal["train", "val", "test", "all"]
 _AROUND_S = 1.0  # of the trajectory that a frame needs: longer than a sweep
 
 
@@ -48,14 +48,14 @@ class RecordingPlan:
         recording: what is read.
         writer: where it is written.
         times: (F,) seconds by frame number, by the recording's clock.
-        timed: whether the recording has times; if not, they are assumed.
         trajectory: poses of the vehicle by the same clock; None until they are estimated.
         poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
         pose_source: where poses come from.
         boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in the frame of the scan; None
             where the data set has no boxes.
         flow: whether flow is written.
-        note: what looks odd about the poses; None if nothing does.
+        voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
+        notes: what users must know of the poses and times, one line each.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames that lack what the motion of actors says, or whose scan is missing.
     """
@@ -63,13 +63,13 @@ class RecordingPlan:
     recording: Recording
     writer: SequenceWriter
     times: NDArray[np.float64]
-    timed: bool
     trajectory: Trajectory | None
     poses: NDArray[np.float64] | None
     pose_source: str
     boxes: dict[int, Boxes] | None
     flow: bool
-    note: str | None = None
+    voxels: GridSpec | None = None
+    notes: list[str] = field(default_factory=list)
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
 
@@ -89,7 +89,7 @@ class RecordingPlan:
         flow = ("flow",) if self.flow else ()
         return flow if self.boxes is None else ("labels", "instances", "boxes", *flow)
 
-    def motion(self, handle: FrameHandle) -> Motion | None:
+    def motion(self, handle: FrameHandle) -> VehicleMotion | None:
         """Return the motion of the vehicle around a frame; None if it is not known when the frame is read.
 
         Poses that are estimated on the way are not: they come from the scans. It makes no difference that an earlier run found them.
@@ -102,7 +102,7 @@ class RecordingPlan:
         near = slice(max(int(first) - 1, 0), int(last) + 1)
         if len(self.trajectory.world_T_vehicle[near]) < 2:
             near = slice(max(int(first) - 2, 0), int(last) + 2)
-        return Motion(Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now)
+        return VehicleMotion(Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now)
 
 
 def choose_recordings(
@@ -154,25 +154,57 @@ def plan_recording(
     recording: Recording,
     converter: type[Converter],
     sink: Sink,
-    pose_source: PoseSource,
+    target: AxesAndClasses,
+    options: PoseOptions,
     *,
     flow: bool,
-    force: bool,
+    voxels: bool,
 ) -> RecordingPlan:
-    """Read a recording's poses, times and boxes, check them, and find out which frames are missing. Nothing is written."""
+    """Read a recording's poses, times and boxes, check them, and find out which frames are missing. Nothing is written.
+
+    Args:
+        recording: the recording.
+        converter: its kind of data set.
+        sink: where it is written.
+        target: the axes and classes in which it is written.
+        options: where poses come from.
+        flow: whether flow is written, if there is any.
+        voxels: whether the recording's own voxel grids are written.
+
+    Raises:
+        FormatError: poses, times or boxes are not valid, or scans do not overlap under the poses.
+        MissingDataError: the recording has no poses or voxels, although they are asked for.
+        ConflictError: another grid exists where the voxels are written.
+    """
     writer = sink.sequence(sequence_path(recording))
     own_times = recording.times()
     times = frame_times(recording, own_times)
-    trajectory = read_trajectory(recording, times, pose_source, force=force)
+    trajectory = read_trajectory(recording, times, options)
     poses = None if trajectory is None else scan_poses(trajectory, recording, times)
-    note = None
-    if recording.rays and poses is not None and not force and writer.read_document(layout.POSES) is None:
-        note = check_poses(recording, converter, poses)
+    notes: list[str | None] = []
+    if not recording.rays:
+        notes.append("nobody knows where points were seen from, so no grids are made from them")
+    elif poses is None:
+        notes.append("there are no poses: they were estimated from the scans with KISS-ICP")
+    else:
+        if not options.force and writer.read_document(layout.POSES) is None:
+            notes.append(check_poses(recording, converter, poses))
+        notes.append(jitter_note(poses))
+    if own_times is None and recording.rays:
+        notes.append("there are no times: frames are taken to be 0.1 s apart")
     boxes = _read_boxes(recording)
-    flow = flow and (boxes is not None or (recording.has_labels and recording.has_instances))
-    source = KISS_ICP if trajectory is None else FILE
-    timed = own_times is not None
-    plan = RecordingPlan(recording, writer, times, timed, trajectory, poses, source, boxes, flow, note)
+    plan = RecordingPlan(
+        recording,
+        writer,
+        times,
+        trajectory,
+        poses,
+        KISS_ICP if trajectory is None else FILE,
+        boxes,
+        flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
+        _check_voxels(recording, writer, target) if voxels else None,
+        [note for note in notes if note],
+    )
     for handle in recording.frames:
         if not writer.has("points", handle.number):
             plan.missing.add(handle.number)
@@ -206,24 +238,24 @@ def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
     return found
 
 
-def check_voxel_grid(plan: RecordingPlan, target: Target) -> None:
-    """Check that the data set's own voxels may be written where the plan says.
+def _check_voxels(recording: Recording, writer: SequenceWriter, target: AxesAndClasses) -> GridSpec:
+    """Return the geometry of a recording's own voxels, after checking that they may be written.
 
     Raises:
         MissingDataError: the recording has no voxels.
         ConflictError: another grid of that name exists there.
     """
-    if target.voxels:
-        if plan.recording.voxels is None:
-            raise MissingDataError(
-                plan.recording.location,
-                expected="voxel grids",
-                found="none",
-                advice="copy them too, or take another value of `grids`",
-            )
-        frames = [handle.number for handle in plan.recording.frames]
-        params = voxel_params(plan.recording.voxels, target)
-        check_grid(plan.writer, layout.grid_folder(plan.recording.voxels), params, frames, overwrite=False)
+    if recording.voxels is None:
+        raise MissingDataError(
+            recording.location,
+            expected="voxel grids",
+            found="none",
+            advice="copy them too, or take another value of `grids`",
+        )
+    frames = [handle.number for handle in recording.frames]
+    params = _voxel_params(recording.voxels, target)
+    check_grid(writer, layout.grid_folder(recording.voxels), params, frames, overwrite=False)
+    return recording.voxels
 
 
 def _announce(plan: RecordingPlan) -> None:
@@ -237,7 +269,7 @@ def _announce(plan: RecordingPlan) -> None:
     plan.writer.expect({"points": [handle.number for handle in frames]}, {"points": max(points)} if points else None)
 
 
-def begin(plan: RecordingPlan, target: Target, metadata: Metadata) -> None:
+def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> None:
     """Write carlasc.json, times and the voxel grid's params.json, and take over the poses that an earlier run estimated.
 
     A second estimate might differ in its last digits.
@@ -264,9 +296,8 @@ def begin(plan: RecordingPlan, target: Target, metadata: Metadata) -> None:
     _announce(plan)
     documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
     documents[layout.TIMES] = agree_times(writer, plan.times - plan.times[0])
-    if target.voxels and plan.recording.voxels is not None:
-        params = voxel_params(plan.recording.voxels, target)
-        documents[layout.params_file(layout.grid_folder(plan.recording.voxels))] = to_json(params)
+    if plan.voxels is not None:
+        documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(_voxel_params(plan.voxels, target))
     _write(plan, documents)
     estimated = writer.read_document(layout.POSES) if plan.poses is None else None
     if estimated is not None:
@@ -276,7 +307,7 @@ def begin(plan: RecordingPlan, target: Target, metadata: Metadata) -> None:
         write_poses(plan, target)
 
 
-def write_poses(plan: RecordingPlan, target: Target) -> None:
+def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     """Write poses.txt.
 
     Raises:
@@ -306,7 +337,7 @@ def _write(plan: RecordingPlan, documents: dict[str, bytes | None]) -> None:
             plan.writer.write_document(document, data)
 
 
-def _sensors(plan: RecordingPlan, target: Target) -> list[dict[str, object]]:
+def _sensors(plan: RecordingPlan, target: AxesAndClasses) -> list[dict[str, object]]:
     """Return the record of each sensor in carlasc.json: its name, 12 numbers of its pose in the frame of scans, and its height if known."""
     records = []
     for sensor in plan.recording.sensors:
@@ -317,8 +348,8 @@ def _sensors(plan: RecordingPlan, target: Target) -> list[dict[str, object]]:
     return records
 
 
-def voxel_params(spec: GridSpec, target: Target) -> dict[str, object]:
+def _voxel_params(spec: GridSpec, target: AxesAndClasses) -> dict[str, object]:
     """Return the params.json of the data set's own voxel grid, whose right-handed geometry is `spec`."""
-    record = {"version": carlasc.__version__, "source": "voxels"}
+    record = {"version": version("carlasc"), "source": "voxels"}
     spec = mirror_spec(spec) if target.mirrored else spec
     return spec.to_params(target.classes.num_channels) | {"carlasc": record}

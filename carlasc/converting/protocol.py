@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform, check_rigid, slerp
 from carlasc.core.grids import GridSpec
-from carlasc.core.times import check_seconds
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError
 
 Split = Literal["Train", "Val", "Test"]
 
@@ -249,11 +249,12 @@ class Recording(ABC):
 class Converter(ABC):
     """Finds the recordings of one kind of data set.
 
+    Options are keyword parameters of the constructor, each with its type, its default and its help:
+    `sweeps: Annotated[bool, "Read all scans, not only key frames."] = True`. `carlasc convert NAME --help` shows them.
+
     Attributes:
         source: folder of the data set, or of one of its sequences.
-        options: what the user gave beside it, by name; all are text.
         title: what it reads, in a few words.
-        option_names: the options that it takes.
         classes: the data set's class table.
         to_carla: maps its ids to CarlaSC's.
         sensor: the sensor that took the scans.
@@ -265,7 +266,6 @@ class Converter(ABC):
     """
 
     title: ClassVar[str]
-    option_names: ClassVar[tuple[str, ...]] = ()
     classes: ClassVar[ClassTable]
     to_carla: ClassVar[Remap]
     sensor: ClassVar[str | None] = None
@@ -275,16 +275,8 @@ class Converter(ABC):
     citation: ClassVar[str | None] = None
     simulated: ClassVar[bool] = False
 
-    def __init__(self, source: Path, **options: str) -> None:
-        """Remember where the data set is.
-
-        Raises:
-            ArgumentError: the converter has no such option.
-        """
-        if unknown := sorted(set(options) - set(self.option_names)):
-            names = f"one of {', '.join(self.option_names)}" if self.option_names else "no options for this data set"
-            raise ArgumentError("option", expected=names, found=", ".join(unknown))
-        self.source, self.options = source, options
+    def __init__(self, source: Path) -> None:
+        self.source = source
 
     @abstractmethod
     def sequences(self) -> list[Recording]:

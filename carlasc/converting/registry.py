@@ -1,9 +1,18 @@
-"""The installed converters and exporters: those that distributions declare in two entry-point groups."""
+"""The installed converters and exporters, which distributions declare in two entry-point groups, and the options that each of them takes.
+
+An option of a converter or an exporter is a keyword parameter of its constructor, with its type, its default and its help text:
+
+    def __init__(self, source: Path, *, sweeps: Annotated[bool, "Read all scans, not only key frames."] = True) -> None:
+"""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter
@@ -13,6 +22,7 @@ from carlasc.errors import ArgumentError, DependencyError
 
 GROUP = "carlasc.converters"
 EXPORTERS = "carlasc.exporters"
+_TRUTH = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
 def converter_names() -> tuple[str, ...]:
@@ -65,6 +75,102 @@ def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
         if converter.classes == table:
             return (converter.to_carla,)
     return None
+
+
+@dataclass(frozen=True)
+class OptionDeclaration:
+    """An option of a converter or an exporter.
+
+    Attributes:
+        name: its name, that of a parameter of the constructor.
+        type: str, int, float or bool.
+        default: its value if it is not given.
+        help: what it does; empty if its author does not say.
+        choices: the values that it may have; empty if it may have any value of its type.
+    """
+
+    name: str
+    type: type[str] | type[int] | type[float] | type[bool]
+    default: str | int | float | bool | None
+    help: str = ""
+    choices: tuple[str, ...] = ()
+
+    def read(self, value: Any) -> Any:
+        """Return a value of the option; text is read as the type of the option.
+
+        Raises:
+            ArgumentError: the option cannot have that value.
+        """
+        if self.choices and value not in self.choices and value is not self.default:
+            raise ArgumentError(self.name, expected=f"one of {', '.join(self.choices)}", found=repr(value))
+        if not isinstance(value, str) or self.type is str:
+            return value
+        kinds: dict[type, tuple[str, Callable[[str], Any]]] = {
+            bool: ("true or false", lambda text: _TRUTH[text.lower()]),
+            int: ("a whole number", int),
+            float: ("a number", float),
+        }
+        expected, parse = kinds[self.type]
+        try:
+            return parse(value)
+        except (KeyError, ValueError):
+            raise ArgumentError(self.name, expected=expected, found=repr(value)) from None
+
+
+def option_declarations(kind: type[Converter] | type[Exporter]) -> tuple[OptionDeclaration, ...]:
+    """Return the options that a converter or an exporter declares: the parameters of its constructor, but for the source.
+
+    Raises:
+        DependencyError: annotations cannot be read, or a parameter has no default, or a type that is none of str, int, float, bool and
+            a Literal of texts.
+    """
+    try:
+        hints = get_type_hints(kind.__init__, include_extras=True)
+    except Exception as error:  # annotations of another distribution may name anything
+        raise DependencyError(f"{kind.__name__}: options", problem=f"annotations cannot be read: {error}") from error
+    parameters = [
+        parameter
+        for parameter in list(inspect.signature(kind).parameters.values())[issubclass(kind, Converter) :]
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    ]
+    return tuple(_declared(kind, parameter, hints.get(parameter.name, str)) for parameter in parameters)
+
+
+def read_options(kind: type[Converter] | type[Exporter], options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return options as the constructor of a converter or an exporter takes them; text is read as the type that is declared.
+
+    Args:
+        kind: the converter or the exporter.
+        options: values by the names of options; None for no options.
+
+    Raises:
+        ArgumentError: there is no such option, or it cannot have that value.
+        DependencyError: a declaration is not valid.
+    """
+    options, known = options or {}, {declared.name: declared for declared in option_declarations(kind)}
+    if unknown := sorted(set(options) - set(known)):
+        expected = f"one of {', '.join(known)}" if known else "no options for this data set"
+        raise ArgumentError("options", expected=expected, found=", ".join(unknown))
+    return {name: known[name].read(value) for name, value in options.items()}
+
+
+def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDeclaration:
+    """Return the option that a parameter declares, whose annotation is `hint`: `Annotated[type, help]` or a type, which may be optional."""
+    text = ""
+    if get_origin(hint) is Annotated:
+        hint, *extras = get_args(hint)
+        text = next((extra for extra in extras if isinstance(extra, str)), "")
+    types = [
+        part for part in (get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)) if part is not NoneType
+    ]
+    choices = get_args(types[0]) if get_origin(types[0]) is Literal else ()
+    found = None if len(types) > 1 else str if choices else types[0]
+    if found not in (str, int, float, bool) or not all(isinstance(choice, str) for choice in choices):
+        expected = "an option of the type str, int, float, bool or a Literal of texts"
+        raise DependencyError(f"{kind.__name__}: {parameter.name}", expected=expected, found=str(hint))
+    if parameter.default is parameter.empty:
+        raise DependencyError(f"{kind.__name__}: {parameter.name}", expected="a default", found="none")
+    return OptionDeclaration(parameter.name, found, parameter.default, text, choices)
 
 
 def _load(group: str, base: type, name: str) -> Any:

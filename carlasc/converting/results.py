@@ -1,9 +1,12 @@
-"""The results of a conversion or an export, and the counting of their steps."""
+"""What a conversion or an export returns, and what both need: the counting of steps, and the check of the place that is written to."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+
+from carlasc.errors import ConflictError
 
 Progress = Callable[[int, int], None]
 
@@ -46,10 +49,33 @@ class ConvertResult:
     elapsed_s: float
 
 
-class Steps:
+@dataclass(frozen=True)
+class ExportResult:
+    """The result of `export`.
+
+    Attributes:
+        out: root of the data set that was written.
+        sequences: the folder of each sequence in it, or its file where a format has one, by the sequence's path in the source.
+        made: number of frames that were written.
+        skipped: number of frames that existed already.
+        failures: frames that could not be written.
+        notes: remarks about the result, one line each.
+        elapsed_s: duration in seconds.
+    """
+
+    out: Path
+    sequences: dict[str, str]
+    made: int
+    skipped: int
+    failures: tuple[Failure, ...]
+    notes: tuple[str, ...]
+    elapsed_s: float
+
+
+class StepCounter:
     """Counts the steps of several stages for one progress callback. A stage adds its steps when it knows their number."""
 
-    def __init__(self, progress: Progress | None, total: int) -> None:
+    def __init__(self, progress: Progress | None, total: int = 0) -> None:
         self._progress, self._done, self._total = progress, 0, total
 
     def expect(self, more: int) -> None:
@@ -61,3 +87,28 @@ class Steps:
         self._done += steps
         if self._progress:
             self._progress(self._done, self._total)
+
+    def stage(self) -> Progress:
+        """Return the progress callback of a stage that counts its own steps."""
+        before, total = self._done, self._total
+
+        def advance(done: int, of: int) -> None:
+            self._total = total + of
+            self(before + done - self._done)
+
+        return advance
+
+
+def check_outside(out: Path, source: str) -> None:
+    """Check that a folder to write to is not the source, and not inside it. A URL is never the same place.
+
+    Raises:
+        ConflictError: it is.
+    """
+    if out.resolve().is_relative_to(Path(source).resolve()):
+        raise ConflictError(
+            out,
+            expected=f"a place outside {source}",
+            found="one inside it",
+            advice="choose another place, because the source is never written to",
+        )

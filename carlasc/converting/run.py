@@ -1,50 +1,41 @@
-"""`convert`: every recording of another data set becomes a sequence of the layout. Frames are converted in parallel."""
+"""`convert`: every recording of another data set becomes a sequence of the layout, and grids are made from what was written."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
+from collections.abc import Sequence as Series
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from carlasc.converting.places import check_outside
-from carlasc.converting.plans import (
-    RecordingPlan,
-    SplitName,
-    check_voxel_grid,
-    choose_recordings,
-    plan_recording,
-    sequence_path,
-)
+from carlasc.converting.layout_options import LayoutOptions
+from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
 from carlasc.converting.protocol import Converter, Recording
-from carlasc.converting.registry import load_converter
-from carlasc.converting.regridding import Regridding
-from carlasc.converting.results import ConvertResult, Failure, Progress, Steps
+from carlasc.converting.registry import load_converter, read_options
+from carlasc.converting.results import ConvertResult, Failure, StepCounter, check_outside
 from carlasc.converting.stages import Conversion
-from carlasc.converting.target import Target
-from carlasc.converting.trajectory import PoseSource
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.running.engines import Engine
+from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
+from carlasc.groundtruth.options import FromScans, GridOptions, Voting
+from carlasc.groundtruth.run import RegridResult, regrid
+from carlasc.motion.options import PoseOptions
 from carlasc.running.options import Run
 from carlasc.running.parts import Part
 from carlasc.running.processes import one_pool
-from carlasc.storage.metadata import Axes, Metadata
+from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
+from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.remote import check_shared
 from carlasc.storage.sinks import Sink
 from carlasc.storage.targets import LocalTarget
 
-if TYPE_CHECKING:
-    from carlasc.groundtruth import RegridResult
-    from carlasc.groundtruth.options import FromScans, Voting
-
-Grids = Literal["scans", "voxels", "none"]
-Flow = Literal["auto", "none"]
+Grids = GridOptions | Literal["voxels"] | None
 
 
 def convert(
@@ -54,27 +45,16 @@ def convert(
     *,
     sequences: Collection[str] | None = None,
     split: SplitName = "all",
-    classes: str = "carla",
-    axes: Axes = "left",
-    grids: Grids = "scans",
-    spec: GridSpec | None = None,
-    observe: FromScans | None = None,
-    voting: Voting | None = None,
-    follow_ground: bool = True,
-    poses: PoseSource = "auto",
-    flow: Flow = "auto",
-    options: Mapping[str, str] | None = None,
-    allow_unknown: bool = False,
-    force: bool = False,
-    workers: int | None = None,
-    executor: Engine | None = None,
-    part: Part = Part(),  # noqa: B008 (frozen)
-    progress: Progress | None = None,
+    layout: LayoutOptions = LayoutOptions(),  # noqa: B008 (frozen)
+    poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
+    grids: Grids = GridOptions(),  # noqa: B008 (frozen)
+    options: Mapping[str, Any] | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
-    """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes.
+    """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes; then make their grids, as `regrid` does.
 
     A second run skips the frames that exist. A frame that cannot be read is reported in the result, and the others are converted.
-    Worker processes import the main module again: scripts call this under `if __name__ == "__main__":`, or with `workers=1`.
+    Worker processes import the main module again: scripts call this under `if __name__ == "__main__":`, or with `run=Run(workers=1)`.
 
     Args:
         name: the converter: "kitti", "argoverse2", ..., or one of another distribution (see `converter_names`); or a class that
@@ -84,26 +64,13 @@ def convert(
             read while it is written.
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
-        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids.
-        axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
-        grids: "scans" makes grids from scans merged over time; "voxels" takes the data set's own voxels, with count 0 where
-            they are unknown; "none" writes no grids.
-        spec: with "scans": the grid; None takes the published coarse one.
-        observe: with "scans": which scans are merged, and how moving points are treated.
-        voting: with "scans": how votes are counted.
-        follow_ground: with "scans": move the grid up or down by whole voxels where the ground is below it, or far above its lower
-            bound; False keeps the bounds of `spec`.
-        poses: "file", "kiss-icp" (estimated from the scans), or "auto": the file where it exists, else estimated.
-        flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
-            the actor's points, if they are numbered; "none" writes no flow.
-        options: what the converter takes beside the source, as text: see its page in the documentation.
-        allow_unknown: treat class ids that the table does not have as unlabelled.
-        force: accept poses under which the scans do not overlap, or whose calibration is missing.
-        workers: number of frames that are converted at the same time; None uses all cores.
-        executor: runs the work instead of processes of our own; it is not shut down.
-        part: converts only this part of the recordings, whole ones, because poses and motion are found along each; other commands
-            convert the others. Grids then keep their height: the ground of the other recordings is not known.
-        progress: called with the number of finished steps and the number of all steps.
+        layout: how sequences are written: their classes, their axes, and whether they get flow.
+        poses: where poses come from, and whether poses are accepted under which the scans do not overlap, or whose calibration is missing.
+        grids: the grids that are made from scans merged over time; "voxels" takes the data set's own voxels, with count 0 where they are
+            unknown; None writes no grids.
+        options: what the converter takes beside the source, by name; text is read as the type of the option (see `option_declarations`).
+        run: how the work is spread. A part converts whole recordings, because poses and motion are found along each; grids then keep
+            their height, because the ground of the other recordings is not known.
 
     Returns:
         What was written, what was skipped, and what failed.
@@ -115,74 +82,107 @@ def convert(
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
-    start, run = time.perf_counter(), Run(workers, executor)
-    workers = run.processes
+    start = time.perf_counter()
     converter = load_converter(name) if isinstance(name, str) else name
-    _check(converter, classes=classes, axes=axes, grids=grids, split=split, poses=poses, flow=flow)
-    root = Path(source)
-    sink = as_sink(out, part=part)
+    target, given = layout.of(converter), read_options(converter, options)
+    root, sink = Path(source), as_sink(out, part=run.part)
     check_shared(sink.location, run)
-    _check_sink(root, sink, grids)
-    if not root.exists():
-        raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
-    if part.count > 1 and grids == "scans" and follow_ground:
-        raise ArgumentError(
-            "follow_ground",
-            expected='False, or grids="none", with `part`: the height of grids is found from the ground of all recordings',
-            found="True",
-        )
-    recordings = choose_recordings(converter(root, **(options or {})).sequences(), root, sequences, split)
-    recordings = _deal(recordings, part)
-    remap = converter.to_carla if classes == "carla" else None
-    target = Target(converter.classes, remap, axes == "left", allow_unknown, voxels=grids == "voxels")
-    metadata = Metadata(
-        axes,
-        target.classes,
-        converter.sensor,
-        converter.min_range_m,
-        converter.max_range_m,
-        f"{name if isinstance(name, str) else name.__name__} {root.name}",
-        _provenance(converter),
-    )
+    _check(root, sink, split, grids, run.part)
+
+    recordings = choose_recordings(converter(root, **given).sequences(), root, sequences, split)
+    recordings = _deal(recordings, run.part)
+    if isinstance(grids, GridOptions):
+        _check_rays(recordings)
     plans = [
-        plan_recording(recording, converter, sink, poses, flow=flow == "auto", force=force) for recording in recordings
+        plan_recording(
+            recording, converter, sink, target, poses, flow=layout.flow == "auto", voxels=isinstance(grids, str)
+        )
+        for recording in recordings
     ]
-    for plan in plans:
-        _check_grids(plan, grids)
-        check_voxel_grid(plan, target)
-    steps = Steps(progress, sum(len(plan.recording.frames) for plan in plans))
-    done: list[Conversion] = []
-    made: list[RegridResult] = []
+    origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
+    ranges = converter.min_range_m, converter.max_range_m
+    metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, _provenance(converter))
+
+    steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
     with one_pool(run) as pooled:
-        pool = pooled.executor
+        conversions = [Conversion(plan, converter, target, pooled, steps) for plan in plans]
         with ExitStack() as writers:
-            for plan in plans:
-                writers.enter_context(plan.writer)
-                done.append(Conversion(plan, converter, target, workers, pool, steps))
-                done[-1].run(metadata)
-        failures = [failure for conversion in done for failure in conversion.failures]
-        notes = [note for conversion in done for note in conversion.notes]
+            for conversion in conversions:
+                writers.enter_context(conversion.plan.writer)
+                conversion.run(metadata)
         if sink is not out:
             sink.finish(incomplete=True)  # what is missing could not be read, and is reported
-        if grids == "scans":
-            regridding = Regridding(spec, observe, voting, follow_ground, force, workers, pool, steps)
-            fitted, remarks = regridding.fit(done, sink.location)
-            notes += remarks
-            made = [regridding.run(conversion, fitted, sink) for conversion in done]
-            if sink is not out:
-                sink.finish(incomplete=True)
-    for result in made:
-        notes += result.notes
-        failures += [Failure(f.sequence, f.frame, f.message) for f in result.failures]
+        made = None
+        if isinstance(grids, GridOptions):
+            made = _make_grids(
+                conversions, grids, sink, out, poses, replace(pooled, part=Part(), progress=steps.stage())
+            )
+
+    failures = [failure for conversion in conversions for failure in conversion.failures]
+    notes = [note for conversion in conversions for note in conversion.notes]
+    if made is not None:
+        failures += [Failure(failure.sequence, failure.frame, failure.message) for failure in made.failures]
+        notes += made.notes
     return ConvertResult(
-        tuple(sink.place(sequence_path(plan.recording)) for plan in plans),
-        sum(conversion.made for conversion in done),
+        tuple(sink.place(sequence_path(recording)) for recording in recordings),
+        sum(conversion.made for conversion in conversions),
         sum(len(plan.recording.frames) - len(plan.unfinished) for plan in plans),
         tuple(failures),
-        tuple(path for result in made for path in result.grids),
+        () if made is None else made.grids,
         tuple(notes),
         time.perf_counter() - start,
     )
+
+
+class _ConvertedScans(Source):
+    """What some conversions wrote to a sink."""
+
+    def __init__(self, sink: Sink, conversions: Series[Conversion]) -> None:
+        self.location, self._source = sink.location, sink.source()
+        self._paths = {sequence_path(conversion.plan.recording) for conversion in conversions}
+
+    def sequences(self) -> dict[str, Sequence]:
+        return {path: sequence for path, sequence in self._source.sequences().items() if path in self._paths}
+
+
+def _make_grids(
+    conversions: Series[Conversion],
+    grids: GridOptions,
+    sink: Sink,
+    out: str | os.PathLike[str] | Sink,
+    poses: PoseOptions,
+    run: Run,
+) -> RegridResult | None:
+    """Make the grids of what conversions wrote to a sink; None if no scan was converted.
+
+    All grids have the same bounds, so that one training set can hold them: those of the options, moved to where the ground is if that is
+    asked for.
+    """
+    conversions = [conversion for conversion in conversions if conversion.has_scans]
+    if not conversions:
+        return None  # every frame failed, and is reported
+    spec, notes = grids.spec or GridSpec.published(), list[str]()
+    if grids.follow_ground:
+        spec, notes = _fit(spec, [one.ground for one in conversions if one.ground is not None], sink.location)
+    observe = replace(
+        grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=PoseOptions("file", poses.force)
+    )
+    voting = grids.voting or Voting()
+    result = regrid(_ConvertedScans(sink, conversions), spec, out, observe=observe, voting=voting, run=run)
+    return replace(result, notes=(*notes, *result.notes))
+
+
+def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec, list[str]]:
+    """Return the grid, moved to where the ground is, and what users must know of it. `where` is the place that is written to."""
+    fitted = fit_to_ground(spec, joined(grounds)) if grounds else spec
+    if fitted == spec:
+        return spec, []
+    low, high = (f"{pick(ground.below_m for ground in grounds):.2f}" for pick in (min, max))
+    heights = f"the sensor is {low} m" if low == high else f"the sensors are {low} to {high} m"
+    return fitted, [
+        f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to {fitted.upper[2]:g} m in z"
+        f" instead of {spec.lower[2]:g} to {spec.upper[2]:g}; bounds that are given are kept"
+    ]
 
 
 def _provenance(converter: type[Converter]) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def _provenance(converter: type[Converter]) -> dict[str, Any]:
     return {key: value for key, value in said.items() if value is not None}
 
 
-def _deal(recordings: Sequence[Recording], part: Part) -> list[Recording]:
+def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     """Return the recordings of a part: those whose middle frame is among its share of all frames."""
     if part.count == 1:
         return list(recordings)
@@ -201,38 +201,49 @@ def _deal(recordings: Sequence[Recording], part: Part) -> list[Recording]:
     return [recording for recording, share in zip(recordings, shares, strict=True) if share == part.number - 1]
 
 
-def _check(converter: type[Converter], **given: str) -> None:
-    allowed: dict[str, tuple[str, ...]] = {
-        "classes": ("carla", converter.classes.name),
-        "axes": get_args(Axes),
-        "grids": get_args(Grids),
-        "split": get_args(SplitName),
-        "poses": get_args(PoseSource),
-        "flow": get_args(Flow),
-    }
-    for option, value in given.items():
-        if value not in allowed[option]:
-            raise ArgumentError(option, expected=f"one of {', '.join(allowed[option])}", found=repr(value))
+def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> None:
+    """Check what can be checked before a recording is looked for.
 
-
-def _check_grids(plan: RecordingPlan, grids: Grids) -> None:
-    if grids == "scans" and not plan.recording.rays:
-        raise ArgumentError(
-            "grids",
-            expected="voxels or none",
-            found=f"scans for {plan.recording.location}",
-            advice="nobody knows where its points were seen from, so free space cannot be told from unknown space",
-        )
-
-
-def _check_sink(source: Path, sink: Sink, grids: Grids) -> None:
+    Raises:
+        ArgumentError: a value is not allowed, or does not fit the output.
+        ConflictError: the output lies inside the source.
+        MissingDataError: the source does not exist.
+    """
+    if split not in get_args(SplitName):
+        raise ArgumentError("split", expected=f"one of {', '.join(get_args(SplitName))}", found=repr(split))
+    if not (isinstance(grids, GridOptions) or grids in ("voxels", None)):
+        raise ArgumentError("grids", expected='GridOptions(...), "voxels" or None', found=repr(grids))
     target = getattr(sink, "target", None)
     if isinstance(target, LocalTarget):
         check_outside(target.folder, str(source))
-    if grids == "scans" and not sink.is_readable:
-        raise ArgumentError(
-            "grids",
-            expected=f"none with {sink.location}, which cannot be read while it is written",
-            found=grids,
-            advice="convert to a folder or a .zarr store",
-        )
+    if isinstance(grids, GridOptions):
+        if not isinstance(grids.observe, FromScans | None):
+            raise ArgumentError(
+                "observe", expected="FromScans(...), because scans are converted", found=str(grids.observe)
+            )
+        if not sink.is_readable:
+            raise ArgumentError(
+                "grids",
+                expected=f"none with {sink.location}, which cannot be read while it is written",
+                found="scans",
+                advice="convert to a folder or a .zarr store",
+            )
+        if part.count > 1 and grids.follow_ground:
+            raise ArgumentError(
+                "follow_ground",
+                expected="False, or `grids=None`, with `part`: the height of grids is found from the ground of all recordings",
+                found="True",
+            )
+    if not source.exists():
+        raise MissingDataError(source, expected="a folder", found="nothing", advice="check the path")
+
+
+def _check_rays(recordings: Series[Recording]) -> None:
+    for recording in recordings:
+        if not recording.rays:
+            raise ArgumentError(
+                "grids",
+                expected="voxels or none",
+                found=f"scans for {recording.location}",
+                advice="nobody knows where its points were seen from, so free space cannot be told from unknown space",
+            )

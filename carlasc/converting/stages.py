@@ -4,29 +4,27 @@ from __future__ import annotations
 
 from bisect import bisect
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.actors import ActorMotion, Velocity
-from carlasc.converting.finishing import FinishBlock, FinishJob, fail_finish_block, finish_block
-from carlasc.converting.outcomes import Outcome, in_blocks, write_outcomes
+from carlasc.converting.layout_options import AxesAndClasses
+from carlasc.converting.motion_stage import MotionBlock, MotionJob
 from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
 from carlasc.converting.protocol import Converter, FrameHandle
-from carlasc.converting.results import Failure, Steps
-from carlasc.converting.scans import Block, FrameJob, FrameResult, convert_block, fail_block
-from carlasc.converting.target import Target
-from carlasc.converting.trajectory import estimate_poses, fill_gaps, jitter_note, odometry_range
+from carlasc.converting.results import Failure, StepCounter
+from carlasc.converting.scan_stage import ConvertedFrame, ScanBlock, ScanJob, StageBlock, in_blocks, write_frames
+from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_range
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
-from carlasc.running.engines import Engine
 from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage.metadata import Metadata
@@ -34,9 +32,6 @@ from carlasc.storage.metadata import Metadata
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
 _GROUND_REACH_M = 25.0
 _NEAR_M = 250.0  # boxes farther away from the sensor hold no points
-
-Item = TypeVar("Item", Block, FinishBlock)
-Result = TypeVar("Result", bound=Outcome)
 
 
 @dataclass
@@ -47,8 +42,7 @@ class Conversion:
         plan: what is read, and where it is written.
         converter: its kind of data set.
         target: how frames are written.
-        workers: number of frames that are worked on at the same time.
-        pool: runs the work; None for this process.
+        run_options: how the work is spread.
         steps: is called after each frame of each stage.
         failures: frames that failed.
         notes: remarks about the result, one line each.
@@ -57,10 +51,9 @@ class Conversion:
 
     plan: RecordingPlan
     converter: type[Converter]
-    target: Target
-    workers: int
-    pool: Engine | None
-    steps: Steps
+    target: AxesAndClasses
+    run_options: Run
+    steps: StepCounter
     failures: list[Failure] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     ground: Ground | None = None
@@ -86,6 +79,11 @@ class Conversion:
         """Number of frames that were converted."""
         return len(self.plan.unfinished - self._failed)
 
+    @property
+    def has_scans(self) -> bool:
+        """Whether the scan of any frame exists."""
+        return any(handle.number not in self._failed for handle in self.plan.recording.frames)
+
     def _estimate_first(self) -> None:
         """Estimate the poses before scans are written, because scans are corrected by them: each scan is then read twice."""
         plan = self.plan
@@ -98,34 +96,33 @@ class Conversion:
 
         Poses are estimated on the way if there are none, and actors are followed if their motion is to be estimated.
         """
-        plan, converter = self.plan, self.converter
+        plan = self.plan
         follow = plan.flow and plan.boxes is None and bool(plan.unfinished)
         estimate = plan.poses is None
         chosen = [
             handle
             for handle in plan.recording.frames
-            if follow or estimate or handle.number in plan.missing or self.target.voxels
+            if follow or estimate or handle.number in plan.missing or plan.voxels
         ]
         self.steps(len(plan.recording.frames) - len(chosen))
-        jobs = [FrameJob(handle, handle.number in plan.missing, plan.motion(handle)) for handle in chosen]
-        voxels = plan.recording.voxels if self.target.voxels else None
+        jobs = [ScanJob(handle, plan.motion(handle), handle.number in plan.missing) for handle in chosen]
         blocks = [
-            Block(tuple(part), self.target, plan.writer, plan.rig, voxels, estimate, follow)
+            ScanBlock(tuple(part), self.target, plan.writer, plan.rig, plan.voxels, estimate, follow)
             for part in in_blocks(jobs, lambda job: job.handle.number, plan.writer)
         ]
-        actors = ActorMotion(converter.classes, self.workers, self.pool)
+        actors = ActorMotion(self.converter.classes, self.run_options)
         found: dict[int, NDArray[np.float64]] = {}
-        for result, pose in self._placed(self._work(convert_block, blocks, fail_block)):
+        for result, pose in self._placed(self._work(blocks)):
             if estimate:
                 found[result.number] = pose
             if follow:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
-        if estimate:
+        if found or (estimate and not self.failures):  # where every frame failed, that is what is reported
             plan.take_estimate(fill_gaps(list(found), np.array(list(found.values())), plan.recording))
         return actors.finish()
 
-    def _placed(self, results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, NDArray[np.float64]]]:
+    def _placed(self, results: Iterator[ConvertedFrame]) -> Iterator[tuple[ConvertedFrame, NDArray[np.float64]]]:
         """Yield the frames that were read with their poses, which are estimated on the way if they are not known."""
         usable = (result for result in results if result.failure is None)
         if self.plan.poses is not None:
@@ -134,7 +131,7 @@ class Conversion:
             return
         from carlasc.motion.odometry import MIN_POINTS, follow_scans
 
-        waiting: deque[FrameResult] = deque()
+        waiting: deque[ConvertedFrame] = deque()
 
         def scans() -> Iterator[tuple[NDArray[np.float32], None]]:
             for result in usable:
@@ -147,29 +144,25 @@ class Conversion:
         for pose in follow_scans(scans(), min_range_m=nearest, max_range_m=farthest):
             yield waiting.popleft(), pose
 
-    def _work(
-        self,
-        function: Callable[[Item], list[Result]],
-        blocks: list[Item],
-        lost: Callable[[Item, str], list[Result]],
-    ) -> Iterator[Result]:
-        """Yield what a function that works on blocks of frames returns for each frame; what workers cannot write is written here."""
-        run = partial(run_all, function, run=Run(self.workers, self.pool))
+    def _work(self, blocks: Sequence[StageBlock[Any]]) -> Iterator[ConvertedFrame]:
+        """Yield the frames of blocks after they were converted; what workers cannot write is written here."""
+        run = partial(run_all, StageBlock.convert, run=self.run_options)
 
-        def one_by_one(block: Item, message: str) -> list[Result]:
+        def one_by_one(block: StageBlock[Any], message: str) -> list[ConvertedFrame]:
             """Work on the frames of a lost block again, each alone: one of them may have killed the workers."""
             if len(block.jobs) == 1 or self.plan.writer.block > 1:
-                return lost(block, message)
+                return block.fail(message)
             singles = [replace(block, jobs=(job,)) for job in block.jobs]
-            return [result for frames in run(singles, lost=lost) for result in frames]
+            return [frame for frames in run(singles, lost=StageBlock.fail) for frame in frames]
 
         with closing(run(blocks, lost=one_by_one)) as results:
             for frames in results:
-                write_outcomes(self.plan.writer, frames)
-                for result in frames:
-                    if result.failure is not None:
-                        self._fail(result.number, result.failure)
-                    yield result
+                write_frames(self.plan.writer, frames)
+                for frame in frames:
+                    if frame.failure is not None:
+                        self._failed.add(frame.number)
+                        self.failures.append(Failure(self.plan.recording.location, frame.number, frame.failure))
+                    yield frame
                 self.steps(len(frames))
 
     def _finish(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> None:
@@ -188,29 +181,29 @@ class Conversion:
         for part in in_blocks(wanted, attrgetter("number"), plan.writer):
             near = None if tracks is None else _near(tracks, part, plan.poses)
             jobs = [
-                FinishJob(
+                MotionJob(
                     handle,
-                    plan.poses[handle.number],
                     plan.motion(handle),
                     velocities.get(handle.number, {}),
                     near,
                     boxes.get(handle.number),
                     self._labelled_around(handle),
                     plan.recording.has_labels and handle.labelled,
+                    first_T_scan=plan.poses[handle.number],
                 )
                 for handle in part
             ]
-            blocks.append(FinishBlock(tuple(jobs), self.target, plan.writer, plan.rig, plan.flow))
-        deque(self._work(finish_block, blocks, fail_finish_block), maxlen=0)  # frames are written; nothing is kept
+            blocks.append(MotionBlock(tuple(jobs), self.target, plan.writer, plan.rig, plan.flow))
+        deque(self._work(blocks), maxlen=0)  # frames are written; nothing is kept
 
-    def _labelled_around(self, handle: FrameHandle) -> tuple[FinishJob, ...]:
+    def _labelled_around(self, handle: FrameHandle) -> tuple[MotionJob, ...]:
         """Return the labelled frames before and after one that has no labels although others have."""
         plan = self.plan
         if handle.labelled or not plan.recording.has_labels or plan.poses is None:
             return ()
         place = bisect(self._labelled, handle.number, key=attrgetter("number"))
         near = self._labelled[max(place - 1, 0) : place + 1]
-        return tuple(FinishJob(other, plan.poses[other.number], plan.motion(other)) for other in near)
+        return tuple(MotionJob(other, plan.motion(other), first_T_scan=plan.poses[other.number]) for other in near)
 
     @cached_property
     def _labelled(self) -> list[FrameHandle]:
@@ -246,21 +239,9 @@ class Conversion:
         if self.ground is not None:
             write_heights(plan, self.ground.below_m)
 
-    def _fail(self, number: int, message: str) -> None:
-        self._failed.add(number)
-        self.failures.append(Failure(self.plan.recording.location, number, message))
-
     def _remarks(self) -> list[str]:
         plan = self.plan
-        notes = list(plan.recording.notes())
-        if not plan.recording.rays:
-            notes.append("nobody knows where points were seen from, so no grids are made from them")
-        elif plan.pose_source != "file":
-            notes.append("there are no poses: they were estimated from the scans with KISS-ICP")
-        elif plan.poses is not None:
-            notes += [note for note in (plan.note, jitter_note(plan.poses)) if note]
-        if not plan.timed and plan.recording.rays:
-            notes.append("there are no times: frames are taken to be 0.1 s apart")
+        notes = [*plan.recording.notes(), *plan.notes]
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
                 "points have no labels: those in boxes got the class of the box, others are ground or of no class"

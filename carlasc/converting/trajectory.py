@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.assembling import Rig, assemble
+from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.protocol import Converter, Recording, Trajectory
+from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
-from carlasc.core.times import check_seconds
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.misfit import describe_misfit
-from carlasc.inspection.structure import static_structure
+from carlasc.inspection.structure import structure_of
+from carlasc.motion.options import PoseOptions
 from carlasc.storage import layout
-from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence
 
-PoseSource = Literal["file", "kiss-icp", "auto"]
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
@@ -47,20 +44,23 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
     return check_seconds(np.asarray(times[:frames], np.float64), recording.location)
 
 
-def read_trajectory(
-    recording: Recording, times: NDArray[np.float64], pose_source: PoseSource, *, force: bool
-) -> Trajectory | None:
+def read_trajectory(recording: Recording, times: NDArray[np.float64], options: PoseOptions) -> Trajectory | None:
     """Return the poses of the vehicle at their own times, from the recording's files; None if they are to be estimated.
 
     Poses without times of their own are those of the frames.
+
+    Args:
+        recording: the recording.
+        times: (F,) seconds by frame number.
+        options: where poses come from.
 
     Raises:
         MissingDataError: the file of poses does not exist, and they are not to be estimated.
         FormatError: a frame has no pose, or there is one pose for all of them.
     """
-    trajectory = None if pose_source == KISS_ICP else recording.poses(force=force)
+    trajectory = None if options.source == KISS_ICP else recording.poses(force=options.force)
     if trajectory is None:
-        if pose_source == FILE:
+        if options.source == FILE:
             raise MissingDataError(
                 recording.location, expected="a file of poses", found="none", advice=f"copy it, or {_ESTIMATE}"
             )
@@ -125,11 +125,18 @@ def estimate_poses(
     Points of sensors that are not corrected for motion are corrected by the estimate, if their times are known. Scans that cannot be
     read are skipped: their conversion reports them. So are scans with too few points.
 
+    Args:
+        recording: its scans.
+        converter: says which points belong to the vehicle, and which are too far away.
+        times: (F,) seconds by frame number.
+        step: is called for each frame.
+
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
 
     Raises:
-        MissingDataError: no scan can be read.
+        CarlascError: no scan can be read: the error of the first one.
+        MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
     from carlasc.motion import odometry
@@ -137,13 +144,15 @@ def estimate_poses(
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
     found: list[int] = []
     read_at: list[float] = []  # times of the frames that were read
+    errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[odometry.UsableScan]:
         for handle in recording.frames:
             step()
             try:
-                scan = assemble(handle.read(), rig, None, handle.location)
-            except (CarlascError, OSError):
+                scan = read_scan(handle, rig, None)
+            except (CarlascError, OSError) as error:
+                errors.append(error)
                 continue
             used = odometry.usable_points(scan.points)
             if np.count_nonzero(used) < odometry.MIN_POINTS:
@@ -155,6 +164,8 @@ def estimate_poses(
 
     nearest, farthest = odometry_range(converter)
     poses = list(odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest))
+    if len(errors) == len(recording.frames):
+        raise errors[0]
     return fill_gaps(found, np.array(poses), recording)
 
 
@@ -192,16 +203,16 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
     Raises:
         FormatError: they do not; says which mistake the poses look like, and what to do.
     """
-    scans = _Scans(recording, converter)
-    frames = [handle.number for handle in recording.frames]
+    rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
 
     def structure(index: int) -> NDArray[np.float64]:
         try:
-            return static_structure(scans, frames[index])
-        except (FormatError, MissingDataError):
-            return np.empty((0, 3))
+            scan = read_scan(recording.frames[index], rig, None)
+        except (CarlascError, OSError):
+            return np.empty((0, 3))  # its conversion reports it
+        return structure_of(scan.points[:, :3], scan.labels, None, converter.classes)
 
-    diagnosis = diagnose_poses(structure, poses[frames])
+    diagnosis = diagnose_poses(structure, poses[[handle.number for handle in recording.frames]])
     expected = "poses under which the scans overlap"
     if diagnosis.correction is not None:
         raise FormatError(
@@ -223,36 +234,3 @@ def check_poses(recording: Recording, converter: type[Converter], poses: NDArray
         return None
     found, advice = describe_misfit(diagnosis.misfit)
     return f"{found}: {advice}, or {_ESTIMATE}"
-
-
-class _Scans(Sequence):
-    """A recording's scans as a sequence, in their own axes and classes, for functions that read sequences."""
-
-    def __init__(self, recording: Recording, converter: type[Converter]) -> None:
-        self.recording, self.path, self.location = recording, "", recording.location
-        self.split, self.name, self.coordinates = recording.split, recording.name, "cartesian"
-        self.metadata = Metadata("right", converter.classes)
-        self._handles = {handle.number: handle for handle in recording.frames}
-        self._rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
-        self._last: tuple[int, dict[str, NDArray[Any]]] = (-1, {})
-
-    def fields(self) -> frozenset[str]:
-        return frozenset(("points", "labels") if self.recording.has_labels else ("points",))
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        return np.array(list(self._handles), np.int64) if field in self.fields() else np.empty(0, np.int64)
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        if self._last[0] != frame:
-            handle = self._handles[frame]
-            scan = assemble(handle.read(), self._rig, None, handle.location)
-            self._last = frame, {"points": scan.points} | ({} if scan.labels is None else {"labels": scan.labels})
-        if field not in self._last[1]:
-            raise MissingDataError(self.location, expected=field, found="none")
-        return self._last[1][field]
-
-    def documents(self) -> tuple[str, ...]:
-        return ()
-
-    def read_document(self, name: str) -> bytes:
-        raise MissingDataError(f"{self.location}/{name}", expected="a file", found="a recording of another data set")

@@ -8,6 +8,8 @@ and the versions of Numba and NumPy. Of several processes that need the same fun
 from __future__ import annotations
 
 import fcntl
+import os
+import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -15,17 +17,17 @@ from contextlib import suppress
 from functools import cache, partial
 from inspect import getfile
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FunctionType
 from typing import IO, Any, ClassVar, overload
 
 import numba
 import numpy as np
 from numba.core import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.dispatcher import Dispatcher
-from numba.misc.appdirs import AppDirs
 
-from carlasc import first_use
+from carlasc.core import first_use
 
 first_use.connect()
 
@@ -61,16 +63,20 @@ def cached(function: Any = None, /, *, error_model: str = "numpy", fastmath: boo
 
 def _compile(function: FunctionType, **options: Any) -> Any:
     dispatcher: Any = numba.njit(nogil=True, **options)(function)
-    dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
+    try:
+        dispatcher._cache = _SharedCache(function)
+    except OSError:  # the source is in a zip, or the folder cannot be written to
+        dispatcher.enable_caching()
     return dispatcher
 
 
 def cache_folder() -> Path:
     """Return the folder of what is compiled: `NUMBA_CACHE_DIR`, or that of the user's caches (`XDG_CACHE_HOME`)."""
     settings: Any = config  # without types
-    base = settings.CACHE_DIR or AppDirs(appname="carlasc", appauthor=False).user_cache_dir  # type: ignore[no-untyped-call]
+    usual = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    base = settings.CACHE_DIR or Path(usual, "carlasc")
     checked = "-checked" if settings.BOUNDSCHECK else ""
-    return Path(base) / f"compiled-numba{numba.__version__}-numpy{np.__version__}{checked}"
+    return Path(base).expanduser() / f"compiled-numba{numba.__version__}-numpy{np.__version__}{checked}"
 
 
 def fingerprint(function: FunctionType) -> int:
@@ -90,7 +96,7 @@ def _sum(file: str) -> str:
 
 
 def _parts(function: FunctionType, seen: set[FunctionType]) -> Iterator[FunctionType]:
-    """Yield a function and the compiled functions that it calls, and those that these call."""
+    """Yield a function and every compiled function that it calls, directly or through others."""
     if function in seen:
         return
     seen.add(function)
@@ -111,22 +117,22 @@ def _names(function: FunctionType) -> Iterator[tuple[str, Any]]:
             yield name, cell.cell_contents
 
 
-class _Locator(_CacheLocator):
-    """Where a function is kept, and the name that tells its versions apart. Numba's protocol."""
+class _SourceLocator:
+    """Where a function is kept, and the name that tells its versions apart: what Numba asks of a locator."""
 
     def __init__(self, function: FunctionType, file: str) -> None:
         self._py_file = file  # for Numba's warnings
         self._folder = cache_folder() / function.__module__
         self._stamp = fingerprint(function)
+        self.ensure_cache_path()
 
     @classmethod
-    def from_function(cls, py_func: FunctionType, py_file: str) -> _Locator | None:
-        try:
-            locator = cls(py_func, py_file)
-            locator.ensure_cache_path()  # type: ignore[no-untyped-call]
-        except OSError:  # no file, such as in a zip; or no folder that can be written to: Numba's own locators follow
-            return None
-        return locator
+    def from_function(cls, py_func: FunctionType, py_file: str) -> _SourceLocator:
+        return cls(py_func, py_file)
+
+    def ensure_cache_path(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=self._folder).close()  # raises OSError where nothing can be written
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -138,15 +144,21 @@ class _Locator(_CacheLocator):
         return f"{self._stamp:08x}"
 
 
-class _Files(CompileResultCacheImpl):
-    _locator_classes: ClassVar[list[Any]] = [_Locator, *CompileResultCacheImpl._locator_classes]  # type: ignore[misc]
+class _CompiledFiles(CompileResultCacheImpl):
+    _locator_classes: ClassVar[list[Any]] = [_SourceLocator]  # type: ignore[misc]
 
 
-class _Cache(FunctionCache):
+class _SharedCache(FunctionCache):
     """Keeps what is compiled of a function. Of the processes that need it at the same time, one compiles it and the others wait for that one."""
 
-    _impl_class = _Files
-    _lock: IO[bytes] | None = None
+    _impl_class = _CompiledFiles
+
+    def __init__(self, function: FunctionType) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        name = f"{Path(getfile(function)).stem}.{function.__name__}-{fingerprint(function):08x}.lock"
+        self._versions = f"*.{function.__name__}-*"  # files
+        self._lock_path = Path(self.cache_path, name)
+        self._lock: IO[bytes] | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -169,7 +181,7 @@ class _Cache(FunctionCache):
         """Wait until no other process compiles the function, but not for ever: it may have been stopped, or its compiling has failed."""
         self._release()  # what a compilation has left that was interrupted
         try:
-            self._lock = (Path(self._cache_path) / f"{self._impl.filename_base}.lock").open("ab")
+            self._lock = self._lock_path.open("ab")
             until = time.monotonic() + _WAITED_S
             while time.monotonic() < until:
                 with suppress(BlockingIOError):
@@ -185,8 +197,7 @@ class _Cache(FunctionCache):
             lock.close()
 
     def _remove_old(self) -> None:
-        name, _, _ = self._impl.filename_base.rpartition("-")
-        for old in Path(self._cache_path).glob(f"{name}-*"):
+        for old in Path(self.cache_path).glob(self._versions):
             with suppress(OSError):  # another process removes them too
                 if time.time() - old.stat().st_mtime > _KEPT_S:
                     old.unlink()

@@ -8,14 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError, FormatError
 
-Coordinates = Literal["cartesian", "cylindrical"]
 Triple = tuple[float, float, float]
 
 _PI32 = float(np.float32(np.pi))  # a little above pi: an azimuth of exactly pi is inside the published bounds

@@ -1,15 +1,20 @@
-"""Class ids as samples hold them: mapped by one lookup table, with errors that name the file and the id."""
+"""The fields of a sample that come from labels and grids: mapped class ids, which voxels are known, and how certain they are."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.evidence import VoxelFlag, is_confident
 from carlasc.core.tables import remap_named
+from carlasc.dataset.transforms import Sample
 from carlasc.errors import ArgumentError, FormatError
+from carlasc.storage import Sequence, layout
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
 """What a `remap` argument takes: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids; None keeps the ids."""
@@ -68,3 +73,128 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     ids = sorted(set(mapping.values()))
     target = ClassTable("custom", {i: f"class {i}" for i in ids}, dict.fromkeys(ids, _GREY))
     return Remap("custom", classes, target, mapping)
+
+
+_PARTS = {  # field of a sample -> fields of the grid
+    "labels": ("labels",),
+    "known": ("counts",),
+    "counts": ("counts",),
+    "posterior": ("counts", "occupied", "classes"),
+    "occupied": ("occupied",),
+    "flags": ("flags",),
+    "views": ("views",),
+}
+OF_GRID = frozenset(_PARTS)
+"""The fields of a sample that come from a grid."""
+_PLAIN: dict[str, type[np.generic]] = {
+    "occupied": np.float32,
+    "flags": np.uint8,
+    "views": np.uint16,
+}  # types in samples
+
+
+@dataclass(frozen=True)
+class GridFields:
+    """Which fields of a sample come from a grid, and which of its voxels are known.
+
+    Attributes:
+        fields: names of fields; those that do not come from a grid are ignored.
+        inferred: whether voxels that no scan saw, but that were completed, are known.
+        min_confidence: voxels that are neither free nor occupied with at least this probability are not known.
+
+    Raises:
+        ArgumentError: a confidence outside of 0 <= c < 1.
+    """
+
+    fields: frozenset[str]
+    inferred: bool
+    min_confidence: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_confidence < 1:
+            found = str(self.min_confidence)
+            raise ArgumentError("min_confidence", expected="a probability from 0 to below 1", found=found)
+
+    def parts(self, grids: Sequence, grid: str) -> set[str]:
+        """Return the names of the grid's fields that a frame must have."""
+        parts = {part for field in self.fields & OF_GRID for part in _PARTS[field]}
+        if self._needs_known:
+            parts |= set() if self.inferred else {"flags"}
+            parts |= {"occupied"} if self.min_confidence else set()
+        if "counts" in parts and "counts" not in self.fields and not len(grids.frames(f"{grid}/counts")):
+            parts = parts - {"counts"} | {"labels"}  # every voxel is known, in all frames that have labels
+        return parts
+
+    def read(self, grids: Sequence, grid: str, frame: int, label_map: LabelMap) -> Sample:
+        """Read the fields of a frame.
+
+        Raises:
+            FormatError: a file does not hold what it must; names the file.
+        """
+
+        def read(part: str) -> NDArray[Any]:
+            return grids.read(f"{grid}/{part}", frame)
+
+        def where(part: str) -> str:
+            return f"{grids.location}: {grid}/{part} of frame {frame}"
+
+        sample: Sample = {name: np.array(read(name), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
+        if "labels" in self.fields:
+            sample["labels"] = label_map(read("labels"), where("labels"))
+        if "counts" in self.fields:
+            sample["counts"] = np.array(read("counts"), np.float32)
+        if self._needs_known:
+            counted = len(grids.frames(f"{grid}/counts"))
+            known = read("counts") > 0 if counted else np.ones(grids.grids[grid].size, np.bool_)
+            if not self.inferred:
+                known = known & ((read("flags") & int(VoxelFlag.INFERRED)) == 0)
+            if self.min_confidence:
+                known = known & is_confident(read("occupied"), self.min_confidence)
+            sample["known"] = known
+        if "posterior" in self.fields:
+            occupied, classes = read("occupied"), read("classes")
+            sample["posterior"] = soft_labels(occupied, classes, sample["known"], label_map, where("classes"))
+        return sample
+
+    @property
+    def _needs_known(self) -> bool:
+        return not self.fields.isdisjoint(("known", "posterior"))
+
+
+def soft_labels(
+    occupied: NDArray[np.floating],
+    classes: NDArray[Any],
+    known: NDArray[np.bool_],
+    label_map: LabelMap,
+    where: str,
+) -> NDArray[np.float32]:
+    """Return the probability of each class in each voxel.
+
+    With the probability p of a voxel and that of a class c if the voxel is occupied, the voxel is free (class 0) with probability
+    1 - p, and occupied by c with p * c. Classes that the map takes to the same id are added up. If the classes of a voxel do not add
+    up to 1, its soft labels do not either: nothing is known of the rest.
+
+    Args:
+        occupied: (X, Y, Z), the field `<grid>/occupied`.
+        classes: (M,), the field `<grid>/classes`.
+        known: (X, Y, Z), voxels that are known; the others get zeros.
+        label_map: maps the class ids of the grid.
+        where: the field, for errors.
+
+    Returns:
+        (K, X, Y, Z) float32, where K is the largest id of the map's target plus 1.
+
+    Raises:
+        FormatError: a voxel is not in the grid, or a class id is not in the map.
+    """
+    voxel, count = classes["voxel"].astype(np.int64), known.size
+    if len(voxel) and not 0 <= int(voxel.min()) <= int(voxel.max()) < count:
+        outside = voxel[(voxel < 0) | (voxel >= count)]
+        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
+    label = label_map(np.ascontiguousarray(classes["label"]), where).astype(np.int64)
+    p = np.where(known, occupied, 0).astype(np.float32).reshape(-1)
+    posterior = np.zeros((max(label_map.target.names) + 1, count), np.float32)
+    posterior[0] = known.reshape(-1) - p
+    share = classes["votes"].astype(np.float32) / np.float32(layout.CERTAIN)
+    np.add.at(posterior.reshape(-1), label * count + voxel, p[voxel] * share)
+    return posterior.reshape(-1, *known.shape)

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
-from carlasc.dataset.grids import OF_GRID, GridFields
-from carlasc.dataset.labels import LabelMap, RemapLike
+from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.scans import RecentScans
 from carlasc.dataset.selection import (
-    Part,
+    SequenceFrames,
     choose_sequences,
     common_frames,
     common_value,
@@ -235,7 +234,7 @@ class Dataset(_MapStyle):
 
     def cached_files(self, indices: Iterable[int]) -> list[tuple[CachedTree, str]]:
         """Return the files that samples are read from, each once, where they are read through a cache."""
-        frames: dict[Part, list[int]] = {}
+        frames: dict[SequenceFrames, list[int]] = {}
         for index in indices:
             part, frame = self._frame_at(index)
             frames.setdefault(part, []).append(frame)
@@ -278,14 +277,14 @@ class Dataset(_MapStyle):
     def _needs_poses(self) -> bool:
         return "poses" in self.fields or (self._asks(_STACKS) and self.align and self.history > 1)
 
-    def _part(self, scans: Sequence, grids: Sequence | None, grid: str) -> Part:
+    def _part(self, scans: Sequence, grids: Sequence | None, grid: str) -> SequenceFrames:
         wanted = {(scans, _OF_SCAN[field]): None for field in self.fields if field in _OF_SCAN}
         if self._asks(_STACKS) or not self._asks(OF_GRID):
             wanted[scans, "points"] = None
         if grids is not None:
             parts = self._grid_fields.parts(grids, grid)
             wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
-        part = Part(scans, grids, grid, common_frames(wanted), tuple(wanted))
+        part = SequenceFrames(scans, grids, grid, common_frames(wanted), tuple(wanted))
         if self._needs_poses:
             part.check_poses()
         return part
@@ -314,11 +313,11 @@ class Dataset(_MapStyle):
             )
         return label_map
 
-    def _frame_at(self, place: int) -> tuple[Part, int]:
+    def _frame_at(self, place: int) -> tuple[SequenceFrames, int]:
         which = int(np.searchsorted(self._starts, place, side="right")) - 1
         return self._parts[which], int(self._parts[which].frames[place - self._starts[which]])
 
-    def _stacks(self, part: Part, past: list[int | None], poses: NDArray[np.float64] | None) -> Sample:
+    def _stacks(self, part: SequenceFrames, past: list[int | None], poses: NDArray[np.float64] | None) -> Sample:
         from carlasc.dataset.stacking import stack_scans
 
         spec = self.spec
@@ -343,7 +342,7 @@ class Dataset(_MapStyle):
             )
         return stacks
 
-    def _scan(self, part: Part, frame: int) -> Sample:
+    def _scan(self, part: SequenceFrames, frame: int) -> Sample:
         sample: Sample = {}
         if "points" in self.fields:
             (points,) = self._recent.read(part.scans, [frame])

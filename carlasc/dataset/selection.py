@@ -24,7 +24,7 @@ _RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class SequenceFrames:
     """One sequence of a Dataset.
 
     Attributes:

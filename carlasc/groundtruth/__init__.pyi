@@ -1,5 +1,4 @@
 from .from_grid import resample as resample
-from .jobs import FrameFailure as FrameFailure
 from .options import Complete as Complete
 from .options import Dynamic as Dynamic
 from .options import FromCapture as FromCapture
@@ -11,8 +10,9 @@ from .options import Voting as Voting
 from .run import RegridResult as RegridResult
 from .run import regrid as regrid
 from .voting.ballot import Ballot as Ballot
+from .voting.ballot import Observation as Observation
 from .voting.ballot import VoteRule as VoteRule
 from .voting.ballot import Votes as Votes
 from .voting.ballot import count_votes as count_votes
-from .voting.evidence import Evidence as Evidence
-from .voting.observations import Observation as Observation
+from .voting.certainty import VoxelCertainty as VoxelCertainty
+from .work import FrameFailure as FrameFailure

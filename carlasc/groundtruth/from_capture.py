@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.raw import Capture, Recording, find_captures
+from carlasc.captures.raw import Capture, SensorRecording, find_captures
 from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.groundtruth.inputs import FrameData, FrameInput, Plan, SequenceInput, choose_frames
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput, choose_frames
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Source
@@ -35,7 +34,7 @@ class CaptureFrame(FrameInput):
         always = ("points", "labels", "flow", "instances")
         return (*always, "bev") if self.capture.has_bev(self.source_frame) else always
 
-    def make(self, plan: Plan) -> FrameData:
+    def make(self, plan: GridPlan) -> FrameData:
         """Read the ego sensor's recording, which is the scan, and count the votes of all sensors.
 
         The other recordings are read one at a time, so memory does not grow with the number of sensors.
@@ -54,7 +53,7 @@ class CaptureFrame(FrameInput):
         votes = count_votes(self._observations(ego), plan.spec, self.capture.classes, rule=plan.rule, free_step_m=step)
         return FrameData(fields, votes.to_grid(), votes)
 
-    def _observations(self, ego: Recording) -> Iterator[Observation]:
+    def _observations(self, ego: SensorRecording) -> Iterator[Observation]:
         for sensor in self.sensors:
             recording = ego if sensor == self.sensors[0] else self.capture.read(sensor, self.source_frame)
             ego_T_sensor = relative_to(ego.world_T_sensor, recording.world_T_sensor)
@@ -64,7 +63,7 @@ class CaptureFrame(FrameInput):
 class CaptureSequence(SequenceInput):
     """A capture as a sequence: its frames are renumbered from 0."""
 
-    def __init__(self, capture: Capture, path: str, plan: Plan) -> None:
+    def __init__(self, capture: Capture, path: str, plan: GridPlan) -> None:
         self.path, self.location, self.metadata = path, capture.location, Metadata(classes=capture.classes)
         self.capture, self.plan = capture, plan
 
@@ -110,7 +109,7 @@ class CaptureSequence(SequenceInput):
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 
-def capture_sequences(source: str | os.PathLike[str] | Source | Capture, plan: Plan) -> list[SequenceInput]:
+def capture_sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
     """Find the captures in or below a folder.
 
     Raises:

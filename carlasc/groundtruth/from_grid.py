@@ -15,7 +15,7 @@ from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
-    Plan,
+    GridPlan,
     SequenceInput,
     StoredSequence,
     choose_frames,
@@ -98,7 +98,7 @@ class ResampledFrame(FrameInput):
         """Return the names of the scan fields that the frame has."""
         return scan_fields(self.sequence, self.number)
 
-    def make(self, plan: Plan) -> FrameData:
+    def make(self, plan: GridPlan) -> FrameData:
         """Read the frame and resample its grid."""
         fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
         finer = self.sequence.grid(self.finer, self.number)
@@ -108,7 +108,7 @@ class ResampledFrame(FrameInput):
 class ResampledSequence(StoredSequence):
     """A sequence whose finer grid is resampled."""
 
-    def __init__(self, sequence: Sequence, finer: str, plan: Plan) -> None:
+    def __init__(self, sequence: Sequence, finer: str, plan: GridPlan) -> None:
         super().__init__(sequence, plan)
         self.finer = finer
 
@@ -125,7 +125,9 @@ class ResampledSequence(StoredSequence):
         return {"observe": "grid", "grid": self.finer}
 
 
-def resampled_sequences(source: str | os.PathLike[str] | Source, plan: Plan, observe: FromGrid) -> list[SequenceInput]:
+def resampled_sequences(
+    source: str | os.PathLike[str] | Source, plan: GridPlan, observe: FromGrid
+) -> list[SequenceInput]:
     """Find the sequences of a source that have a finer grid of the same coordinates.
 
     Raises:

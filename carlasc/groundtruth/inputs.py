@@ -23,7 +23,7 @@ from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.facts import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
-from carlasc.groundtruth.voting.evidence import Evidence
+from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.running.options import Run
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
@@ -32,7 +32,7 @@ from carlasc.storage.sinks import SequenceWriter
 
 
 @dataclass(frozen=True)
-class Plan:
+class GridPlan:
     """What a run makes: the same for each of its sequences and frames.
 
     Attributes:
@@ -92,16 +92,16 @@ class FrameData:
         fields: the scan fields that are written beside the grid, by name.
         grid: the grid.
         votes: the votes that decided the grid; None for a resampled grid.
-        evidence: how certain each voxel is; None unless the plan needs it (`Plan.needs_evidence`).
+        evidence: how certain each voxel is; None unless the plan needs it (`GridPlan.needs_evidence`).
     """
 
     fields: Mapping[str, NDArray[Any]]
     grid: Grid
     votes: Votes | None
-    evidence: Evidence | None = None
+    evidence: VoxelCertainty | None = None
 
 
-class Steps:
+class RunProgress:
     """Counts the steps of a run: scans of the passes before, and frames."""
 
     def __init__(self, progress: Callable[[int, int], None] | None, done: int, total: int) -> None:
@@ -131,7 +131,7 @@ class FrameInput(ABC):
         """Return the names of the scan fields that `make` returns."""
 
     @abstractmethod
-    def make(self, plan: Plan) -> FrameData:
+    def make(self, plan: GridPlan) -> FrameData:
         """Read the frame and make its grid.
 
         Raises:
@@ -139,7 +139,7 @@ class FrameInput(ABC):
             FormatError: the content of a file is not valid.
         """
 
-    def thinned(self, plan: Plan) -> Grid | None:
+    def thinned(self, plan: GridPlan) -> Grid | None:
         """Return the grid without a tenth of the scans of other frames; None if it is not made from scans of other frames."""
         return None
 
@@ -235,7 +235,7 @@ class SequenceInput(ABC):
 class StoredSequence(SequenceInput):
     """A sequence of the layout: its scans, poses and times are kept, and frames keep their numbers."""
 
-    def __init__(self, sequence: Sequence, plan: Plan) -> None:
+    def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
         self.sequence, self.plan = sequence, plan
         self.path = parent_path(sequence)
         self.location, self.metadata = sequence.location, sequence.metadata

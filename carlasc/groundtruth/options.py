@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
+from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 from carlasc.motion.options import MotionOptions, PoseOptions
-
-Dynamic = Literal["align", "current", "drop", "tube"]
-Complete = Literal["seen", "mirror", "body"]
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from carlasc.captures.names import RAW
-from carlasc.captures.raw import Capture, find_captures
+from carlasc.captures.raw import RAW, Capture, find_captures
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
-from carlasc.groundtruth.inputs import Plan, SequenceInput
-from carlasc.groundtruth.jobs import FrameFailure, Job, Work
+from carlasc.groundtruth.inputs import GridPlan, SequenceInput
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
+from carlasc.groundtruth.work import FrameFailure, SequenceJob, Work
 from carlasc.running.options import Run
 from carlasc.running.processes import one_pool
 from carlasc.storage import as_source, layout
@@ -114,7 +113,7 @@ def regrid(
     sink = as_sink(_folder_of(source) if out is None else out, part=run.part)
     for place in (sink.location, str(source)):
         check_shared(place, run)
-    plan = Plan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
+    plan = GridPlan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
     jobs = [_prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)]
 
     with ExitStack() as open_things:
@@ -165,7 +164,7 @@ def _choose(source: str | os.PathLike[str] | Source | Capture) -> Observe:
     return FromScans()
 
 
-def _sequences(source: str | os.PathLike[str] | Source | Capture, plan: Plan) -> list[SequenceInput]:
+def _sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
     """Return the sequences of a source.
 
     Raises:
@@ -198,7 +197,7 @@ def _folder_of(source: str | os.PathLike[str] | Source | Capture) -> str | Path:
     return folder.resolve().parent if folder.resolve().name in (RAW, *layout.COORDINATES) else folder
 
 
-def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) -> Job:
+def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bool) -> SequenceJob:
     """Compare what exists with what this run makes, and stop before anything is written if they do not agree."""
     path = "/".join(part for part in (inputs.path, plan.spec.coordinates) if part)
     writer = sink.sequence(path)
@@ -217,10 +216,10 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: Plan, *, overwrite: bool) 
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    return Job(path, inputs, plan, writer, needed, params, replaces=exists and overwrite)
+    return SequenceJob(path, inputs, plan, writer, needed, params, replaces=exists and overwrite)
 
 
-def _begin(job: Job) -> None:
+def _begin(job: SequenceJob) -> None:
     """Write the documents of a sequence: the settings of its grid first, so that a run with others that began at the same time finds them.
 
     Raises:

@@ -3,6 +3,7 @@ from .cards.card import card as card
 from .cards.facts import CardDetails as CardDetails
 from .findings import Finding as Finding
 from .findings import ValidationResult as ValidationResult
+from .heldout import EVERY as EVERY
 from .heldout import HoldoutResult as HoldoutResult
 from .heldout import holdout as holdout
 from .heldout_scores import HeldOutScores as HeldOutScores

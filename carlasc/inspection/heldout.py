@@ -17,13 +17,13 @@ from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.others import feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
-from carlasc.groundtruth.inputs import Plan, Steps
+from carlasc.groundtruth.inputs import GridPlan, RunProgress
 from carlasc.inspection.heldout_scores import HeldOutScores
+from carlasc.motion.tracks import MovingActors
 from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import layout
@@ -82,10 +82,10 @@ class _HeldOutFrame:
 
     path: str
     feed: ScanFeed
-    actors: Actors
+    actors: MovingActors
     whole: Sequence
     frame: int
-    plan: Plan
+    plan: GridPlan
 
 
 def holdout(
@@ -123,10 +123,10 @@ def holdout(
         raise ArgumentError("every", expected="2 or more", found=str(every))
     if spec.coordinates != "cartesian":
         raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
-    plan = Plan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
+    plan = GridPlan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
     inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
     drives = [_HeldOutDrive.of(sequence, every) for sequence in inputs]
-    steps = Steps(run.progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
+    steps = RunProgress(run.progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
     tasks = [task for drive in drives for task in drive.tasks(run, steps)]
     scores: dict[str, HeldOutScores] = {}
     failures = []
@@ -173,7 +173,7 @@ class _HeldOutDrive:
     def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
         """Find the actors in the scans that are left, and return a task for each frame to measure."""
         feed, inputs = self.feed, self.inputs
-        actors = Actors()
+        actors = MovingActors()
         if feed.needs_actors:
             actors = find_actors(feed, run, steps)
         first, last = feed.options.window

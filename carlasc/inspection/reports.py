@@ -13,7 +13,7 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDa
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
-from carlasc.groundtruth.inputs import Plan, Steps, without_caches
+from carlasc.groundtruth.inputs import GridPlan, RunProgress, without_caches
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.heldout import EVERY
@@ -117,7 +117,7 @@ _Measured = FrameFacts | FrameFailure
 
 def _measure_all(makers: list[_ReportMaker], run: Run) -> list[list[_Measured]]:
     """Return what was measured of the frames of each report."""
-    steps = Steps(run.progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
+    steps = RunProgress(run.progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
     for maker in makers:
         maker.find_actors(run, steps)
     tasks = [(row, task) for row, maker in enumerate(makers) for task in maker.tasks()]
@@ -138,7 +138,7 @@ class _ReportedFrame:
     grid: str
     number: int
     scans: ScanFrame | None  # the scans that it was made from
-    plan: Plan | None  # to make it again without a tenth of the scans
+    plan: GridPlan | None  # to make it again without a tenth of the scans
 
 
 class _ReportMaker:
@@ -233,7 +233,7 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
             return None
         options = _options_of(known)
         voting = Voting(known.get("voting"), float(known.get("free_step_m", Voting().free_step_m)))
-        plan = Plan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
+        plan = GridPlan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
         inputs = ScanSequence(sequence, plan, options)
         return inputs if len(inputs.feed.frames) else None
     except (CarlascError, ValueError, TypeError, OverflowError):  # the record of another version, or no valid poses

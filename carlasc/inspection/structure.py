@@ -6,6 +6,8 @@ the poses of a sensor that does not move. Points on moving objects, and points s
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,15 +42,32 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
         CarlascError: the points cannot be read.
     """
     points = np.asarray(sequence.read("points", frame))[:, :3]
-    keep = within(points, points.dtype.type(MIN_RANGE_M), points.dtype.type(MAX_RANGE_M))
     labels = _per_point(sequence, "labels", frame, len(points))
+    flow = _per_point(sequence, "flow", frame, len(points))
+    return structure_of(points, labels, flow, sequence.metadata.classes)
+
+
+def structure_of(
+    points: NDArray[np.floating], labels: NDArray[Any] | None, flow: NDArray[Any] | None, classes: ClassTable
+) -> NDArray[np.float64]:
+    """Return the structure of a scan.
+
+    Args:
+        points: (N, 3) metres, in the frame of the sensor.
+        labels: (N,) class ids; None if the scan has none.
+        flow: (N, 3) velocity over ground, m/s; None if it is not known.
+        classes: table of the ids.
+
+    Returns:
+        (M, 3) float64 points, metres, in the frame of the sensor.
+    """
+    keep = within(points, points.dtype.type(MIN_RANGE_M), points.dtype.type(MAX_RANGE_M))
     if labels is not None and bool(labels.any()):
-        keep &= _static_classes(sequence.metadata.classes)[
+        keep &= _static_classes(classes)[
             np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)  # packed stores keep labels in uint8
         ]
     else:
         keep[keep] = _is_upright(points[keep])
-    flow = _per_point(sequence, "flow", frame, len(points))
     if flow is not None:
         keep &= _rows(np.abs(flow) < 0.1)
     return points[np.flatnonzero(keep)].astype(np.float64)
@@ -71,7 +90,7 @@ def upright(points: NDArray[np.floating]) -> NDArray[np.float64]:
     return near[_is_upright(near)].astype(np.float64)
 
 
-def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[np.generic] | None:
+def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[Any] | None:
     """Return a field of the points; None if it is missing or cannot be read, which other checks report."""
     if field not in sequence.fields():
         return None

@@ -11,7 +11,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError
 
 
-class Outcome(IntEnum):
+class VoxelOutcome(IntEnum):
     """How one voxel of a prediction compares with the ground truth."""
 
     NOT_COMPARED = 0
@@ -34,7 +34,7 @@ def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
         truth: voxels with count 0 are unknown and are not compared; without counts, every voxel is known.
 
     Returns:
-        (X, Y, Z) uint8, an `Outcome` for each voxel.
+        (X, Y, Z) uint8, an `VoxelOutcome` for each voxel.
 
     Raises:
         ArgumentError: the grids differ in their geometry.
@@ -43,8 +43,8 @@ def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
     predicted, occupied = prediction.labels > 0, truth.labels > 0
     outcomes = np.select(
         [~truth.known, occupied & (prediction.labels == truth.labels), occupied & predicted, occupied, predicted],
-        [Outcome.NOT_COMPARED, Outcome.RIGHT, Outcome.WRONG, Outcome.MISSED, Outcome.INVENTED],
-        default=Outcome.NOT_COMPARED,
+        [VoxelOutcome.NOT_COMPARED, VoxelOutcome.RIGHT, VoxelOutcome.WRONG, VoxelOutcome.MISSED, VoxelOutcome.INVENTED],
+        default=VoxelOutcome.NOT_COMPARED,
     )
     return outcomes.astype(np.uint8)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +12,7 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.metrics.conventions import CONVENTIONS, Convention
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
-from carlasc.metrics.scorer import LabelPair, Options, Region, Scorer, Voxels
+from carlasc.metrics.scorer import LabelPair, Scorer, Scoring
 from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 
@@ -27,10 +27,7 @@ def evaluate(
     grid: str | None = None,
     truth_grid: str | None = None,
     source_classes: str | None = None,
-    voxels: Voxels = "known",
-    region: Region | None = None,
-    by: Collection[str] = (),
-    rays: bool = False,
+    scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
     frames: Frames = None,
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
@@ -48,26 +45,24 @@ def evaluate(
         truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
         source_classes: name of the class table of the predictions, for data that do not name one. None takes the class table of the
             convention's own files.
-        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
-        region: function from a GridSpec to a mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in the mask count.
-        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
-        rays: also compute RayIoU; this needs poses and a Cartesian grid.
+        scoring: which voxels count, and what is scored beside the classes.
         frames: the frames that are scored; None scores all frames of the ground truth.
         name: name of the predictions in tables.
-        run: how the work is spread, and who is told of its progress. With several processes, `region` must be a function that can be pickled.
+        run: how the work is spread, and who is told of its progress.
 
     Returns:
         The scores. Frames that could not be scored are listed in `failures`.
 
     Raises:
-        ArgumentError: an argument has an unknown value, or `region`, `by` or `rays` needs data that do not exist.
+        ArgumentError: an argument has an unknown value, or `scoring` needs data that do not exist.
         MissingDataError: no grid exists, a sequence has no ground truth, or no frame can be scored.
         FormatError: the grids or the classes of the two sides cannot be compared.
     """
-    (result,) = _score_all(
-        [convention], source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
-        run=run, options=Options(voxels, region, tuple(by), rays),
-    )  # fmt: skip
+    pairs, notes = pair_grids(source, truth, grid, truth_grid)
+    frames_of = _choose_frames(pairs, frames)
+    scorer = Scorer(convention, pairs, source_classes, scoring)
+    _score_frames([scorer], frames_of, run)
+    result = scorer.result(name or _name_of(source), notes)
     if isinstance(result, CarlascError):
         raise result
     return result
@@ -84,98 +79,95 @@ def evaluate_by_all_conventions(
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Mapping[str, Evaluation | CarlascError]:
-    """Score predictions by every convention. Each frame is read once.
+    """Score predictions by every convention. Each frame is read once. The arguments have the meaning that they have in `evaluate`.
 
     Args:
-        source: the predictions, as for `evaluate`.
-        truth: the ground truth.
-        grid: as for `evaluate`.
-        truth_grid: as for `evaluate`.
-        source_classes: as for `evaluate`.
-        frames: as for `evaluate`.
-        name: as for `evaluate`.
+        source: the predictions: a data set, a sequence, the folder of a grid, or files of a benchmark.
+        truth: the ground truth, likewise.
+        grid: the grid that holds the predictions.
+        truth_grid: the grid that holds the ground truth.
+        source_classes: name of the class table of the predictions.
+        frames: the frames that are scored.
+        name: name of the predictions in tables.
         run: how the work is spread, and who is told of its progress.
 
     Returns:
         For the name of each convention: the scores, or the error that says why the data cannot be scored by it.
     """
-    results = _score_all(
-        list(CONVENTIONS), source, truth, grid=grid, truth_grid=truth_grid, source_classes=source_classes, name=name, frames=frames,
-        run=run, options=Options(),
-    )  # fmt: skip
-    return dict(zip(CONVENTIONS, results, strict=True))
-
-
-def _score_all(
-    conventions: Sequence[str | Convention | None],
-    source: Place,
-    truth: Place,
-    *,
-    grid: str | None,
-    truth_grid: str | None,
-    source_classes: str | None,
-    frames: Frames,
-    name: str | None,
-    run: Run,
-    options: Options,
-) -> list[Evaluation | CarlascError]:
-    """Read each frame once and score it by each convention."""
-    chosen = FrameRange.of(frames)
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
-    jobs = [(pair, chosen.select(pair.truth.frames())) for pair in pairs]
-    total = sum(len(numbers) for _, numbers in jobs)
-    if total == 0:
+    frames_of = _choose_frames(pairs, frames)
+    scorers = {convention: Scorer(convention, pairs, source_classes, Scoring()) for convention in CONVENTIONS}
+    _score_frames(list(scorers.values()), frames_of, run)
+    return {convention: scorer.result(name or _name_of(source), notes) for convention, scorer in scorers.items()}
+
+
+def _name_of(source: Place) -> str:
+    return getattr(source, "location", None) or str(source)
+
+
+def _choose_frames(pairs: list[Pair], frames: Frames) -> list[tuple[Pair, list[int]]]:
+    """Return the frames of each pair that are scored.
+
+    Raises:
+        MissingDataError: there are none.
+    """
+    chosen = FrameRange.of(frames)
+    found = [(pair, chosen.select(pair.truth.frames()).tolist()) for pair in pairs]
+    if not any(numbers for _, numbers in found):
         raise MissingDataError(
             pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
         )
-    label = name or getattr(source, "location", None) or str(source)
-    scorers = [Scorer(convention, pairs, source_classes, options) for convention in conventions]
-    size = 1 if run.is_alone else _TOGETHER
-    tasks = [
-        _Task(pair, tuple(numbers[first : first + size].tolist()))
-        for pair, numbers in jobs
-        for first in range(0, len(numbers), size)
-    ]
-    score, fail = partial(_score_task, scorers=scorers), partial(_fail_task, scorers=scorers)
-    steps, done = run.progress or (lambda done, total: None), 0
-    with closing(run_all(score, tasks, run, lost=fail)) as results:
-        for task, parts in zip(tasks, results, strict=True):
-            for scorer, part in zip(scorers, parts, strict=True):
-                scorer.merge(part)
-            done += len(task.frames)
-            steps(done, total)
-    return [scorer.result(label, notes) for scorer in scorers]
+    return found
 
 
 @dataclass(frozen=True)
-class _Task:
-    """Some frames to score. It pickles into a worker."""
+class _FrameBatch:
+    """Frames of one pair, which a worker scores together. It pickles into a worker."""
 
     pair: Pair
     frames: tuple[int, ...]
 
 
-def _score_task(task: _Task, scorers: Sequence[Scorer]) -> list[Scorer]:
+def _score_frames(scorers: Sequence[Scorer], frames_of: list[tuple[Pair, list[int]]], run: Run) -> None:
+    """Read each frame once, and add its scores to each scorer."""
+    size = 1 if run.is_alone else _TOGETHER
+    batches = [
+        _FrameBatch(pair, tuple(numbers[first : first + size]))
+        for pair, numbers in frames_of
+        for first in range(0, len(numbers), size)
+    ]
+    total, done = sum(len(numbers) for _, numbers in frames_of), 0
+    score, fail = partial(_score_batch, scorers=scorers), partial(_fail_batch, scorers=scorers)
+    with closing(run_all(score, batches, run, lost=fail)) as results:
+        for batch, parts in zip(batches, results, strict=True):
+            for scorer, part in zip(scorers, parts, strict=True):
+                scorer.merge(part)
+            done += len(batch.frames)
+            if run.progress is not None:
+                run.progress(done, total)
+
+
+def _score_batch(batch: _FrameBatch, scorers: Sequence[Scorer]) -> list[Scorer]:
     """Read frames and score them, in a worker: return what there is to add to each scorer."""
     parts = [scorer.empty() for scorer in scorers]
-    predicted = set(task.pair.prediction.frames().tolist())
-    for frame in task.frames:
+    predicted = set(batch.pair.prediction.frames().tolist())
+    for frame in batch.frames:
         content: LabelPair | CarlascError
         try:
-            content = _read(task.pair, frame, predicted)
+            content = _read(batch.pair, frame, predicted)
         except CarlascError as error:
             content = error
         for part in parts:
-            part.add(task.pair, frame, content)
+            part.add(batch.pair, frame, content)
     return parts
 
 
-def _fail_task(task: _Task, message: str, scorers: Sequence[Scorer]) -> list[Scorer]:
+def _fail_batch(batch: _FrameBatch, message: str, scorers: Sequence[Scorer]) -> list[Scorer]:
     """Return what there is to add for frames that no worker could score."""
     parts = [scorer.empty() for scorer in scorers]
-    for frame in task.frames:
+    for frame in batch.frames:
         for part in parts:
-            part.add(task.pair, frame, CarlascError("", problem=message))
+            part.add(batch.pair, frame, CarlascError("", problem=message))
     return parts
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.metrics.tables import Cell, Table
+from carlasc.metrics.results import Cell, FigureTable
 from carlasc.storage.files import parse_json
 
 _FIGURES = {"miou": "mIoU", "iou": "IoU", "precision": "Precision", "recall": "Recall", "false_free": "False free"}
@@ -36,7 +36,7 @@ class ScoreTable:
         """The classes of all results, in the order of the first one."""
         return list(dict.fromkeys(name for result in self.results for name in result["class_iou"]))
 
-    def table(self, *, classes: bool = True) -> Table:
+    def table(self, *, classes: bool = True) -> FigureTable:
         """Return the figures in percent, one row per result; `classes` adds a column per class."""
         rayed = any(result.get("rayiou") is not None for result in self.results)
         mixed = len({result["convention"] for result in self.results}) > 1
@@ -54,7 +54,7 @@ class ScoreTable:
             values += [result.get("rayiou")] if rayed else []
             cells = [math.nan if value is None else 100 * value for value in values]
             rows.append((str(result["name"]), *([str(result["convention"])] if mixed else []), *cells))
-        return Table(f"Scores by the convention {self.convention} (percent)", header, tuple(rows))
+        return FigureTable(f"Scores by the convention {self.convention} (percent)", header, tuple(rows))
 
     def to_markdown(self) -> str:
         """Return a Markdown table."""

@@ -165,7 +165,7 @@ class RayIoU:
             return cast_rays(grids, spec, origins, self.directions, free=self.free)
         import torch
 
-        from carlasc.metrics.tensor_casting import cast_rays_on_device
+        from carlasc.metrics.casting import cast_rays_on_device
 
         on_device = torch.from_numpy(grids.astype(np.int32)).to(device)
         voxels, depths = cast_rays_on_device(on_device, spec, origins, self.directions, free=self.free)

@@ -1,4 +1,4 @@
-"""The scores of predictions over a data set, and the paper's two tables of them."""
+"""The scores of predictions over a data set, and tables of them as text, LaTeX and CSV."""
 
 from __future__ import annotations
 
@@ -15,7 +15,52 @@ from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import Convention, ConventionScore
 from carlasc.metrics.rays import RayScore
 from carlasc.metrics.sampling import FEWEST_SEQUENCES, Comparison, Interval, bootstrap, compare
-from carlasc.metrics.tables import Cell, Table
+
+Cell = str | float
+
+
+@dataclass(frozen=True)
+class FigureTable:
+    """Rows under a header. Numbers are percentages; NaN, a figure that is not defined, is written as a dash.
+
+    Attributes:
+        title: what the table shows.
+        header: names of the columns.
+        rows: one per set of predictions: its name, then numbers.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def texts(self) -> list[list[str]]:
+        """Return the rows as text, numbers with two decimals."""
+        return [[_text(cell) for cell in row] for row in self.rows]
+
+    def to_csv(self) -> str:
+        """Return the table as CSV with a header."""
+        buffer = io.StringIO()
+        writer = csv.writer(buffer, lineterminator="\n")
+        writer.writerow(self.header)
+        writer.writerows(self.texts())
+        return buffer.getvalue()
+
+    def to_latex(self) -> str:
+        r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule, \midrule, \bottomrule)."""
+        lines = [" & ".join(map(_escape, row)) + r" \\" for row in [list(self.header), *self.texts()]]
+        body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
+        columns = "l" + "r" * (len(self.header) - 1)
+        return f"% {self.title}\n\\begin{{tabular}}{{{columns}}}\n{body}\n\\end{{tabular}}\n"
+
+
+def _text(cell: Cell) -> str:
+    if isinstance(cell, str):
+        return cell
+    return "-" if math.isnan(cell) else f"{cell:.2f}"
+
+
+def _escape(text: str) -> str:
+    return "".join(f"\\{letter}" if letter in "&%$#_{}" else letter for letter in text)
 
 
 @dataclass(frozen=True)
@@ -106,7 +151,7 @@ class Evaluation:
             raise ArgumentError("other", expected=f"scores by {self.convention.name}", found=other.convention.name)
         return compare(self.sequences, other.sequences, lambda m: self.convention.score(m).miou)
 
-    def tables(self) -> tuple[Table, ...]:
+    def tables(self) -> tuple[FigureTable, ...]:
         """Return the paper's two tables, IoU of each class and completeness, and one of the regions if there are any."""
         tables = [semantic_table([self]), geometric_table([self])]
         return (*tables, self._breakdown_table()) if self.breakdown else tuple(tables)
@@ -156,16 +201,16 @@ class Evaluation:
             "failures": [list(failure) for failure in self.failures],
         }
 
-    def _breakdown_table(self) -> Table:
+    def _breakdown_table(self) -> FigureTable:
         rows: list[tuple[Cell, ...]] = []
         for name, matrix in self.breakdown.items():
             score = self.convention.score(matrix)
             rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
         header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
-        return Table("By region", header, tuple(rows))
+        return FigureTable("By region", header, tuple(rows))
 
 
-def semantic_table(evaluations: Sequence[Evaluation]) -> Table:
+def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
     """Return the table of the IoU of each class, the mean of them, and accuracy; one row per evaluation.
 
     Raises:
@@ -187,17 +232,17 @@ def semantic_table(evaluations: Sequence[Evaluation]) -> Table:
         means = [e.miou, *([e.miou_without_free] if with_free else []), e.matrix.accuracy]
         means += [math.nan if e.rays is None else e.rays.rayiou] if rayed else []
         rows.append((e.name, *_percent(*e.class_iou.values(), *means)))
-    return Table(f"Semantic scene completion, IoU of each class, by {first.title}", header, tuple(rows))
+    return FigureTable(f"Semantic scene completion, IoU of each class, by {first.title}", header, tuple(rows))
 
 
-def geometric_table(evaluations: Sequence[Evaluation]) -> Table:
+def geometric_table(evaluations: Sequence[Evaluation]) -> FigureTable:
     """Return the table of completeness: precision, recall and IoU of occupied against free space; one row per evaluation."""
     rows: list[tuple[Cell, ...]] = []
     for evaluation in evaluations:
         score = evaluation.score
         rows.append((evaluation.name, *_percent(score.precision, score.recall, score.iou, score.false_free)))
     header = ("Network", "Precision", "Recall", "IoU", "False free")
-    return Table("Scene completion: all classes other than free count as one", header, tuple(rows))
+    return FigureTable("Scene completion: all classes other than free count as one", header, tuple(rows))
 
 
 def _percent(*values: float) -> tuple[float, ...]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from copy import copy
 from dataclasses import dataclass
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import BreakdownName
+from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, table_named
@@ -23,35 +25,44 @@ from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_ban
 from carlasc.metrics.results import Evaluation, FrameScore
 
 Region = Callable[[GridSpec], NDArray[np.bool_]]
-Voxels = Literal["known", "all"]
 LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]  # of a prediction and of the truth
-BREAKDOWNS = ("distance", "height", "visibility", "motion")
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
 
 
 @dataclass(frozen=True)
-class Options:
-    """What is scored of each frame."""
+class Scoring:
+    """What is scored of each frame.
+
+    Attributes:
+        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
+        region: function from a GridSpec to a (X, Y, Z) bool mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in
+            the mask count. With several processes it must be a function that can be pickled.
+        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
+        rays: also compute RayIoU; this needs poses and a Cartesian grid.
+
+    Raises:
+        ArgumentError: an unknown value.
+    """
 
     voxels: Voxels = "known"
     region: Region | None = None
-    by: tuple[str, ...] = ()
+    by: Collection[str] = ()
     rays: bool = False
 
     def __post_init__(self) -> None:
         if self.voxels not in ("known", "all"):
             raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
-        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
-            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
+        if unknown := [name for name in self.by if name not in get_args(BreakdownName)]:
+            raise ArgumentError("by", expected=f"any of {', '.join(get_args(BreakdownName))}", found=repr(unknown[0]))
 
 
 class Scorer:
     """Adds up the frames of all sequences by one convention."""
 
     def __init__(
-        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, options: Options
+        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, scoring: Scoring
     ) -> None:
-        self.options = options
+        self.scoring = scoring
         self.impossible: CarlascError | None = None
         self.convention = _resolve(convention, pairs)
         given = None if source_classes is None else table_named(source_classes)
@@ -60,7 +71,7 @@ class Scorer:
         self.failures: list[tuple[str, str]] = []
         self.frames: list[FrameScore] = []
         self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
-        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if options.rays else None
+        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if scoring.rays else None
         try:
             for pair in pairs:
                 self.tables[pair.truth.path] = self._check(pair, given)
@@ -112,7 +123,7 @@ class Scorer:
             return self.impossible
         summed = sum(self.matrices.values(), self._matrix())
         return Evaluation(
-            name, self.convention, summed, self.matrices, len(self.frames), self.options.voxels, self.failures, tuple(self.frames), notes,
+            name, self.convention, summed, self.matrices, len(self.frames), self.scoring.voxels, self.failures, tuple(self.frames), notes,
             self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
         )  # fmt: skip
 
@@ -139,7 +150,7 @@ class Scorer:
                 expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
                 found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
             )
-        for argument, asked in (("region", self.options.region), ("by", self.options.by), ("rays", self.options.rays)):
+        for argument, asked in (("region", self.scoring.region), ("by", self.scoring.by), ("rays", self.scoring.rays)):
             if asked and _spec_of(pair) is None:
                 raise ArgumentError(
                     argument,
@@ -147,9 +158,9 @@ class Scorer:
                     found="a region" if argument == "region" else str(asked),
                     advice=f"add params.json to {pair.truth.location}",
                 )
-        if (self.options.rays or "motion" in self.options.by) and not isinstance(pair.truth, SequenceGrid):
+        if (self.scoring.rays or "motion" in self.scoring.by) and not isinstance(pair.truth, SequenceGrid):
             raise ArgumentError(
-                "rays" if self.options.rays else "by",
+                "rays" if self.scoring.rays else "by",
                 expected="a data set with poses and scans as the truth",
                 found="files of grids",
             )
@@ -161,11 +172,11 @@ class Scorer:
         tables = self.tables[pair.truth.path]
         known, spec = self._known(pair, frame, truth.shape), _spec_of(pair)
         region = None
-        if self.options.region is not None and spec is not None:
-            region = self.options.region(spec).reshape(truth.shape)
+        if self.scoring.region is not None and spec is not None:
+            region = self.scoring.region(spec).reshape(truth.shape)
         try:
             matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
-            if (self.options.by or self.rays is not None) and spec is not None:
+            if (self.scoring.by or self.rays is not None) and spec is not None:
                 pred, true, counted = self.convention.prepare(
                     (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
                 )
@@ -180,7 +191,7 @@ class Scorer:
 
     def _known(self, pair: Pair, frame: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """Return which voxels the truth evaluated; None: all of them."""
-        if self.options.voxels == "all":
+        if self.scoring.voxels == "all":
             return None
         known = pair.truth.known(frame, self.convention.seen_by)
         if known is not None:
@@ -205,13 +216,13 @@ class Scorer:
     ) -> Iterator[Masks]:
         """Yield the masks of each breakdown that was asked for."""
         counts = None if known is None else known.astype(np.float32).reshape(spec.size)
-        if "distance" in self.options.by:
+        if "distance" in self.scoring.by:
             yield distance_bands(spec, _DISTANCES_M)
-        if "height" in self.options.by:
+        if "height" in self.scoring.by:
             yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
-        if "visibility" in self.options.by:
+        if "visibility" in self.scoring.by:
             yield visibility(Grid(spec, truth, counts), free=self.convention.free)
-        if "motion" in self.options.by and isinstance(pair.truth, SequenceGrid):
+        if "motion" in self.scoring.by and isinstance(pair.truth, SequenceGrid):
             labels = pair.truth.labels(frame).reshape(spec.size)
             yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))
 

@@ -4,13 +4,11 @@ from .bodies import usual_shell as usual_shell
 from .boxes import segment_by_boxes as segment_by_boxes
 from .boxes import tracks_from_boxes as tracks_from_boxes
 from .evidence import HORIZON_S as HORIZON_S
-from .evidence import Evidence as Evidence
+from .evidence import FreeSpaceEvidence as FreeSpaceEvidence
 from .evidence import Sighting as Sighting
 from .evidence import find_evidence as find_evidence
 from .ground import ground_height as ground_height
 from .ground import ground_points as ground_points
-from .linking import Chain as Chain
-from .linking import Linker as Linker
 from .movers import Movers as Movers
 from .movers import find_movers as find_movers
 from .movers import follow_movers as follow_movers
@@ -18,6 +16,8 @@ from .options import MotionOptions as MotionOptions
 from .options import MotionSource as MotionSource
 from .options import PoseOptions as PoseOptions
 from .options import PoseSource as PoseSource
+from .segments import Chain as Chain
+from .segments import Linker as Linker
 from .segments import Segment as Segment
 from .segments import Standing as Standing
 from .segments import is_fast as is_fast

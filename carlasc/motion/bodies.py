@@ -100,7 +100,7 @@ def seen_from(
         for axis in (LENGTH, WIDTH)
         for beyond in (lower[axis] - sensors[:, axis], sensors[:, axis] - upper[axis])
     )
-    mean = counts @ sensors[:, :2] / max(total, 1)
+    mean = (counts[:, None] * sensors[:, :2]).sum(axis=0) / max(total, 1)  # not `@`, which is BLAS
     return Extent(lower, upper, (rear, front, low, high), total, (float(mean[0]), float(mean[1])))
 
 

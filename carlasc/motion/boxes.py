@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan
 from carlasc.motion.bodies import Extent
+from carlasc.motion.paths import resample, smooth
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
-from carlasc.motion.smoothing import resample, smooth
+from carlasc.motion.solving import nearest_rotation
 from carlasc.motion.tracks import BODY_MARGIN_M, Track
 
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
@@ -26,7 +27,7 @@ _JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart are differen
 
 
 @dataclass(frozen=True)
-class _Sightings:
+class _ObjectBoxes:
     """The boxes of one object.
 
     Attributes:
@@ -45,8 +46,8 @@ class _Sightings:
     labels: NDArray[np.int64]
     weights: NDArray[np.float64]
 
-    def part(self, rows: NDArray[np.int64]) -> _Sightings:
-        return _Sightings(*(values[rows] for values in vars(self).values()))
+    def part(self, rows: NDArray[np.int64]) -> _ObjectBoxes:
+        return _ObjectBoxes(*(values[rows] for values in vars(self).values()))
 
 
 def tracks_from_boxes(
@@ -120,7 +121,7 @@ def segment_by_boxes(
         track = tracks[index]
         pose = track.pose(frame)
         if pose is not None:
-            reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)))
+            reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
             near = order[slice(*np.searchsorted(along, [pose[0, 3] - reach, pose[0, 3] + reach]))]
             members = near[_inside(track, pose, points[near], None if labels is None else labels[near], floor_m)]
             owners[candidates[members]] = index
@@ -142,7 +143,7 @@ def _inside(
     floor_m: float,
 ) -> NDArray[np.int64]:
     """Return the indices of the points (M, 3), world, that are in a track's box at a pose, and not on the ground below it."""
-    reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)))
+    reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
     near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
     body = transform_points(invert(pose), points[near])
     inside = ((body >= track.lower) & (body <= track.upper)).all(axis=1)
@@ -152,11 +153,11 @@ def _inside(
     return near[inside & above]
 
 
-def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _Sightings:
+def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
     """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
     chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
     frames = np.array([frame for frame, _, _ in found], np.int64)
-    return _Sightings(
+    return _ObjectBoxes(
         frames,
         np.array([times[frame] for frame in frames.tolist()]),
         np.concatenate([box.sensor_T_box for box in chosen]),
@@ -166,7 +167,7 @@ def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) 
     )
 
 
-def _split_at_jumps(sightings: _Sightings) -> list[_Sightings]:
+def _split_at_jumps(sightings: _ObjectBoxes) -> list[_ObjectBoxes]:
     """Split the boxes of a number where no object can get from one to the next."""
     steps = np.linalg.norm(np.diff(sightings.poses[:, :3, 3], axis=0), axis=1)
     jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(sightings.seconds)) + 1
@@ -174,7 +175,7 @@ def _split_at_jumps(sightings: _Sightings) -> list[_Sightings]:
 
 
 def _make_track(
-    instance: int, sightings: _Sightings, known: NDArray[np.int64], known_seconds: NDArray[np.float64]
+    instance: int, sightings: _ObjectBoxes, known: NDArray[np.int64], known_seconds: NDArray[np.float64]
 ) -> Track:
     """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
     seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
@@ -193,12 +194,12 @@ def _make_track(
     every = np.arange(frames[0], frames[-1] + 1)
     at = np.interp(every, known, known_seconds)
     if stands:  # one pose for all frames, in the memory of one
-        pose = rotation_z(turns[0]) @ tilt
+        pose = multiply(rotation_z(turns[0]), tilt)
         pose[:3, 3] = path[0]
         poses, speed = np.broadcast_to(pose, (len(every), 4, 4)), np.broadcast_to(speed[0], (len(every), 3))
     else:
         path, speed = resample(at, seconds, path, speed)
-        poses = np.stack([rotation_z(angle) @ tilt for angle in np.interp(at, seconds, turns)])
+        poses = np.stack([multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)])
         poses[:, :3, 3] = path
     half = np.median(sightings.sizes, axis=0) / 2
     return Track(
@@ -223,10 +224,9 @@ def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float
     headings = np.unwrap(angles, period=np.pi)
     if np.cos(headings - angles).sum() < 0:
         headings = headings + np.pi
-    upright = np.stack([rotation_z(-angle)[:3, :3] for angle in angles]) @ rotations
-    left, _, right = np.linalg.svd(upright.mean(axis=0))
+    upright = multiply(np.stack([rotation_z(-angle)[:3, :3] for angle in angles]), rotations)
     tilt = np.eye(4)
-    tilt[:3, :3] = left @ right
+    tilt[:3, :3] = nearest_rotation(upright.mean(axis=0))
     return headings, tilt
 
 
@@ -235,13 +235,14 @@ def _stands(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: ND
     duration = float(seconds[-1] - seconds[0])
     if duration <= 0:
         return True
-    line = np.polynomial.polynomial.polyfit(seconds - seconds.mean(), centers[:, :2], 1)
-    way = float(np.linalg.norm(line[1])) * duration
-    deviation = centers[:, :2] - line[0] - (seconds - seconds.mean())[:, None] * line[1]
+    line, offsets = centers[:, :2].mean(axis=0), (seconds - seconds.mean())[:, None]
+    velocity = (offsets * centers[:, :2]).sum(axis=0) / np.square(offsets).sum()
+    way = float(np.hypot(*velocity)) * duration
+    deviation = centers[:, :2] - line - offsets * velocity
     steady = way > max(_STEADY_M, _STEADY * float(np.sqrt(np.square(deviation).sum(axis=1).mean())))
     if steady and way / duration > MIN_SPEED_M_S:
         return False
-    extent = float(np.linalg.norm(np.ptp(path[:, :2], axis=0)))
+    extent = float(np.hypot(*np.ptp(path[:, :2], axis=0)))
     slow = _fastest(path, seconds) < MIN_SPEED_M_S
     return extent < _STANDING_M or slow
 

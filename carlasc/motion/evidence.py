@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import as_pose
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, thin, transform_points, translation
+from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points, translation
 from carlasc.core.scans import runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
-from carlasc.motion.visibility import View, look_up
+from carlasc.motion.visibility import SortedReturns, look_up
 
 HORIZON_S = 5.0
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -70,7 +70,7 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FreeSpaceEvidence:
     """What moved in one scan.
 
     Attributes:
@@ -89,7 +89,7 @@ class Evidence:
     points: tuple[NDArray[np.float64], ...]
     labels: tuple[int, ...]
 
-    def thinned(self, most: int = 400) -> Evidence:
+    def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most so many `points` for each cluster; `clusters` stay complete."""
         return replace(self, points=tuple(thin(points, most) for points in self.points))
 
@@ -108,19 +108,21 @@ class _Kept:
 
     scan: Sighting
     seconds: float
-    views: tuple[tuple[Transform, View], ...]
+    views: tuple[tuple[Transform, SortedReturns], ...]
 
     @classmethod
     def of(cls, scan: Sighting, seconds: float) -> _Kept:
         """Sort the points of a scan by the places from which they were seen: (place_T_world, view) for each."""
         views = []
         for part, origin in _places(scan):
-            place_T_world = invert(scan.world_T_sensor @ translation(origin))
-            views.append((place_T_world, View.of(scan.points[part] - origin if origin.any() else scan.points[part])))
+            place_T_world = invert(multiply(scan.world_T_sensor, translation(origin)))
+            views.append(
+                (place_T_world, SortedReturns.of(scan.points[part] - origin if origin.any() else scan.points[part]))
+            )
         return cls(scan, seconds, tuple(views))
 
 
-def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -> Iterator[Evidence]:
+def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -> Iterator[FreeSpaceEvidence]:
     """Yield what moved in each scan of a drive, as soon as the scans of `HORIZON_S` after it were read.
 
     Only the scans within this time are held, so memory does not grow with the drive.
@@ -148,7 +150,7 @@ def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -
         yield _evidence(window, index, movable)
 
 
-def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> Evidence:
+def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> FreeSpaceEvidence:
     own = window[current]
     scan = own.scan
     ground = ground_points(scan.points) if scan.ground is None else scan.ground
@@ -166,14 +168,14 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> E
     clusters = [candidates[own] for own in _clusters(world, kind, moved, left, static)]
     points = [transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64)) for members in clusters]
     classes = [0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax()) for own in clusters]
-    return Evidence(scan.frame, own.seconds, len(scan.points), tuple(clusters), tuple(points), tuple(classes))
+    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), tuple(clusters), tuple(points), tuple(classes))
 
 
 def _places(scan: Sighting) -> list[tuple[slice, NDArray[np.float32]]]:
     """Return the places from which the points of a scan were seen. Neighbouring places of one sensor that moves count as their middle."""
     joined: list[tuple[slice, list[NDArray[np.float32]]]] = []
     for part, origin in runs_of_origins(scan.origins, len(scan.points)):
-        if joined and np.linalg.norm(origin - joined[-1][1][0]) < _SAME_PLACE_M:
+        if joined and np.linalg.norm(origin - joined[-1][1][0], axis=0) < _SAME_PLACE_M:
             joined[-1] = (slice(joined[-1][0].start, part.stop), [*joined[-1][1], origin])
         else:
             joined.append((part, [origin]))
@@ -201,7 +203,7 @@ def _judge(
     for side, others in enumerate((before, after)):
         for bit, other in enumerate(others):
             for place_T_world, view in other.views:
-                pose = as_pose(place_T_world @ scan.world_T_sensor)
+                pose = as_pose(multiply(place_T_world, scan.world_T_sensor))
                 look_up(points, pose, view.start, view.slope, view.distance, bit, free[side], hit[side])
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import fast_azimuth
 from carlasc.core.compiling import cached
+from carlasc.motion.solving import least_squares
 
 _SECTORS, _RINGS, _RING_M = 120, 160, 0.5
 _BLIND_M = 1.0  # nearer points are on the vehicle
@@ -97,18 +98,39 @@ def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np
         return None
     rows = np.column_stack([chosen[:, :2], np.ones(len(chosen))])
     samples = np.random.default_rng(0).integers(0, len(chosen), (_TRIALS, 3))
-    samples = samples[np.abs(np.linalg.det(rows[samples])) > 1.0]  # twice the area of the triangle, in square metres
-    planes = np.linalg.solve(rows[samples], chosen[samples, 2][..., None])[..., 0]
+    x, y, z = np.moveaxis(
+        chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0
+    )  # of the other two points, from the first
+    area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice that of the triangle, in square metres
+    wide = np.abs(area) > 1.0
+    x, y, z, area, corner = x[wide], y[wide], z[wide], area[wide], chosen[samples[wide, 0]]
+    along_x = (z[:, 0] * y[:, 1] - z[:, 1] * y[:, 0]) / area
+    along_y = (x[:, 0] * z[:, 1] - x[:, 1] * z[:, 0]) / area
+    planes = np.column_stack([along_x, along_y, corner[:, 2] - along_x * corner[:, 0] - along_y * corner[:, 1]])
     planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < _STEEPEST]
     if not len(planes):
         return None
     weight = 1.0 / np.maximum(np.hypot(chosen[:, 0], chosen[:, 1]) / _NEAR_M, 1.0)
-    on_plane = np.abs(planes @ rows.T - chosen[:, 2]) < _ON_PLANE_M
-    on = on_plane[int((on_plane @ weight).argmax())]
+    best = planes[int(_support(planes, chosen, weight).argmax())]
+    on = np.abs(best[0] * chosen[:, 0] + best[1] * chosen[:, 1] + best[2] - chosen[:, 2]) < _ON_PLANE_M
     if on.sum() < max(_MIN_CELLS, _MIN_SHARE * len(chosen)):
         return None
-    found: NDArray[np.float64] = np.linalg.lstsq(rows[on] * weight[on, None], chosen[on, 2] * weight[on], rcond=None)[0]
+    found: NDArray[np.float64] = least_squares(rows[on] * weight[on, None], (chosen[on, 2] * weight[on])[:, None])[:, 0]
     return found
+
+
+@cached
+def _support(
+    planes: NDArray[np.float64], points: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return (P,) the sum of the weights, (N,), of those of (N, 3) points that are on each of (P, 3) planes."""
+    support = np.zeros(len(planes))
+    for p in range(len(planes)):
+        for i in range(len(points)):
+            height = planes[p, 0] * points[i, 0] + planes[p, 1] * points[i, 1] + planes[p, 2]
+            if abs(height - points[i, 2]) < _ON_PLANE_M:
+                support[p] += weight[i]
+    return support
 
 
 @cached

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import thin
-from carlasc.motion.evidence import Evidence, Sighting, find_evidence
-from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.motion.registration import nearest_points
+from carlasc.motion.evidence import FreeSpaceEvidence, Sighting, find_evidence
+from carlasc.motion.paths import estimate_path, headings_of, is_standing, nearest_points
 from carlasc.motion.segments import Segment
 
 _MAX_GAP_S = 1.0  # a mover may be hidden for this long
@@ -90,7 +89,7 @@ def find_movers(
 
 
 def follow_movers(
-    evidence: Iterable[Evidence],
+    evidence: Iterable[FreeSpaceEvidence],
     moved: dict[int, NDArray[np.int64]],
     *,
     deformable: Collection[int] = (),
@@ -106,7 +105,7 @@ def follow_movers(
         first_instance: number of the first mover; others follow.
         default_label: class of movers without labels.
     """
-    alive: list[_Chain] = []
+    alive: list[_MoverChain] = []
     number = first_instance
     for found in evidence:
         moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
@@ -119,7 +118,7 @@ def follow_movers(
     yield from _earned(alive, deformable, number, default_label)
 
 
-def _earned(chains: list[_Chain], deformable: Collection[int], number: int, default_label: int) -> Iterator[Mover]:
+def _earned(chains: list[_MoverChain], deformable: Collection[int], number: int, default_label: int) -> Iterator[Mover]:
     """Yield the movers of the chains that earn a track, numbered from `number`."""
     for chain in chains:
         mover = chain.mover(deformable, number, default_label)
@@ -138,7 +137,7 @@ class _Link:
     upper: NDArray[np.float64]
 
     @classmethod
-    def of(cls, evidence: Evidence, index: int) -> _Link:
+    def of(cls, evidence: FreeSpaceEvidence, index: int) -> _Link:
         points = evidence.points[index]
         segment = Segment(evidence.frame, evidence.labels[index], evidence.clusters[index], points, None)
         return cls(evidence.seconds, segment, points.min(axis=0), points.max(axis=0))
@@ -163,7 +162,7 @@ class _Link:
         return _Link(self.seconds, segment, lower, upper)
 
 
-class _Chain:
+class _MoverChain:
     """Sightings of one thing in consecutive scans."""
 
     def __init__(self, first: _Link) -> None:
@@ -187,7 +186,7 @@ class _Chain:
         # The faces that are seen change, so lower corner, middle and upper corner are measured, and the least motion counts.
         offsets = seconds - seconds.mean()
         corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
-        slopes = np.tensordot(offsets, corners, axes=(0, 0)) / np.square(offsets).sum()
+        slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
@@ -201,10 +200,14 @@ class _Chain:
         gap = np.maximum(np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0)
         offset = link.middle - last.middle - shift
         reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
-        if np.linalg.norm(gap[:2]) > reach or abs(gap[2]) > _REACH_M or np.linalg.norm(offset[:2]) > 3 * reach + 2.0:
+        if (
+            np.linalg.norm(gap[:2], axis=0) > reach
+            or abs(gap[2]) > _REACH_M
+            or np.linalg.norm(offset[:2], axis=0) > 3 * reach + 2.0
+        ):
             return None
         sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
-        return float(np.linalg.norm(gap) + 0.3 * np.linalg.norm(offset[:2]) + 0.2 * sizes.sum())
+        return float(np.linalg.norm(gap, axis=0) + 0.3 * np.linalg.norm(offset[:2], axis=0) + 0.2 * sizes.sum())
 
     def covers(self, link: _Link) -> bool:
         """Return whether a sighting is inside the place where the chain's next one is expected."""
@@ -272,7 +275,7 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 
-def _link(evidence: Evidence, alive: list[_Chain], deformable: Collection[int]) -> None:
+def _link(evidence: FreeSpaceEvidence, alive: list[_MoverChain], deformable: Collection[int]) -> None:
     """Continue chains with the clusters of a scan, and start new ones: best first, then parts of what a chain has found already."""
     links = _join_parts([_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable)
     costs = []
@@ -296,7 +299,7 @@ def _link(evidence: Evidence, alive: list[_Chain], deformable: Collection[int]) 
     for i, j in extra.items():
         main = next(k for k, chain in taken.items() if chain == j)
         links[main] = links[main].joined(links[i])
-    fresh = [_Chain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
+    fresh = [_MoverChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
     for i, j in taken.items():
         alive[j].append(links[i])
     alive.extend(fresh)

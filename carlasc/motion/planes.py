@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, thin
+from carlasc.motion.solving import principal_axes
 
 _CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most so many
 _PLANE_M = 0.5  # radius of the neighbourhood in which planes are estimated
@@ -75,7 +76,7 @@ def covariances(sums: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (N, 3) normals of planes through points with (N, 3, 3) covariances."""
-    values, vectors = np.linalg.eigh(covariances)
+    values, vectors = principal_axes(covariances)
     flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
     flat[values[:, 1] < _LINE_M**2] = 0.0
     return vectors[:, :, 0] * np.sqrt(flat)[:, None]

@@ -31,7 +31,7 @@ FREE, HIT = 1, 2
 
 
 @dataclass(frozen=True)
-class View:
+class SortedReturns:
     """The returns of one scan, sorted for looking up directions.
 
     Attributes:
@@ -45,7 +45,7 @@ class View:
     distance: NDArray[np.float32]
 
     @classmethod
-    def of(cls, points: NDArray[np.float32]) -> View:
+    def of(cls, points: NDArray[np.float32]) -> SortedReturns:
         """Sort the (N, 3) points of a scan, metres, sensor frame."""
         column, slope, distance = _directions(np.ascontiguousarray(points[:, :3], np.float32))
         kept = np.flatnonzero(distance >= _MIN_RANGE_M)
@@ -91,7 +91,7 @@ def look_up(
     Args:
         points: (M, 3) metres.
         pose: from the points' frame to the sensor of the other scan.
-        start: as in the other scan's View.
+        start: as in the other scan's SortedReturns.
         slope: the same.
         distance: the same.
         bit: number of the bit that is set.

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import parent_process
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
 from carlasc.errors import CarlascError
@@ -45,12 +46,12 @@ class OwnProcesses(Executor):
     """
 
     def __init__(self, workers: int) -> None:
-        self._workers, self._pool = workers, _Pool(workers)
-        self._tasks: dict[int, _Task] = {}
+        self._workers, self._pool = workers, _ProcessGroup(workers)
+        self._tasks: dict[int, _RetriedTask] = {}
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Start a task. Its result is asked for in the thread that submits."""
-        task = _Task(self, _Cleanly(fn), args, kwargs)
+        task = _RetriedTask(self, _Cleanly(fn), args, kwargs)
         try:
             task.start(self._pool)
         except BrokenProcessPool:
@@ -75,7 +76,7 @@ class OwnProcesses(Executor):
             CarlascError: new processes die before they do anything.
         """
         self._pool.shutdown()
-        self._pool = _Pool(1)
+        self._pool = _ProcessGroup(1)
         for task in [task for task in self._tasks.values() if task.was_lost()]:
             for _ in range(DEATHS - 1):
                 self._renew(1)
@@ -83,10 +84,10 @@ class OwnProcesses(Executor):
                 if not task.was_lost():
                     break
         self._pool.shutdown()
-        self._pool = _Pool(self._workers)
+        self._pool = _ProcessGroup(self._workers)
         self._renew(self._workers)
 
-    def forget(self, task: _Task) -> None:
+    def forget(self, task: _RetriedTask) -> None:
         """Forget a task whose result was taken."""
         self._tasks.pop(id(task), None)
 
@@ -96,7 +97,7 @@ class OwnProcesses(Executor):
             if self._is_alive():
                 return
             self._pool.shutdown()
-            self._pool = _Pool(workers)
+            self._pool = _ProcessGroup(workers)
         if not self._is_alive():
             self._pool.shutdown()  # what its processes say on stderr comes before the error, not after it
             raise CarlascError(
@@ -112,7 +113,7 @@ class OwnProcesses(Executor):
             return False
 
 
-class _Task(Future[Any]):
+class _RetriedTask(Future[Any]):
     """A task that its pool may start several times."""
 
     def __init__(
@@ -146,18 +147,32 @@ class _Task(Future[Any]):
         return self._attempt.cancel()
 
 
-class _Pool(ProcessPoolExecutor):
+class _NotingContext(SpawnContext):
+    """How a pool starts its processes; notes them, because a pool does not tell which they are before Python 3.14."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.started: list[SpawnProcess] = []
+
+    def Process(self, *args: Any, **kwargs: Any) -> SpawnProcess:  # type: ignore[override]
+        process = SpawnProcess(*args, **kwargs)
+        self.started.append(process)
+        return process
+
+
+class _ProcessGroup(ProcessPoolExecutor):
     """The processes of a moment: when one dies, the others end too."""
 
     def __init__(self, workers: int) -> None:
-        super().__init__(workers, mp_context=get_context("spawn"), initializer=_prepare_worker)
+        self._context = _NotingContext()
+        super().__init__(workers, mp_context=self._context, initializer=_prepare_worker)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         with inherited_by_workers():  # a pool starts its processes when tasks are submitted
             return super().submit(fn, *args, **kwargs)
 
     def stop(self) -> None:
-        processes = list((self._processes or {}).values())
+        processes = [process for process in self._context.started if process.is_alive()]
         self.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.terminate()

@@ -13,7 +13,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
-import carlasc
 from carlasc.errors import CarlascError
 from carlasc.running.pools import ONE_THREAD
 
@@ -38,7 +37,7 @@ class Versions:
     def here(cls) -> Self:
         """Return the versions of this process."""
         return cls(
-            f"{carlasc.__version__} (source {_digest_of_source()})",
+            f"{version('carlasc')} (source {_digest_of_source()})",
             ".".join(platform.python_version_tuple()[:2]),
             version("numpy"),
             version("numba"),
@@ -62,7 +61,7 @@ class Versions:
 
 @cache
 def _digest_of_source() -> str:
-    root, digest = Path(carlasc.__file__).parent, hashlib.sha256()
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
         digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
     return digest.hexdigest()[:8]

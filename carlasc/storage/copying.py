@@ -28,7 +28,7 @@ _SAMPLED = 5  # frames of which the largest says how large frames are
 
 
 @dataclass(frozen=True)
-class Block:
+class FrameBlock:
     """Frames that one task copies.
 
     Attributes:
@@ -46,23 +46,23 @@ class Block:
         """Number of published files that the frames are."""
         return sum(map(len, self.frames.values()))
 
-    def missing(self) -> Block:
+    def missing(self) -> FrameBlock:
         """Return the frames that the writer lacks."""
         has = self.writer.has
         lacking = {name: [frame for frame in frames if not has(name, frame)] for name, frames in self.frames.items()}
-        return Block(self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames})
+        return FrameBlock(self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames})
 
 
-def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Block]:
+def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[FrameBlock]:
     """Return all frames of a sequence in blocks of `size` frame numbers."""
     blocks: dict[int, dict[str, list[int]]] = {}
     for name in sorted(sequence.fields()):
         for frame in sequence.frames(name).tolist():
             blocks.setdefault(frame // size, {}).setdefault(name, []).append(frame)
-    return [Block(sequence, writer, blocks[number]) for number in sorted(blocks)]
+    return [FrameBlock(sequence, writer, blocks[number]) for number in sorted(blocks)]
 
 
-def copy_blocks(blocks: Series[Block], run: Run, step: Callable[[int], None]) -> int:
+def copy_blocks(blocks: Series[FrameBlock], run: Run, step: Callable[[int], None]) -> int:
     """Copy blocks in parallel, and return the number of files that they are; `step` is called with that of each."""
     todo = [block for block in blocks if block.files]
     files = 0
@@ -77,7 +77,7 @@ def copy_blocks(blocks: Series[Block], run: Run, step: Callable[[int], None]) ->
     return files
 
 
-def _copy(block: Block) -> int:
+def _copy(block: FrameBlock) -> int:
     found: dict[int, dict[str, NDArray[Any]]] = {}
     for name, frames in block.frames.items():
         for frame, array in zip(frames, block.sequence.read_many(name, frames), strict=True):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from carlasc.storage.packed.arrays.zarr_finish import FinishedStore
-from carlasc.storage.packed.arrays.zarr_finish import finish as finish_target
 from carlasc.storage.remote import target_of
+from carlasc.storage.zarr.zarr_finish import FinishedStore
+from carlasc.storage.zarr.zarr_finish import finish as finish_target
 
 
 def finish(out: str | os.PathLike[str], *, incomplete: bool = False, **storage_options: Any) -> FinishedStore:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
+from carlasc.core.choices import Axes as Axes  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, table_from_json, table_to_json
 from carlasc.errors import FormatError
@@ -14,7 +15,6 @@ from carlasc.storage.files import parse_json, to_json
 FORMAT = 2
 """Version of carlasc.json. Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`."""
 
-Axes = Literal["left", "right"]
 _AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # by the `frame` of version 1
 
 

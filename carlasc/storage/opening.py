@@ -15,7 +15,7 @@ from carlasc.storage.folders.published import PublishedSource
 from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, is_url
 from carlasc.storage.folders.zipped import ZipTree
 from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK, unfinished, unfinished_error
-from carlasc.storage.packed.protocol import Options, PackedSink
+from carlasc.storage.packed.stores import PackedSink, PackOptions
 from carlasc.storage.protocol import Source
 from carlasc.storage.remote import target_of
 from carlasc.storage.sinks import Sink
@@ -25,7 +25,7 @@ PACKED = (".zarr", ".h5", ".hdf5", ".parquet")
 """Endings of the names of packed stores."""
 
 if TYPE_CHECKING:
-    from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
+    from carlasc.storage.zarr.zarr_sink import ZarrSink
 
 _ZIP, _EMPTY_ZIP, _HDF5, _PARQUET = b"PK\x03\x04", b"PK\x05\x06", b"\x89HDF\r\n\x1a\n", b"PAR1"
 _SIGNATURE = 8  # number of leading bytes that identify the kind of file
@@ -80,7 +80,7 @@ def as_source(source: str | os.PathLike[str] | Source) -> Source:
 
 
 def open_sink(
-    path: str | os.PathLike[str] | Target, options: Options | None, overwrite: bool, **storage_options: Any
+    path: str | os.PathLike[str] | Target, options: PackOptions | None, overwrite: bool, **storage_options: Any
 ) -> PackedSink | ZarrSink:
     """Start a packed store. The ending of its name gives its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`.
 
@@ -93,7 +93,7 @@ def open_sink(
     if kind not in PACKED:
         raise ArgumentError(path, expected="a store ending in .zarr, .h5 or .parquet", found=kind or "no ending")
     if kind == ".zarr":
-        from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
+        from carlasc.storage.zarr.zarr_sink import ZarrSink
 
         return ZarrSink(target_of(path, **storage_options), options, overwrite)
     if isinstance(path, Target) or is_url(path):
@@ -104,10 +104,10 @@ def open_sink(
             advice="write it to a file and upload it",
         )
     if kind == ".parquet":
-        from carlasc.storage.packed.tables.writing import ParquetSink
+        from carlasc.storage.parquet.parquet_sink import ParquetSink
 
         return ParquetSink(path, options, overwrite)
-    from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
+    from carlasc.storage.hdf5.hdf5_sink import HDF5Sink
 
     return HDF5Sink(path, options, overwrite)
 
@@ -178,13 +178,13 @@ def _open_folder(tree: Tree) -> Source:
 def _open_store(tree: Tree) -> Source | None:
     """Open a packed store that is a folder; return None if the folder is not a packed store."""
     if tree.is_file("zarr.json"):
-        from carlasc.storage.packed.arrays.zarr_store import ZarrSource
+        from carlasc.storage.zarr.zarr_source import ZarrSource
 
         return ZarrSource(tree)
     if tree.is_file(UNFINISHED_MARK):
         raise unfinished_error(tree.location)
     if tree.is_file(TABLES_MARK):
-        from carlasc.storage.packed.tables.reading import ParquetSource
+        from carlasc.storage.parquet.parquet_source import ParquetSource
 
         return ParquetSource(tree)
     return None
@@ -202,7 +202,7 @@ def _open_file(tree: Tree, name: str) -> Source:
         inside = ZipTree(tree, name)
         return _open_store(inside) or PublishedSource(inside)
     if signature.startswith(_HDF5):
-        from carlasc.storage.packed.arrays.hdf5_store import HDF5Source
+        from carlasc.storage.hdf5.hdf5_source import HDF5Source
 
         return HDF5Source(tree, name)
     if signature.startswith(_PARQUET):

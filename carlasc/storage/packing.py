@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError, ConflictError, StorageError
 from carlasc.running.options import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import (
-    Block,
+    FrameBlock,
     Progress,
     blocks_of,
     copy_blocks,
@@ -31,12 +31,12 @@ from carlasc.storage.copying import (
 from carlasc.storage.folders.published import PublishedSequence
 from carlasc.storage.folders.trees import is_url
 from carlasc.storage.opening import as_source, open, open_sink
-from carlasc.storage.packed.protocol import Options, PackedSink, PackedSource, check_names
+from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions, check_names
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
 if TYPE_CHECKING:
-    from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter
+    from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
 _BLOCK = 8  # frames that are read together
 _AHEAD = 2  # threads that read ahead of the writer of a store that is appended to
@@ -108,7 +108,7 @@ def pack(
         StorageError: the store cannot be written: a full disk, a folder without write permission.
     """
     began = time.perf_counter()
-    options = Options(small, lossy_mm)
+    options = PackOptions(small, lossy_mm)
     run.part.refuse(overwrite)
     if PurePath(out).suffix != ".zarr":
         _refuse_several(out, run)
@@ -152,7 +152,7 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
             found="a finished store",
             advice="choose another name, or give `overwrite=True`",
         )
-    blocks: list[Block] = []
+    blocks: list[FrameBlock] = []
     writers: list[ZarrWriter] = []
     for path, sequence in sequences.items():
         writers.append(writer := sink.sequence(path))
@@ -218,6 +218,7 @@ def _append_sequence(
     if writer is not None:
         for name, data in documents.items():
             writer.write_document(name, data)
+        writer.expect({name: sequence.frames(name).tolist() for name in sequence.fields()}, typical_rows(sequence))
     for name in sorted(sequence.fields()):
         entry, frames = layout.field_named(name), sequence.frames(name).tolist()
         for frame, array in _read_ahead(sequence, name, frames, threads):

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
+from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
-from carlasc.core.times import check_seconds
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json

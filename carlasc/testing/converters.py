@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import carlasc
-from carlasc.converting import Converter, convert, load_converter
+from carlasc import storage
+from carlasc.converting import Converter, LayoutOptions, convert, load_converter, read_options
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, relative_to, transform_points
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 from carlasc.storage import Sequence
 from carlasc.testing.drives import KINDS, SimulatedDrive, world_T_sensor
 
@@ -40,7 +42,7 @@ class ConverterContract:
     ids: Mapping[str, int]
     drive: SimulatedDrive = SimulatedDrive()
     keeps: frozenset[str] = frozenset({"labels", "instances", "boxes", "poses", "times"})
-    options: Mapping[str, str] = {}
+    options: Mapping[str, Any] = {}
     points_m: float = 1e-4
     poses_m: float = 1e-6
 
@@ -59,15 +61,14 @@ class ConverterContract:
             self.converter,
             source,
             out,
-            axes="left" if axes == "left" else "right",
-            classes=classes,
-            grids="none",
+            layout=LayoutOptions(axes="left" if axes == "left" else "right", classes=classes),
+            poses=PoseOptions(force="poses" not in self.keeps),
+            grids=None,
             options=self.options,
-            force="poses" not in self.keeps,
-            workers=1,
+            run=Run(workers=1),
         )
         assert result.failures == ()
-        (sequence,) = carlasc.open(out).sequences().values()
+        (sequence,) = storage.open(out).sequences().values()
         return sequence
 
     @pytest.fixture(scope="class")
@@ -86,7 +87,7 @@ class ConverterContract:
 
     @pytest.fixture
     def sequence(self, out: Path) -> Sequence:
-        (sequence,) = carlasc.open(out).sequences().values()
+        (sequence,) = storage.open(out).sequences().values()
         return sequence
 
     def test_every_point_is_kept_in_its_place(self, sequence: Sequence) -> None:
@@ -172,7 +173,7 @@ class ConverterContract:
         assert not speed[truth == 0][instances[truth == 0] == 0].any()
 
     def test_frames_are_read_in_other_processes(self, source: Path) -> None:
-        (recording,) = self._class()(source, **self.options).sequences()
+        (recording,) = self._class()(source, **read_options(self._class(), self.options)).sequences()
         handle = recording.frames[1]
         again = pickle.loads(pickle.dumps(handle))
         for one, other in zip(handle.read(), again.read(), strict=True):

@@ -1,6 +1,7 @@
 from .colors import ClassColors as ClassColors
 from .colors import Entry as Entry
 from .colors import colorblind_palette as colorblind_palette
+from .rendering.cameras import CameraOptions as CameraOptions
 from .rendering.cameras import Viewpoint as Viewpoint
 from .rendering.drawings import Drawing as Drawing
 from .rendering.drawings import error_drawing as error_drawing
@@ -12,8 +13,9 @@ from .rendering.pictures import draw_panels as draw_panels
 from .rendering.pictures import render_comparison as render_comparison
 from .rendering.pictures import render_grid as render_grid
 from .rendering.pictures import render_scan as render_scan
-from .rendering.run import RenderResult as RenderResult
-from .rendering.run import render as render
+from .rendering.render import RenderResult as RenderResult
+from .rendering.render import render as render
+from .rendering.styles import StyleOptions as StyleOptions
 from .scene import FrameContent as FrameContent
 from .scene import GridPanel as GridPanel
 from .scene import Scene as Scene

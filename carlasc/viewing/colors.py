@@ -9,34 +9,34 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import PaletteName as PaletteName  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Color
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError
-from carlasc.metrics.comparison import Outcome
+from carlasc.metrics.comparison import VoxelOutcome
 
-PaletteName = Literal["class", "colorblind", "height"]
 PALETTES: tuple[str, ...] = get_args(PaletteName)
 
 ERRORS = ClassTable(
     "errors",
     {
-        Outcome.NOT_COMPARED: "nothing to compare",
-        Outcome.RIGHT: "right class",
-        Outcome.WRONG: "wrong class",
-        Outcome.MISSED: "missed: predicted free",
-        Outcome.INVENTED: "invented: free in truth",
+        VoxelOutcome.NOT_COMPARED: "nothing to compare",
+        VoxelOutcome.RIGHT: "right class",
+        VoxelOutcome.WRONG: "wrong class",
+        VoxelOutcome.MISSED: "missed: predicted free",
+        VoxelOutcome.INVENTED: "invented: free in truth",
     },
     {
-        Outcome.NOT_COMPARED: (255, 255, 255),
-        Outcome.RIGHT: (205, 209, 214),
-        Outcome.WRONG: (213, 70, 0),
-        Outcome.MISSED: (16, 90, 190),
-        Outcome.INVENTED: (240, 200, 40),
+        VoxelOutcome.NOT_COMPARED: (255, 255, 255),
+        VoxelOutcome.RIGHT: (205, 209, 214),
+        VoxelOutcome.WRONG: (213, 70, 0),
+        VoxelOutcome.MISSED: (16, 90, 190),
+        VoxelOutcome.INVENTED: (240, 200, 40),
     },
 )
 """Names and colours of the outcomes of comparing a prediction with the ground truth."""

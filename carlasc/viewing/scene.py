@@ -23,9 +23,19 @@ from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.comparison import check_same_geometry, compare_grids
 from carlasc.storage.metadata import Axes
-from carlasc.viewing.choosing import choose_grid, common_table, describe_frames, frames_with, list_fields, table_of
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
-from carlasc.viewing.finding import FoundSequence, SceneSource, find_sequence, find_truth
+from carlasc.viewing.finding import (
+    FoundSequence,
+    SceneSource,
+    choose_grid,
+    common_table,
+    describe_frames,
+    find_sequence,
+    find_truth,
+    frames_with,
+    list_fields,
+    table_of,
+)
 from carlasc.viewing.remapping import RemappedSequence
 
 CONTENTS = ("grid", "scan", "flow", "truth", "errors")
@@ -166,7 +176,7 @@ class FrameContent:
     """What a viewer shows of one frame.
 
     Attributes:
-        grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.Outcome`).
+        grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.VoxelOutcome`).
         scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
         time_s: seconds since the first frame, or None if the sequence has no times.
         boxes: tracked boxes, sensor frame; None where the frame was not annotated.

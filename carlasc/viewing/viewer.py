@@ -10,7 +10,7 @@ from typing import overload
 from carlasc.errors import ArgumentError
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.page import PAGES, write_page
-from carlasc.viewing.recordings.run import RECORDINGS, write_recording
+from carlasc.viewing.recordings.recording import RECORDINGS, write_recording
 from carlasc.viewing.scene import Scene, as_scene
 from carlasc.viewing.targets import ViewResult
 from carlasc.viewing.window.window import show_window

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, remap_named
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size
-from carlasc_converters.files import opening, read_text
-from carlasc_converters.npz import read_arrays
+from carlasc_converters.files import opening, read_arrays, read_text
 from carlasc_converters.ply import PlyVertices
 
 _TAGS: tuple[tuple[str, Color], ...] = (  # tags of CARLA 0.9.14 and later, in order, and CarlaOcc's Rock
@@ -52,18 +51,13 @@ _COPY = "the file is incomplete: copy it again"
 
 
 class CarlaOcc(Converter):
-    """Reads CarlaOcc, or one of its sequences.
-
-    Options:
-        voxels: which of its grids are read: the name of a folder in `occupancy/`, such as vs_0_2_forward_view.
-    """
+    """Reads CarlaOcc, or one of its sequences."""
 
     title: ClassVar[str] = "CarlaOcc: CARLA 0.10 with voxels from meshes"
     citation = (
         "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for Autonomous Driving, CVPR 2026"
     )
     simulated = True
-    option_names = ("voxels",)
     classes = CLASSES
     to_carla = Remap(
         "carlaocc_to_carla", CLASSES, CARLA, {**remap_named("carla0914_to_carla").mapping, 29: CARLA.id_of("Terrain")}
@@ -71,6 +65,15 @@ class CarlaOcc(Converter):
     sensor = "simulated semantic LiDAR, 32 channels"
     min_range_m = 2.5
     max_range_m = 70.0
+
+    def __init__(
+        self,
+        source: Path,
+        *,
+        voxels: Annotated[str | None, "Grid that is read: a folder in occupancy/, such as vs_0_2_forward_view."] = None,
+    ) -> None:
+        super().__init__(source)
+        self.voxels = voxels
 
     def sequences(self) -> list[Recording]:
         """Return the sequences, by name.
@@ -91,10 +94,9 @@ class CarlaOcc(Converter):
             )
         splits = _read_splits(folders[0].parent)
         existing = sorted({path.name for folder in folders for path in folder.glob("occupancy/*") if path.is_dir()})
-        wanted = self.options.get("voxels")
-        if wanted is not None and wanted not in existing:
-            raise ArgumentError("voxels", expected=f"one of {', '.join(existing) or 'no grids'}", found=wanted)
-        grid = wanted or next((name for name in (*_GRIDS, *existing) if name in existing), None)
+        if self.voxels is not None and self.voxels not in existing:
+            raise ArgumentError("voxels", expected=f"one of {', '.join(existing) or 'no grids'}", found=self.voxels)
+        grid = self.voxels or next((name for name in (*_GRIDS, *existing) if name in existing), None)
         return [CarlaOccRecording(folder, splits.get(folder.name, "Train"), grid) for folder in folders]
 
 

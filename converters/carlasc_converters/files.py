@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from carlasc.errors import MissingDataError, reading
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.arrays import ArrayFormat, open_npz
 
 COPY = "the file may be cut short: copy it again"
 
@@ -52,3 +56,23 @@ def read_text(path: str | os.PathLike[str], expected: str = "a text file", advic
     """
     with opening(path, expected, advice):
         return Path(path).read_text("utf-8")
+
+
+def read_arrays(path: str | Path, formats: Mapping[str, ArrayFormat], advice: str) -> list[NDArray[Any]]:
+    """Return some arrays of an .npz file, in the order of their names. No pickle is read.
+
+    Args:
+        path: the file.
+        formats: what each array that it must have is, by its name.
+        advice: what to do if the file is missing or damaged.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it is no .npz file, is damaged, or lacks an array; or an array has another type, shape or size.
+    """
+    try:
+        with open_npz(path) as arrays:
+            return [arrays.read(name, expected) for name, expected in formats.items()]
+    except (MissingDataError, FormatError) as error:
+        error.advice = error.advice or advice
+        raise

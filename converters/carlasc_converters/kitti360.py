@@ -47,7 +47,7 @@ class Kitti360(KittiConverter):
         """
         source = self.source.resolve()
         if (source / _SCANS).is_dir():
-            return [Kitti360Drive(Files(str(source.parents[1]), source.name))]
+            return [Kitti360Drive(Kitti360Files(str(source.parents[1]), source.name))]
         folders = sorted(path.parents[1].name for path in source.glob(f"data_3d_raw/*/{_SCANS}/data") if path.is_dir())
         if not folders:
             raise MissingDataError(
@@ -56,11 +56,11 @@ class Kitti360(KittiConverter):
                 found="none" if source.is_dir() else "no folder",
                 advice="give the folder that holds data_3d_raw/, data_poses/ and calibration/",
             )
-        return [Kitti360Drive(Files(str(source), name)) for name in folders]
+        return [Kitti360Drive(Kitti360Files(str(source), name)) for name in folders]
 
 
 @dataclass(frozen=True)
-class Files:
+class Kitti360Files:
     """Where the files of a drive are.
 
     Attributes:
@@ -101,7 +101,7 @@ class Kitti360Drive(Recording):
 
     sensors = (Sensor("velodyne", deskewed=False),)
 
-    def __init__(self, files: Files) -> None:
+    def __init__(self, files: Kitti360Files) -> None:
         self.files, self.location = files, str(files.scans.parent)
         self.name = f"KITTI360_{files.drive.removeprefix('2013_05_28_drive_').removesuffix('_sync')}"
         self.split: Split = "Test" if files.drive in _TEST else "Train"
@@ -146,7 +146,7 @@ class Kitti360Drive(Recording):
 class Kitti360Frame(FrameHandle):
     """One scan, and the window of frames whose cloud has its labels."""
 
-    files: Files
+    files: Kitti360Files
     number: int
     period_s: float
     window: str | None
@@ -178,13 +178,13 @@ class Kitti360Frame(FrameHandle):
 
 
 @lru_cache(maxsize=2)  # drives per process
-def _motion(files: Files) -> tuple[NDArray[np.float64], Trajectory]:
+def _motion(files: Kitti360Files) -> tuple[NDArray[np.float64], Trajectory]:
     """Return the times of a drive's frames, and its poses."""
     times = FrameTimes.read(files.scans / "timestamps.txt", frames_of(files.scans / "data", ".bin")).seconds
     return times, read_trajectory(files, times)
 
 
-def read_trajectory(files: Files, times: NDArray[np.float64], *, force: bool = False) -> Trajectory:
+def read_trajectory(files: Kitti360Files, times: NDArray[np.float64], *, force: bool = False) -> Trajectory:
     """Return the poses of the LiDAR from the poses of the IMU in poses.txt.
 
     Args:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,27 +17,31 @@ from carlasc.core.geometry import Transform, invert
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc_converters.nuscenes_classes import MINI_VALIDATION, NUSCENES, TO_CARLA, VALIDATION
 from carlasc_converters.nuscenes_frames import NuScenesFrame
-from carlasc_converters.nuscenes_tables import CHANNEL, Annotations, Scene, Tables
+from carlasc_converters.nuscenes_tables import CHANNEL, Annotations, SceneRow, Tables
 from carlasc_converters.rigid import poses_of
 
 
 class NuScenes(Converter):
-    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), as far as they are installed.
-
-    Options:
-        version: the folder of the tables, if there are several, such as "v1.0-mini".
-        sweeps: "yes" for all LiDAR scans, which are 20 a second; "no" for key frames only, which are 2 a second.
-    """
+    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), as far as they are installed."""
 
     title: ClassVar[str] = "nuScenes, with lidarseg and panoptic labels where they are installed"
     license = "CC BY-NC-SA 4.0"
     citation = "H. Caesar et al., nuScenes, CVPR 2020; W. K. Fong et al., Panoptic nuScenes, RA-L 2022"
-    option_names = ("version", "sweeps")
     classes = NUSCENES
     to_carla = TO_CARLA
     sensor = "Velodyne HDL-32E"
     min_range_m = 2.5
     max_range_m = 50.0
+
+    def __init__(
+        self,
+        source: Path,
+        *,
+        version: Annotated[str | None, "Folder of the tables, if there are several, such as v1.0-mini."] = None,
+        sweeps: Annotated[bool, "Read all scans, 20 a second; without it, key frames only, 2 a second."] = True,
+    ) -> None:
+        super().__init__(source)
+        self.version, self.sweeps = version, sweeps
 
     def sequences(self) -> list[Recording]:
         """Return the scenes of which there are files, by name. This reads the tables.
@@ -47,9 +51,6 @@ class NuScenes(Converter):
             MissingDataError: there are no tables, a table does not exist, or no scene has files.
             FormatError: a table does not hold what it must.
         """
-        sweeps = self.options.get("sweeps", "yes")
-        if sweeps not in ("yes", "no"):
-            raise ArgumentError("sweeps", expected="yes or no", found=repr(sweeps))
         tables = Tables(self._version())
         tables.check_categories()
         root, names = tables.folder.parent, _Names()
@@ -57,7 +58,7 @@ class NuScenes(Converter):
         for scene in tables.scenes:
             present = {scan.file for scan in scene.scans if (root / scan.file).name in names.of(root / scan.file)}
             if present:
-                found.append(NuScenesScene(tables, scene, present, all_scans=sweeps == "yes"))
+                found.append(NuScenesScene(tables, scene, present, all_scans=self.sweeps))
         if not found:
             raise MissingDataError(
                 root,
@@ -69,7 +70,7 @@ class NuScenes(Converter):
 
     def _version(self) -> Path:
         """Return the folder of the tables."""
-        root, asked = self.source.resolve(), self.options.get("version")
+        root, asked = self.source.resolve(), self.version
         if (root / "scene.json").is_file() and asked in (None, root.name):
             return root
         folders = sorted(path.parent for path in root.glob("v*/scene.json"))
@@ -109,7 +110,7 @@ class NuScenesScene(Recording):
         scene: the scene.
     """
 
-    def __init__(self, tables: Tables, scene: Scene, present: set[str], *, all_scans: bool) -> None:
+    def __init__(self, tables: Tables, scene: SceneRow, present: set[str], *, all_scans: bool) -> None:
         """Choose the scans.
 
         Args:

@@ -13,8 +13,7 @@ from carlasc.converting.protocol import Cloud, FrameHandle
 from carlasc.core.boxes import Boxes
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat
-from carlasc_converters.files import read_bytes
-from carlasc_converters.npz import read_arrays
+from carlasc_converters.files import read_arrays, read_bytes
 from carlasc_converters.nuscenes_classes import NUSCENES
 
 _COLUMNS = 5  # x, y, z, intensity, ring

@@ -56,7 +56,7 @@ class LidarScan:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneRow:
     """A scene: about 20 s of driving.
 
     Attributes:
@@ -144,7 +144,7 @@ class Tables:
         return {row[0]: pose for row, pose in zip(rows, poses, strict=True)}
 
     @cached_property
-    def scenes(self) -> list[Scene]:
+    def scenes(self) -> list[SceneRow]:
         """The scenes, by name."""
         scans: dict[str, list[LidarScan]] = {}
         labels, instances = self._label_files("lidarseg"), self._label_files("panoptic")
@@ -173,7 +173,9 @@ class Tables:
         rows = list(read_rows(self.path("scene"), ("token", "name")))
         for _, name in rows:
             self._check_inside("scene", name)
-        found = [Scene(name, tuple(sorted(scans.get(token, ()), key=attrgetter("timestamp")))) for token, name in rows]
+        found = [
+            SceneRow(name, tuple(sorted(scans.get(token, ()), key=attrgetter("timestamp")))) for token, name in rows
+        ]
         return sorted(found, key=attrgetter("name"))
 
     def _label_files(self, table: str) -> dict[str, str]:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,6 @@ _SYNONYMS = {  # names of columns, in lower case, letters only: those of the pub
     "label": {"label", "labels", "labelid", "class", "classes", "classid", "classification", "category", "semantic"},
 }
 _COLUMNS = "x=NAME,y=NAME,z=NAME,label=NAME"
-_GRIDS = ("cartesian", "cartesian_fine")
 _HEIGHT_M = 1.8  # of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
 _GROUND_RADIUS_M, _GROUND_POINTS = 5.0, 20  # the ground is that around the middle of a tile, if it has so many points
 _BATCH = 1 << 18  # rows in memory
@@ -53,20 +52,28 @@ _ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])  # 
 
 
 class SynthCity(Converter):
-    """Reads the areas of SynthCity, or one of them.
-
-    Options:
-        columns: the names of columns that are not found by themselves, such as "x=X_noise,y=Y_noise,label=Class".
-        grid: "cartesian" (the default) or "cartesian_fine": the published grid whose size and voxels tiles have.
-    """
+    """Reads the areas of SynthCity, or one of them."""
 
     title: ClassVar[str] = "SynthCity: tiles of a static cloud, voxels without free space"
     citation = "D. Griffiths, J. Boehm, SynthCity: A large scale synthetic point cloud, 2019"
     simulated = True
-    option_names = ("columns", "grid")
     classes = CLASSES
     to_carla = Remap("synthcity_to_carla", CLASSES, CARLA, _TARGETS)
     sensor = "simulated mobile mapping (BlenSor)"
+
+    def __init__(
+        self,
+        source: Path,
+        *,
+        columns: Annotated[
+            str | None, "Names of columns that are not found by themselves: x=X_noise,y=Y_noise,label=Class."
+        ] = None,
+        grid: Annotated[
+            Literal["cartesian", "cartesian_fine"], "Published grid whose size and voxels tiles have."
+        ] = "cartesian",
+    ) -> None:
+        super().__init__(source)
+        self.columns, self.grid = columns, grid
 
     def sequences(self) -> list[Recording]:
         """Return the areas, by name.
@@ -77,14 +84,11 @@ class SynthCity(Converter):
             ArgumentError: an option has a wrong value.
             DependencyError: pyarrow is not installed.
         """
-        grid = self.options.get("grid", _GRIDS[0])
-        if grid not in _GRIDS:
-            raise ArgumentError("grid", expected=f"one of {', '.join(_GRIDS)}", found=grid)
-        named = _parse_columns(self.options["columns"]) if "columns" in self.options else {}
+        named = {} if self.columns is None else _parse_columns(self.columns)
         files = [self.source] if self.source.is_file() else sorted(self.source.rglob("*.parquet"))
         if not files:
             raise MissingDataError(self.source, expected="Parquet tables, one per area", found="none")
-        return [SynthCityArea(path, _find_columns(path, named), GridSpec.published(grid)) for path in files]
+        return [SynthCityArea(path, _find_columns(path, named), GridSpec.published(self.grid)) for path in files]
 
 
 class SynthCityArea(Recording):
@@ -126,9 +130,9 @@ class SynthCityArea(Recording):
         ]
 
     @cached_property
-    def _cut(self) -> tuple[_Folder, list[tuple[int, int]]]:
+    def _cut(self) -> tuple[_TileFolder, list[tuple[int, int]]]:
         """The folder with the rows of each tile, and the tiles. One pass over the table makes them."""
-        folder, tiles = _Folder(), set[tuple[int, int]]()
+        folder, tiles = _TileFolder(), set[tuple[int, int]]()
         for points, labels in _batches(self.path, self.columns):
             tiles |= _append(folder.name, points, labels, self._step)
         if not tiles:
@@ -159,7 +163,7 @@ class SynthCityArea(Recording):
         ]
 
 
-class _Folder:
+class _TileFolder:
     """A temporary folder that is deleted when nothing refers to this object any more, at the latest when the process ends."""
 
     def __init__(self) -> None:

@@ -15,9 +15,10 @@ from clock import Clock
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.captures import Drive
+from carlasc.captures import TownDrive
 from carlasc.converting import convert
 from carlasc.core.tables import CARLA
+from carlasc.running import Run
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.datasets.kitti import write_kitti
@@ -35,11 +36,11 @@ ROWS = {  # name: class, speeds in m/s, numbers of points
 
 def compare(seed: int) -> NDArray[np.float64]:
     """Return (S, 4) of a drive's sightings of moving actors: class, true speed, number of points, end-point error."""
-    drive, found = Drive(seed, "heavy"), []
+    drive, found = TownDrive(seed, "heavy"), []
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         truth = write_kitti(root / "in", drive, FRAMES, voxels_every=0)
-        convert("kitti", root / "in", root / "out", grids="none", workers=2)
+        convert("kitti", root / "in", root / "out", grids=None, run=Run(workers=2))
         (sequence,) = carlasc.open(root / "out").sequences().values()
         for number in truth.frames:
             scan, flow = sequence.scan(number), truth.flow[number] * MIRROR

@@ -16,7 +16,7 @@ import numpy as np
 from clock import Clock
 from numpy.typing import NDArray
 
-from carlasc.captures import Drive, Lidar
+from carlasc.captures import Lidar, TownDrive
 from carlasc.captures.town.drive import scan_snapshot
 from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.core.tables import CARLA
@@ -81,7 +81,7 @@ class Found:
 def scans(case: Case, seed: int) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
     """Yield (N, 3) points in the frame of the first sensor, and (N,) which of them are ground."""
     lidar = Lidar(case.channels, RAYS[case.channels])
-    drive = Drive(seed, "heavy", lidar)
+    drive = TownDrive(seed, "heavy", lidar)
     for frame in FRAMES:
         rng = np.random.default_rng([seed, frame, case.channels])
         poses = [drive.ego_pose(frame) @ _mount(*mount) for mount in case.mounts]

@@ -18,8 +18,8 @@ from PIL import Image
 
 import carlasc
 from carlasc import Grid, GridSpec, Run
-from carlasc.captures import Drive
-from carlasc.converting import convert
+from carlasc.captures import TownDrive
+from carlasc.converting import FlowSource, LayoutOptions, convert
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, count_votes, regrid
@@ -36,11 +36,11 @@ VEHICLE = CARLA.id_of("Vehicle")
 RUNS = {  # name: rule for what moves, and whether flow is estimated by the converter
     "tube": ("tube", "none"),
     "align, by instances": ("align", "none"),
-    "align, by instances and their estimated flow": ("align", "instances"),
+    "align, by instances and their estimated flow": ("align", "auto"),
 }
 
 
-def reference(drive: Drive, frame: int) -> dict[str, Grid]:
+def reference(drive: TownDrive, frame: int) -> dict[str, Grid]:
     """Return what 60 sensors see at the instant of a frame, in each grid of the ego sensor."""
     grid_T_world = invert(drive.sensor_poses(frame, 1)[0])
     seen = drive.reference_observations(frame, 60)
@@ -79,12 +79,20 @@ def row(name: str, run: str, total: TruthScore) -> str:
 
 def main(out: Path) -> None:
     """Convert, make grids by each rule, score them, draw one scene."""
-    drive, clock = Drive(SEED, "heavy"), Clock()
+    drive, clock = TownDrive(SEED, "heavy"), Clock()
     lines = [f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | wrongly Vehicle |", "|---|---|" + "---:|" * 7]
     with tempfile.TemporaryDirectory() as place:
         write_kitti(Path(place) / "in", drive, FRAMES, voxels_every=0)
-        for flow in ("none", "instances"):
-            convert("kitti", Path(place) / "in", Path(place) / flow, grids="none", flow=flow, workers=2)  # type: ignore[arg-type]
+        flows: tuple[FlowSource, ...] = ("none", "auto")
+        for flow in flows:
+            convert(
+                "kitti",
+                Path(place) / "in",
+                Path(place) / flow,
+                layout=LayoutOptions(flow=flow),
+                grids=None,
+                run=Run(workers=2),
+            )
         clock("conversion")
         truths = {frame: reference(drive, frame) for frame in JUDGED}
         clock("reference")

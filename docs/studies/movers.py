@@ -35,12 +35,12 @@ from movers_tables import Table, write_tables
 from carlasc import Run
 from carlasc.core.frames import FrameRange
 from carlasc.groundtruth import Voting
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.inputs import Plan
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection import holdout
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage.files import write_atomic
 
 SEEDS = {"town": [61, 62, 63, 64, 65], "street": [261, 262, 263, 264, 265]}
@@ -104,16 +104,16 @@ class ActorStore:
 
     folder: Path
 
-    def of(self, row: Row, feed: ScanFeed) -> Actors:
+    def of(self, row: Row, feed: ScanFeed) -> MovingActors:
         """Return the actors of a row; they are found on first use."""
         if not feed.needs_actors:
-            return Actors()
+            return MovingActors()
         path = self.folder / f"{plain(row.finds)}.npz"
         if not path.exists():
             found = find_actors(feed)
             write_atomic(path, found.to_bytes(row.finds))
             return found
-        return Actors.from_bytes(path.read_bytes(), str(path))[0]
+        return MovingActors.from_bytes(path.read_bytes(), str(path))[0]
 
 
 def plain(name: str) -> str:
@@ -169,7 +169,7 @@ def make(
     drive: Recorded, row: Row, grid: str, frames: Iterable[int], store: ActorStore
 ) -> Iterator[tuple[int, MergedFrame, float]]:
     """Yield the frames of a drive that are made in one way, each with the time that it took in seconds."""
-    plan = Plan(GRIDS[grid], "grid", row.observe, Voting(keep_evidence=row.observe.dynamic != "tube"), FrameRange())
+    plan = GridPlan(GRIDS[grid], "grid", row.observe, Voting(keep_evidence=row.observe.dynamic != "tube"), FrameRange())
     feed = None
     for frame in frames:
         if feed is None or row.by_frame:

@@ -15,7 +15,7 @@ from street import StreetDrive
 
 import carlasc
 from carlasc import Boxes, GridSpec
-from carlasc.captures import Actor, Drive, Lidar
+from carlasc.captures import Lidar, TownActor, TownDrive
 from carlasc.captures.town.actors import EGO_ID
 from carlasc.captures.town.drive import REFERENCE_OFFSET_M, scan_snapshot
 from carlasc.core.geometry import Transform, invert, relative_to, transform_points, translation
@@ -45,7 +45,7 @@ class Kind:
         movers_only: whether the voxels of actors that stand are left out.
     """
 
-    make: Callable[[int, Lidar], Drive]
+    make: Callable[[int, Lidar], TownDrive]
     frames: int
     candidates: tuple[int, ...]
     judged: int
@@ -53,12 +53,12 @@ class Kind:
     movers_only: bool = True
 
 
-def _town(seed: int, lidar: Lidar) -> Drive:
-    return Drive(seed, "heavy", lidar)
+def _town(seed: int, lidar: Lidar) -> TownDrive:
+    return TownDrive(seed, "heavy", lidar)
 
 
-def _town_without_parked_cars(seed: int, lidar: Lidar) -> Drive:
-    drive = Drive(seed, "heavy", lidar)
+def _town_without_parked_cars(seed: int, lidar: Lidar) -> TownDrive:
+    drive = TownDrive(seed, "heavy", lidar)
     drive._population._parked = []
     return drive
 
@@ -184,7 +184,7 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
         np.save(folder / SIGHTINGS, np.concatenate(sightings[channels]))
 
 
-def boxes_of(actors: list[Actor], world_T_sensor: Transform) -> Boxes:
+def boxes_of(actors: list[TownActor], world_T_sensor: Transform) -> Boxes:
     """Return the tight boxes of actors in the frame of a sensor; their tracks are the actors' numbers."""
     poses, sizes = np.zeros((len(actors), 4, 4)), np.zeros((len(actors), 3))
     for row, actor in enumerate(actors):
@@ -195,7 +195,7 @@ def boxes_of(actors: list[Actor], world_T_sensor: Transform) -> Boxes:
     return Boxes.from_poses(np.array([actor.id for actor in actors], np.uint32), labels, poses, sizes)
 
 
-def label_of(actor: Actor) -> int:
+def label_of(actor: TownActor) -> int:
     """Return the class of an actor."""
     return int(np.bincount(actor.mesh.labels).argmax())
 
@@ -243,7 +243,7 @@ def _see(name: str, seed: int) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def choose_frames(drive: Drive, kind: Kind) -> list[int]:
+def choose_frames(drive: TownDrive, kind: Kind) -> list[int]:
     """Return the candidates with most moving vehicles in the grid's area, in their order."""
     counts = []
     for frame in kind.candidates:
@@ -256,7 +256,7 @@ def choose_frames(drive: Drive, kind: Kind) -> list[int]:
     return sorted(kind.candidates[int(row)] for row in best)
 
 
-def _owners(actors: list[Actor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
+def _owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
     """Return the actor that each voxel may belong to; the smaller one where boxes overlap."""
     owner = np.zeros(spec.num_voxels, np.uint16)
     centers = np.indices(spec.size).reshape(3, -1).T * spec.voxel_size + spec.lower + np.array(spec.voxel_size) / 2

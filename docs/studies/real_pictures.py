@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import carlasc
-from carlasc.groundtruth import FromScans
+from carlasc.groundtruth import FromScans, GridOptions
 from carlasc.viewing import Scene
 
 WINDOW = (-30, 30)
@@ -19,7 +19,7 @@ WINDOW = (-30, 30)
 
 def main(converter: str, source: Path, out: Path, chosen: list[int]) -> None:
     """Convert a data set, and draw frames of its first recording."""
-    result = carlasc.convert(converter, source, out / "data", observe=FromScans(window=WINDOW))
+    result = carlasc.convert(converter, source, out / "data", grids=GridOptions(observe=FromScans(window=WINDOW)))
     for note in result.notes:
         print(f"note: {note}")
     for failure in result.failures:
@@ -30,7 +30,11 @@ def main(converter: str, source: Path, out: Path, chosen: list[int]) -> None:
         scene = Scene(source=sequence.location, frames=(frame, frame + 1))
         for what in ("scan,grid", "flow"):
             picture = out / f"{sequence.name}_{frame:06d}_{what.replace(',', '_')}.png"
-            print(carlasc.render(scene, picture, what=what, size=(1600, 700), overwrite=True).out)
+            print(
+                carlasc.render(
+                    scene, picture, what=what, style=carlasc.StyleOptions(size=(1600, 700)), overwrite=True
+                ).out
+            )
 
 
 if __name__ == "__main__":

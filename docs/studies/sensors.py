@@ -16,7 +16,7 @@ from clock import Clock
 from matplotlib.figure import Figure
 
 from carlasc import Grid, GridSpec
-from carlasc.captures import Drive, Recording
+from carlasc.captures import SensorRecording, TownDrive
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
@@ -27,7 +27,7 @@ SCENES = [(seed, 60) for seed in range(101, 106)]
 SPECS = {"0.4 m": GridSpec.published().with_resolution(0.4), "0.2 m": GridSpec.published().with_resolution(0.2)}
 
 
-def vote(recordings: Iterable[Recording], grid_T_world: np.ndarray, spec: GridSpec) -> Grid:
+def vote(recordings: Iterable[SensorRecording], grid_T_world: np.ndarray, spec: GridSpec) -> Grid:
     """Return the grid of several recordings."""
     observations = (Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in recordings)
     return count_votes(observations, spec).to_grid()
@@ -35,7 +35,7 @@ def vote(recordings: Iterable[Recording], grid_T_world: np.ndarray, spec: GridSp
 
 def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
     """Return the score per resolution and number of sensors in one scene."""
-    drive = Drive(seed, "heavy")
+    drive = TownDrive(seed, "heavy")
     reference = drive.reference_observations(frame, 60)
     recordings = [drive.record(frame, sensor) for sensor in range(max(SENSORS))]
     grid_T_world = invert(recordings[0].world_T_sensor)

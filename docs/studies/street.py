@@ -12,14 +12,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from carlasc.captures import Actor, Drive, Lidar
+from carlasc.captures import Lidar, TownActor, TownDrive
 from carlasc.captures.town import furniture
 from carlasc.captures.town.actors import EGO_ID, STRIDE_M
+from carlasc.captures.town.blocks import GROUND, PAINT_M, ROAD, ROAD_LINE, SIDEWALK, TERRAIN
+from carlasc.captures.town.buildings import add_building
 from carlasc.captures.town.meshes import Mesh
-from carlasc.captures.town.paving import GROUND, PAINT_M, ROAD, ROAD_LINE, SIDEWALK, TERRAIN
-from carlasc.captures.town.plan import KERB_M, Plan
+from carlasc.captures.town.plan import KERB_M, Rectangle, TownPlan
 from carlasc.captures.town.plants import PlantCatalogue
-from carlasc.captures.town.plots import Rectangle
 from carlasc.captures.town.shapes import (
     EGO_KIND,
     GAIT_PHASES,
@@ -76,7 +76,7 @@ class Mover:
     shape: Mesh | float
     backwards: bool = False
 
-    def at(self, number: int, frame: int) -> Actor:
+    def at(self, number: int, frame: int) -> TownActor:
         """Return it in a frame, as the actor of a number."""
         way = self.speed * frame * FRAME_PERIOD_S
         sign = -1.0 if self.backwards else 1.0
@@ -86,7 +86,7 @@ class Mover:
             mesh = self.shape
         else:
             mesh = pedestrian_mesh(round(self.shape, 1), int((self.x + way) / STRIDE_M * GAIT_PHASES) % GAIT_PHASES)
-        return Actor(number, pose, np.array([sign * self.speed, 0.0, 0.0]), mesh)
+        return TownActor(number, pose, np.array([sign * self.speed, 0.0, 0.0]), mesh)
 
 
 class Traffic:
@@ -117,12 +117,12 @@ class Traffic:
         """Return (4, 4) world_T_ego of a frame."""
         return self.movers[0].at(EGO_ID, frame).world_T_actor
 
-    def at(self, frame: int) -> list[Actor]:
+    def at(self, frame: int) -> list[TownActor]:
         """Return all actors in a frame, the vehicle that records first."""
         return [mover.at(EGO_ID + index, frame) for index, mover in enumerate(self.movers)]
 
 
-class StreetDrive(Drive):
+class StreetDrive(TownDrive):
     """A drive along a street instead of through a town."""
 
     def __init__(self, seed: int, lidar: Lidar | None = None) -> None:
@@ -158,7 +158,7 @@ def _queue(
 
 def build_street(rng: np.random.Generator) -> Street:
     """Build what stands along a random street."""
-    plan = Plan(rng, PlantCatalogue(rng))
+    plan = TownPlan(rng, PlantCatalogue(rng))
     _lay_strip(plan, ROAD, (-HALF_ROAD_M, 0.0), (HALF_ROAD_M, 0.0))
     for y in (-3.5, 0.0, 3.5):
         dashes = np.arange(START_M, END_M, 7.5)
@@ -174,7 +174,7 @@ def build_street(rng: np.random.Generator) -> Street:
     return Street(plan.builder.build(), tuple(plan.buildings))
 
 
-def _lay_strip(plan: Plan, label: int, one: tuple[float, float], other: tuple[float, float]) -> None:
+def _lay_strip(plan: TownPlan, label: int, one: tuple[float, float], other: tuple[float, float]) -> None:
     """Add a surface along the street between two lines, (y, z) each, in tiles of 6 m."""
     x = np.arange(START_M, END_M, 6.0)
     parts = max(1, round(abs(other[0] - one[0]) / 6.0))
@@ -185,7 +185,7 @@ def _lay_strip(plan: Plan, label: int, one: tuple[float, float], other: tuple[fl
         plan.builder.ribbon(label, left, right)
 
 
-def _build_houses(plan: Plan, side: float) -> None:
+def _build_houses(plan: TownPlan, side: float) -> None:
     rng, x = plan.rng, START_M
     while x < END_M - 25:
         width, depth = float(rng.uniform(9, 20)), float(rng.uniform(7, 10))
@@ -194,11 +194,11 @@ def _build_houses(plan: Plan, side: float) -> None:
             y = side * (HALF_ROAD_M + WALK_M + back + depth / 2)
             yaw = 0.0 if side > 0 else np.pi
             footprint = Rectangle(np.array([x + width / 2, y]), (width, depth), yaw)
-            plan.add_building(footprint, float(rng.uniform(5, 14)), pitched=bool(rng.random() < 0.4))
+            add_building(plan, footprint, float(rng.uniform(5, 14)), pitched=bool(rng.random() < 0.4))
         x += width + float(rng.uniform(1, 6))
 
 
-def _add_furniture(plan: Plan, side: float) -> None:
+def _add_furniture(plan: TownPlan, side: float) -> None:
     rng, yaw = plan.rng, 0.0 if side > 0 else np.pi
     for x in np.arange(START_M + rng.uniform(0, 8), END_M, 22.0):
         plan.add(furniture.street_lamp(), np.array([x, side * (HALF_ROAD_M + 0.3)]), yaw)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarking.sizes import SPLITS, Scenes, settings_of
 from carlasc import FromScans, Grid, GridSpec, Run, Voting, regrid
-from carlasc.captures import Drive, TrafficLevel
+from carlasc.captures import TownDrive, TrafficLevel
 from carlasc.core import CARLA, invert, relative_to, transform_points
 from carlasc.errors import ConflictError
 from carlasc.groundtruth import Observation, count_votes
@@ -63,14 +63,14 @@ def build_drives(
         path = f"{split}/Town{seed}_{TRAFFIC.title()}"
         writer = FolderSink(out).sequence(f"{path}/cartesian")
         if writer.read_document("evaluation/params.json") is None:  # written last
-            record_drive(writer, Drive(seed, TRAFFIC, scenes.lidar), scenes)
+            record_drive(writer, TownDrive(seed, TRAFFIC, scenes.lidar), scenes)
         if split != "Test":  # all runs are scored on capture truth
             merge_scans(out / path, scenes, workers)
         if progress:
             progress(done, len(towns))
 
 
-def record_drive(writer: SequenceWriter, drive: Drive, scenes: Scenes) -> None:
+def record_drive(writer: SequenceWriter, drive: TownDrive, scenes: Scenes) -> None:
     """Write the scans of a stretch of a drive, with labels and flow, and the capture truth of its middle frames."""
     count = scenes.frames + 2 * scenes.margin
     first = choose_stretch(drive, scenes)
@@ -89,7 +89,7 @@ def record_drive(writer: SequenceWriter, drive: Drive, scenes: Scenes) -> None:
     writer.write_document("evaluation/params.json", json.dumps(scenes.spec.to_params()).encode())
 
 
-def see_all(drive: Drive, frame: int, sensors: int, spec: GridSpec) -> Grid:
+def see_all(drive: TownDrive, frame: int, sensors: int, spec: GridSpec) -> Grid:
     """Return what all sensors of the vehicle see at the instant of a frame, in the ego sensor's frame."""
     ego = drive.sensor_poses(frame, 1)[0]
     recordings = (drive.record(frame, sensor) for sensor in range(sensors))
@@ -114,7 +114,7 @@ def merge_scans(folder: Path, scenes: Scenes, workers: int | None) -> None:
     regrid(folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, run=Run(workers=workers))
 
 
-def choose_stretch(drive: Drive, scenes: Scenes) -> int:
+def choose_stretch(drive: TownDrive, scenes: Scenes) -> int:
     """Return the first frame of the stretch in which most frames show a pedestrian, and a vehicle that moves, in the grid.
 
     Both are rare at a random frame. The earliest of equal stretches is taken.
@@ -126,7 +126,7 @@ def choose_stretch(drive: Drive, scenes: Scenes) -> int:
     return int(looked_at[scores.argmax()]) - scenes.margin
 
 
-def _who_is_near(drive: Drive, frame: int, within_m: float) -> tuple[bool, bool]:
+def _who_is_near(drive: TownDrive, frame: int, within_m: float) -> tuple[bool, bool]:
     """Return whether a pedestrian, and whether a moving vehicle other than the ego, is in the grid of a frame."""
     ego, *others = drive.actors(frame)
     places = np.array([actor.world_T_actor[:3, 3] for actor in others]).reshape(-1, 3)

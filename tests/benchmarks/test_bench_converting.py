@@ -10,9 +10,11 @@ import pytest
 from helpers.datasets.kitti import write_kitti
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
-from carlasc.captures import Drive, Lidar
-from carlasc.converting import convert
+from carlasc.captures import Lidar, TownDrive
+from carlasc.converting import LayoutOptions, convert
+from carlasc.motion import PoseOptions
 from carlasc.motion.paths import estimate_path
+from carlasc.running import Run
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +42,15 @@ def test_bench_copy(benchmark, source, tmp_path):
 def test_bench_convert(benchmark, source, tmp_path):
     def run():
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        return convert("kitti", source, tmp_path / "out", grids="none", flow="none", force=True, workers=1)
+        return convert(
+            "kitti",
+            source,
+            tmp_path / "out",
+            layout=LayoutOptions(flow="none"),
+            poses=PoseOptions(force=True),
+            grids=None,
+            run=Run(workers=1),
+        )
 
     assert benchmark(run).made == FRAMES
 
@@ -48,7 +58,9 @@ def test_bench_convert(benchmark, source, tmp_path):
 @pytest.fixture(scope="module")
 def traffic(tmp_path_factory):
     root = tmp_path_factory.mktemp("traffic")
-    write_kitti(root, Drive(4, "heavy", Lidar(channels=64, points=POINTS)), range(240, 240 + FRAMES), voxels_every=0)
+    write_kitti(
+        root, TownDrive(4, "heavy", Lidar(channels=64, points=POINTS)), range(240, 240 + FRAMES), voxels_every=0
+    )
     return root
 
 
@@ -58,7 +70,7 @@ def test_bench_convert_with_flow(benchmark, traffic, tmp_path, workers):
 
     def run():
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        return convert("kitti", traffic, tmp_path / "out", grids="none", workers=workers)
+        return convert("kitti", traffic, tmp_path / "out", grids=None, run=Run(workers=workers))
 
     assert benchmark(run).made == FRAMES
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.converting import export
 from carlasc.core.grids import GridSpec
+from carlasc.running import Run
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folders.folder import FolderSink
@@ -70,6 +71,6 @@ def test_bench_export_kitti(benchmark: Any, tmp_path: Path) -> None:
 
     def run() -> int:
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        return export("kitti", tmp_path / "in", tmp_path / "out", workers=1).made
+        return export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made
 
     assert benchmark(run) == FRAMES

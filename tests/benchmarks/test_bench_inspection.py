@@ -11,8 +11,7 @@ import pytest
 from helpers.scenes.lidar_frames import street_frame
 
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.inspection import validate
 from carlasc.inspection.agreement import GridEvidence
 from carlasc.storage import layout

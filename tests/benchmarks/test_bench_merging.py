@@ -13,11 +13,11 @@ import pytest
 from carlasc import FromScans, GridSpec, Voting
 from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
-from carlasc.groundtruth.inputs import Plan
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.motion import MotionOptions
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.testing.drives import KINDS, SimulatedDrive
 
@@ -47,11 +47,11 @@ def feed_of(folder: Path, full: bool) -> ScanFeed:
 def test_a_frame_from_merged_scans(benchmark: Any, tmp_path: Path, res: float, keep_evidence: bool) -> None:
     feed = feed_of(tmp_path, benchmark.enabled)
     spec = GridSpec.published().with_resolution(res)
-    plan = Plan(spec, "evaluation", feed.options, Voting(keep=True, keep_evidence=keep_evidence), FrameRange())
+    plan = GridPlan(spec, "evaluation", feed.options, Voting(keep=True, keep_evidence=keep_evidence), FrameRange())
     frame = int(feed.frames[len(feed.frames) // 2])
 
     def make() -> tuple[MergedFrame, Any]:
-        merged = merge_frame(plan, feed, Actors(), frame, feed.window_of(frame))
+        merged = merge_frame(plan, feed, MovingActors(), frame, feed.window_of(frame))
         return merged, merged.votes.to_sparse()
 
     make()  # compiled, and the scans are read

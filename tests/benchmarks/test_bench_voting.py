@@ -12,8 +12,7 @@ from helpers.references.plain_voting import plain_grid, plain_votes
 from helpers.scenes.lidar_frames import street_frame
 
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 
 pytestmark = [pytest.mark.slow, pytest.mark.benchmark(timer=time.process_time)]  # of one thread, whatever else runs
 

@@ -7,7 +7,7 @@ from helpers.datasets.captures import make_recording, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from carlasc.captures.raw import Capture, Recording, find_captures
+from carlasc.captures.raw import Capture, SensorRecording, find_captures
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.scans import Scan
 from carlasc.errors import FormatError, MissingDataError, StorageError
@@ -103,10 +103,10 @@ def test_a_capture_without_pictures_has_none(tmp_path):
 def test_flow_is_the_velocity_of_each_points_actor_and_zero_elsewhere():
     scan = Scan(np.zeros((5, 3), np.float32), None, None, np.array([9, 0, 4, 7, 9], np.uint32))
     velocities = np.array([[9, 1, 2, 3], [4, -1, 0, 0], [0, 5, 5, 5]], np.float64)
-    flow = Recording(scan, np.eye(4), velocities).flow()
+    flow = SensorRecording(scan, np.eye(4), velocities).flow()
     assert flow.dtype == np.float32
     assert flow.tolist() == [[1, 2, 3], [0, 0, 0], [-1, 0, 0], [0, 0, 0], [1, 2, 3]]
-    assert not Recording(scan, np.eye(4), np.empty((0, 4))).flow().any()
+    assert not SensorRecording(scan, np.eye(4), np.empty((0, 4))).flow().any()
 
 
 def test_a_capture_pickles_into_a_worker(tmp_path):
@@ -211,7 +211,7 @@ def test_a_file_of_another_size_is_named(tmp_path, change, message):
 def test_a_recording_without_labels_is_not_written(tmp_path):
     scan = Scan(np.zeros((1, 3), np.float32))
     with pytest.raises(FormatError, match="sensor 0, frame 5: expected labels and instances"):
-        CaptureWriter(tmp_path).write(0, 5, Recording(scan, np.eye(4), np.empty((0, 4))))
+        CaptureWriter(tmp_path).write(0, 5, SensorRecording(scan, np.eye(4), np.empty((0, 4))))
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(tmp_path):
@@ -276,4 +276,4 @@ def test_times_files_are_in_the_order_of_frames_and_keep_the_lines_that_they_hav
 def test_a_pose_that_is_not_rigid_is_not_written(tmp_path):
     recording = make_recording()
     with pytest.raises(FormatError, match="sensor 0, frame 5: expected a rigid transform"):
-        CaptureWriter(tmp_path).write(0, 5, Recording(recording.scan, 2 * np.eye(4), recording.velocities))
+        CaptureWriter(tmp_path).write(0, 5, SensorRecording(recording.scan, 2 * np.eye(4), recording.velocities))

@@ -10,14 +10,15 @@ import typer
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.cli.common import CommandGroup, FramesOption, parse_numbers, print_json, report_failures
+from carlasc.cli.commands import Command, CommandGroup
+from carlasc.cli.common import FramesOption, parse_numbers, print_json, report_failures
 from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 
 
 def run(action):
     app = typer.Typer(cls=CommandGroup)
-    app.command("one")(action)
+    app.command("one", cls=Command)(action)
     app.command("other")(lambda: None)
     return CliRunner().invoke(app, ["one"])
 
@@ -68,7 +69,7 @@ def run_with_options(error):
         typer.echo(repr(frames))
 
     app = typer.Typer(cls=CommandGroup)
-    app.command("one")(action)
+    app.command("one", cls=Command)(action)
     app.command("other")(lambda: None)
     return lambda *arguments: CliRunner().invoke(app, ["one", "data", *arguments])
 

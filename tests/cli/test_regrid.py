@@ -8,7 +8,7 @@ from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.cli.grid_options import Coordinates, Preset, parse_grid
+from carlasc.cli.grid_flags import GridFlags
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 
@@ -159,17 +159,17 @@ def test_options_for_scans_and_grids_say_what_observes_the_scene(capture):
 
 def test_presets_are_the_published_grids_in_the_coordinates_asked_for():
     published = GridSpec.published
-    assert parse_grid(None, None, Preset.coarse, None, None) == published("cartesian")
-    assert parse_grid(None, None, Preset.fine, None, None) == published("cartesian_fine")
-    assert parse_grid(None, None, Preset.cylindrical, None, None) == published("cylindrical")
-    assert parse_grid(None, None, Preset.coarse, Coordinates.cylindrical, None) == published("cylindrical")
+    assert GridFlags(preset="coarse").spec() == published("cartesian")
+    assert GridFlags(preset="fine").spec() == published("cartesian_fine")
+    assert GridFlags(preset="cylindrical").spec() == published("cylindrical")
+    assert GridFlags(preset="coarse", coordinates="cylindrical").spec() == published("cylindrical")
 
 
 def test_degrees_end_at_the_command_line():
-    spec = parse_grid("0.5,3,0.5", None, None, Coordinates.cylindrical, "0,20,-90,90,-2,1")
+    spec = GridFlags("0.5,3,0.5", coordinates="cylindrical", bounds="0,20,-90,90,-2,1").spec()
     assert spec.size == (40, 60, 6)
     assert spec.lower[1] == np.float32(-math.pi / 2) and spec.upper[1] == np.float32(math.pi / 2)
-    whole = parse_grid(None, "8,8,4", None, Coordinates.cylindrical, "0,20,-180,180,-2,1")
+    whole = GridFlags(size="8,8,4", coordinates="cylindrical", bounds="0,20,-180,180,-2,1").spec()
     assert whole.lower[1] == GridSpec.published("cylindrical").lower[1]
     with pytest.raises(ArgumentError, match="at most 2 pi"):
-        parse_grid(None, "8,8,4", None, Coordinates.cylindrical, "0,20,-190,180,-2,1")
+        GridFlags(size="8,8,4", coordinates="cylindrical", bounds="0,20,-190,180,-2,1").spec()

@@ -8,6 +8,7 @@ import pytest
 from carlasc.converting.actors import ActorMotion, find_actors
 from carlasc.core import SEMANTICKITTI, SEMANTICPOSS
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
+from carlasc.running import Run
 
 MOVING_CAR, CAR, PERSON = 252, 10, 254
 POSS_CAR, POSS_PERSON = 7, 4
@@ -27,8 +28,8 @@ def scan_of(number, actors, pose):
     return stacked, np.array(labels, np.uint16), np.array(instances, np.uint32)
 
 
-def estimate(frames, actors, classes=SEMANTICKITTI, poses=None, damaged=(), **options):
-    motion = ActorMotion(classes, **options)
+def estimate(frames, actors, classes=SEMANTICKITTI, poses=None, damaged=(), run=Run(1)):  # noqa: B008 (frozen)
+    motion = ActorMotion(classes, run)
     for number in frames:
         pose = np.eye(4) if poses is None else poses[number]
         points, labels, instances = scan_of(number, actors, pose)
@@ -136,4 +137,4 @@ def test_an_executor_gives_the_same():
     frames = range(20)
     actors = {n: (MOVING_CAR, (10, 4 * n, 0), (6, 0, 0), frames) for n in range(1, 4)}
     with ThreadPoolExecutor(2) as executor:
-        assert estimate(frames, actors, workers=2, executor=executor) == estimate(frames, actors)
+        assert estimate(frames, actors, run=Run(2, executor)) == estimate(frames, actors)

@@ -9,9 +9,10 @@ from converters.formats import argoverse2 as av2
 from converters.formats.argoverse2 import CITY_T_WORLD, LOG, START_NS, read_table, write_argoverse2, write_table
 
 import carlasc
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.running import Run
 from carlasc.testing import ConverterContract
 from carlasc.testing.drives import KINDS
 
@@ -305,7 +306,7 @@ def test_a_folder_without_logs_and_an_unknown_option_are_refused(tmp_path):
     with pytest.raises(MissingDataError, match="found no such folder"):
         Argoverse2(tmp_path / "typo").sequences()
     with pytest.raises(ArgumentError, match="expected no options for this data set, found flow"):
-        Argoverse2(tmp_path, flow="yes")
+        convert("argoverse2", tmp_path, tmp_path / "out", options={"flow": "yes"})
 
 
 @pytest.fixture(scope="module")
@@ -365,7 +366,7 @@ def test_boxes_of_the_real_sample_hold_the_points_that_the_annotators_counted(sa
 
 @pytest.mark.slow
 def test_the_road_of_the_real_sample_is_in_the_grid_and_each_lidar_casts_its_own_rays(sample, tmp_path):
-    result = convert("argoverse2", sample, tmp_path / "out", axes="right", workers=1)
+    result = convert("argoverse2", sample, tmp_path / "out", layout=LayoutOptions(axes="right"), run=Run(workers=1))
     assert result.failures == () and result.made == 3
     assert sum("both LiDARs count as one" in note for note in result.notes) == 1
     for sequence in carlasc.open(tmp_path / "out").sequences().values():

@@ -19,6 +19,8 @@ from carlasc.converting import convert
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.groundtruth import GridOptions
+from carlasc.running import Run
 from carlasc.storage import layout
 from carlasc.testing import KINDS, ConverterContract, SimulatedDrive
 from carlasc.testing.drives import world_T_sensor
@@ -263,10 +265,9 @@ def test_meshes_are_a_truth_for_the_grids_that_scans_give(tmp_path: Path) -> Non
     drive = SimulatedDrive(frames=3, channels=24, columns=180)
     write_carlaocc(tmp_path / "source", drive)
     grids = {}
-    for kind in ("scans", "voxels"):
-        observe = FromScans(window=(-2, 0))
+    for kind, how in (("scans", GridOptions(SURROUND, FromScans(window=(-2, 0)))), ("voxels", "voxels")):
         out = tmp_path / kind
-        result = convert("carlaocc", tmp_path / "source", out, grids=kind, spec=SURROUND, observe=observe, workers=1)
+        result = convert("carlaocc", tmp_path / "source", out, grids=how, run=Run(workers=1))
         assert result.failures == ()
         (sequence,) = carlasc.open(out).sequences().values()
         grids[kind] = sequence.grid(layout.grid_folder(SURROUND), 2)

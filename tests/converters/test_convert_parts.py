@@ -9,7 +9,9 @@ from carlasc.cli import app
 from carlasc.converting import convert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.running import Part
+from carlasc.groundtruth import GridOptions
+from carlasc.motion import PoseOptions
+from carlasc.running import Part, Run
 
 SPEC = GridSpec.published().with_size((16, 16, 4))
 
@@ -24,9 +26,9 @@ def kitti(tmp_path):
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2)])
 def test_parts_make_the_files_of_one_conversion(kitti, tmp_path, order):
-    how = {"spec": SPEC, "follow_ground": False, "force": True, "workers": 1}
-    whole = convert("kitti", kitti, tmp_path / "whole", **how)
-    parts = [convert("kitti", kitti, tmp_path / "parts", part=Part(n, 3), **how) for n in order]
+    how = {"grids": GridOptions(SPEC, follow_ground=False), "poses": PoseOptions(force=True)}
+    whole = convert("kitti", kitti, tmp_path / "whole", run=Run(1), **how)
+    parts = [convert("kitti", kitti, tmp_path / "parts", run=Run(1, part=Part(n, 3)), **how) for n in order]
     assert sum(part.made for part in parts) == whole.made == 12
     assert sorted(path for part in parts for path in part.sequences) == sorted(
         path.replace("whole", "parts") for path in whole.sequences
@@ -39,7 +41,14 @@ def test_parts_make_the_files_of_one_conversion(kitti, tmp_path, order):
 
 def test_long_recordings_weigh_more(kitti, tmp_path):
     made = [
-        convert("kitti", kitti, tmp_path / "out", part=Part(n, 2), grids="none", force=True, workers=1).made
+        convert(
+            "kitti",
+            kitti,
+            tmp_path / "out",
+            poses=PoseOptions(force=True),
+            grids=None,
+            run=Run(part=Part(n, 2), workers=1),
+        ).made
         for n in (1, 2)
     ]
     assert made == [6, 6]
@@ -47,7 +56,7 @@ def test_long_recordings_weigh_more(kitti, tmp_path):
 
 def test_grids_do_not_follow_a_ground_that_a_part_does_not_see(kitti, tmp_path):
     with pytest.raises(ArgumentError, match="ground of all recordings"):
-        convert("kitti", kitti, tmp_path / "out", part=Part(1, 2))
+        convert("kitti", kitti, tmp_path / "out", run=Run(part=Part(1, 2)))
     ran = CliRunner().invoke(app, ["convert", "kitti", str(kitti), str(tmp_path / "out"), "--part", "1/2"])
     assert ran.exit_code == 2
     assert ran.stderr.startswith("carlasc: --part: expected --bounds or --grids none")

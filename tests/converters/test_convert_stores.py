@@ -9,10 +9,12 @@ from carlasc import Run
 from carlasc.converting import convert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
+from carlasc.groundtruth import GridOptions
+from carlasc.motion import PoseOptions
 
 pytest.importorskip("numcodecs")
 
-HOW = {"spec": GridSpec.published().with_size((16, 16, 4)), "force": True}
+HOW = {"grids": GridOptions(GridSpec.published().with_size((16, 16, 4))), "poses": PoseOptions(force=True)}
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +23,7 @@ def kitti(tmp_path_factory):
     root = tmp_path_factory.mktemp("convert")
     for name, frames in (("00", 20), ("08", 3)):
         write_tiny_kitti(root / "kitti", name, frames)
-    convert("kitti", root / "kitti", root / "files", **HOW, workers=1)
+    convert("kitti", root / "kitti", root / "files", run=Run(workers=1), **HOW)
     return root
 
 
@@ -32,11 +34,11 @@ def without_tracks(tree):
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_store_unpacks_to_the_files_of_a_folder(kitti, tmp_path, workers):
-    result = convert("kitti", kitti / "kitti", tmp_path / "x.zarr", **HOW, workers=workers)
+    result = convert("kitti", kitti / "kitti", tmp_path / "x.zarr", run=Run(workers=workers), **HOW)
     assert (result.made, len(result.grids)) == (23, 2)
     carlasc.unpack(tmp_path / "x.zarr", tmp_path / "x", run=Run(workers=1))
     assert without_tracks(read_tree(tmp_path / "x")) == without_tracks(read_tree(kitti / "files"))
-    again = convert("kitti", kitti / "kitti", tmp_path / "x.zarr", **HOW, workers=1)
+    again = convert("kitti", kitti / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW)
     assert (again.made, again.skipped) == (0, 23)
 
 
@@ -45,12 +47,12 @@ def test_a_frame_that_fails_is_added_when_it_is_corrected(kitti, tmp_path):
     scan = tmp_path / "kitti/sequences/00/velodyne/000017.bin"
     good = scan.read_bytes()
     scan.write_bytes(good[:-3])
-    result = convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", **HOW, workers=1)
+    result = convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW)
     assert [failure.frame for failure in result.failures] == [17]
     (sequence,) = carlasc.open(tmp_path / "x.zarr").sequences().values()
     assert 17 not in sequence.frames("points") and len(sequence.frames("points")) == 19
     scan.write_bytes(good)
-    assert convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", **HOW, workers=1).made == 1
+    assert convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW).made == 1
     (sequence,) = carlasc.open(tmp_path / "x.zarr").sequences().values()
     assert len(sequence.frames("points")) == len(sequence.frames("flow")) == 20
 
@@ -58,4 +60,4 @@ def test_a_frame_that_fails_is_added_when_it_is_corrected(kitti, tmp_path):
 @pytest.mark.parametrize("kind", ["h5", "parquet"])
 def test_stores_of_one_writer_take_scans_only(kitti, tmp_path, kind):
     with pytest.raises(ArgumentError, match="cannot be read while it is written"):
-        convert("kitti", kitti / "kitti", tmp_path / f"x.{kind}", **HOW, workers=1)
+        convert("kitti", kitti / "kitti", tmp_path / f"x.{kind}", run=Run(workers=1), **HOW)

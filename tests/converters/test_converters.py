@@ -9,17 +9,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
+from typer.testing import CliRunner
 
 import carlasc
-from carlasc.converting import convert, converter_names, load_converter
+from carlasc.cli import app
+from carlasc.converting import (
+    Converter,
+    LayoutOptions,
+    OptionDeclaration,
+    convert,
+    converter_names,
+    load_converter,
+    option_declarations,
+    read_options,
+)
 from carlasc.errors import ArgumentError, DependencyError, MissingDataError
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 from carlasc.storage import Sink
 from carlasc.storage.sinks import SequenceWriter
 
-PLAIN = {"grids": "none", "flow": "none", "workers": 1}
+PLAIN = {"grids": None, "layout": LayoutOptions(flow="none"), "run": Run(workers=1)}
 
 THIRD_PARTY = """
+from typing import Annotated, Literal
 import numpy as np
+from carlasc.errors import FormatError
 from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Trajectory
 from carlasc.core.classes import Remap
 from carlasc.core.tables import CARLA
@@ -41,6 +56,25 @@ class Lab(Converter):
     title, classes, to_carla = "our laboratory", CARLA, Remap("lab", CARLA, CARLA, {i: i for i in CARLA.names})
     def sequences(self):
         return [Rec()]
+
+class Torn(Handle):
+    def read(self):
+        raise FormatError(self.location, expected="a scan", found="half of one")
+
+class Faulty(Handle):
+    def read(self):
+        return {}["points"]
+
+class Failing(Lab):
+    def __init__(self, source, *, how: Annotated[Literal["torn", "faulty"], "What is wrong."] = "torn", posed: bool = True):
+        super().__init__(source)
+        self.how, self.posed = how, posed
+    def sequences(self):
+        recording = Rec()
+        recording.frames = [{"torn": Torn, "faulty": Faulty}[self.how](number) for number in range(2)]
+        if not self.posed:
+            recording.poses = lambda *, force=False: None
+        return [recording]
 """
 
 
@@ -53,6 +87,7 @@ def installed(tmp_path, monkeypatch):
     (site / "lab-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
     (site / "lab-1.0.dist-info" / "entry_points.txt").write_text(
         "[carlasc.converters]\nlab = lab_converter:Lab\nbroken = lab_converter:Nothing\nwrong = lab_converter:Handle\n"
+        "failing = lab_converter:Failing\n"
     )
     monkeypatch.syspath_prepend(str(site))
     yield site
@@ -65,12 +100,64 @@ def test_kitti_and_poss_are_there():
 
 def test_a_third_partys_converter_is_found_and_used(installed, tmp_path):
     assert "lab" in converter_names()
-    result = convert("lab", installed, tmp_path / "out", force=True, **PLAIN)
+    result = convert("lab", installed, tmp_path / "out", poses=PoseOptions(force=True), **PLAIN)
     assert (result.made, result.failures) == (2, ())
     sequence = carlasc.open(tmp_path / "out").sequences()["Test/LAB_a/cartesian"]
     assert sequence.read("points", 1)[0].tolist() == [2, -2, 2, 2]
     assert sequence.read("labels", 1).tolist() == [7] * 5
     assert sequence.times.tolist() == [0, 0.1]
+
+
+@pytest.mark.parametrize("posed", [True, False])
+@pytest.mark.parametrize(
+    ("how", "cause"),
+    [
+        ("torn", "lab 0: expected a scan, found half of one"),
+        ("faulty", "lab 0: the converter failed: KeyError: 'points'"),
+    ],
+)
+def test_where_every_frame_fails_the_first_cause_is_the_message(installed, tmp_path, how, cause, posed):
+    result = convert("failing", installed, tmp_path / "out", options={"how": how, "posed": posed}, run=Run(workers=1))
+    assert [failure.frame for failure in result.failures] == [0, 1]
+    assert result.failures[0].message == cause
+    assert (result.made, result.grids) == (0, ())
+    options = ["--option", f"how={how}", "--option", f"posed={posed}", "--workers", "1"]
+    ran = CliRunner().invoke(app, ["convert", "failing", str(installed), str(tmp_path / "cli"), *options])
+    assert ran.exit_code == 1
+    assert cause in ran.stderr.splitlines()[0]
+    assert "velodyne" not in ran.output
+
+
+def test_a_converter_declares_its_options(installed):
+    kind = load_converter("failing")
+    assert option_declarations(kind) == (
+        OptionDeclaration("how", str, "torn", "What is wrong.", ("torn", "faulty")),
+        OptionDeclaration("posed", bool, True),
+    )
+    assert read_options(kind, {"how": "faulty", "posed": "no"}) == {"how": "faulty", "posed": False}
+    for options, message in (
+        ({"how": "broken"}, "how: expected one of torn, faulty, found 'broken'"),
+        ({"posed": "perhaps"}, "posed: expected true or false, found 'perhaps'"),
+        ({"color": "red"}, "options: expected one of how, posed, found color"),
+    ):
+        with pytest.raises(ArgumentError) as error:
+            read_options(kind, options)
+        assert str(error.value) == message
+
+
+def test_options_that_are_declared_badly_are_named():
+    class NoDefault(Converter):
+        def __init__(self, source, *, count: int):
+            super().__init__(source)
+
+    class NoType(Converter):
+        def __init__(self, source, *, names: list[str] = ()):
+            super().__init__(source)
+
+    with pytest.raises(DependencyError, match="NoDefault: count: expected a default, found none"):
+        option_declarations(NoDefault)
+    with pytest.raises(DependencyError, match="NoType: names: expected an option of the type str, int, float, bool"):
+        option_declarations(NoType)
 
 
 def test_a_converter_that_does_not_load_is_named(installed):
@@ -82,8 +169,8 @@ def test_a_converter_that_does_not_load_is_named(installed):
 
 def test_what_a_converter_lacks_is_an_argument_error(installed, tmp_path):
     with pytest.raises(MissingDataError, match="lab: expected voxel grids, found none"):
-        convert("lab", installed, tmp_path / "out", grids="voxels", force=True)
-    with pytest.raises(ArgumentError, match="option: expected no options for this data set, found color"):
+        convert("lab", installed, tmp_path / "out", poses=PoseOptions(force=True), grids="voxels")
+    with pytest.raises(ArgumentError, match="options: expected no options for this data set, found color"):
         convert("lab", installed, tmp_path / "out", options={"color": "red"})
 
 
@@ -119,7 +206,7 @@ def test_actors_of_semanticposs_that_go_nowhere_have_no_flow(tmp_path):
         write_labels(folder, frame, np.repeat([7 | 1 << 16, 7 | 2 << 16], 200))
     np.savetxt(folder / "poses.txt", np.tile(np.eye(4)[:3].ravel(), (20, 1)))
     (folder / "calib.txt").unlink()
-    convert("poss", tmp_path / "in", tmp_path / "out", grids="none", force=True, workers=1)
+    convert("poss", tmp_path / "in", tmp_path / "out", poses=PoseOptions(force=True), grids=None, run=Run(workers=1))
     flow = carlasc.open(tmp_path / "out").sequences()["Train/POSS_00/cartesian"].read("flow", 10)
     assert np.abs(flow[:200] - [8, 0, 0]).max() < 0.3
     assert not flow[200:].any()
@@ -159,14 +246,14 @@ class Memory(Sink):
 def test_any_sink_will_do(tmp_path):
     write_tiny_kitti(tmp_path / "in")
     sink = Memory()
-    convert("kitti", tmp_path / "in", sink, grids="none", workers=2)
+    convert("kitti", tmp_path / "in", sink, grids=None, run=Run(workers=2))
     kept = sink.writers["Train/KITTI_00/cartesian"]
     assert {(name, frame) for name, frame in kept.fields} == {
         (name, frame) for name in ("points", "labels", "flow", "instances") for frame in range(3)
     }
     assert {"poses.txt", "times.txt", "carlasc.json"} == set(kept.texts)
     with pytest.raises(ArgumentError, match="convert to a folder or a .zarr store"):
-        convert("kitti", tmp_path / "in", sink, grids="scans")
+        convert("kitti", tmp_path / "in", sink)
 
 
 def files_of(root):
@@ -176,7 +263,7 @@ def files_of(root):
 @pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
 def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path, name):
     write_tiny_kitti(tmp_path / "in", frames=60)
-    convert("kitti", tmp_path / "in", tmp_path / "whole", grids="none", workers=1)
+    convert("kitti", tmp_path / "in", tmp_path / "whole", grids=None, run=Run(workers=1))
     arguments = ["kitti", str(tmp_path / "in"), str(tmp_path / "out"), "--grids", "none", "--workers", "1"]
     helper = Path(__file__).parents[1] / "helpers" / "processes" / "interrupted.py"
     done = subprocess.run(
@@ -192,6 +279,6 @@ def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path
     expected = files_of(tmp_path / "whole")
     assert 0 < len(there) < len(expected)
     assert all(expected[path] == data for path, data in there.items() if path.suffix != ".part")
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", workers=1)
+    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids=None, run=Run(workers=1))
     assert result.skipped > 0
     assert files_of(tmp_path / "out") == expected

@@ -5,23 +5,24 @@ import pytest
 from helpers.datasets.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
 from carlasc.converting import Cloud, Sensor, Trajectory, VoxelContent
-from carlasc.converting.assembling import Motion, Rig, assemble
-from carlasc.converting.places import check_outside
+from carlasc.converting.assembling import Rig, VehicleMotion, assemble
+from carlasc.converting.layout_options import AxesAndClasses
 from carlasc.converting.plans import begin, choose_recordings, plan_recording
-from carlasc.converting.scans import Block, FrameJob, convert_block, make_fields
-from carlasc.converting.target import Target
+from carlasc.converting.results import check_outside
+from carlasc.converting.scan_stage import ScanBlock, ScanJob, make_fields
 from carlasc.converting.trajectory import frame_times, jitter, read_trajectory, scan_poses
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
 from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
+from carlasc.motion import PoseOptions
 from carlasc.storage import Metadata, layout
 
 VOXELS = GridSpec("cartesian", (3, 4, 2), (0.0, -1.0, -1.0), (3.0, 3.0, 1.0))
 GRID = layout.grid_folder(VOXELS)
 TO_CARLA = REMAPS["semantickitti_to_carla"]
-LEFT = Target(SEMANTICKITTI, TO_CARLA, mirrored=True)
-RIGHT = Target(SEMANTICKITTI, None, mirrored=False)
+LEFT = AxesAndClasses(SEMANTICKITTI, TO_CARLA, mirrored=True)
+RIGHT = AxesAndClasses(SEMANTICKITTI, None, mirrored=False)
 RIG = Rig((Sensor(),), np.eye(4))
 
 
@@ -98,7 +99,7 @@ def voxels_of(labels, known=None):
 
 def convert_voxels(target, voxels, writer):
     frame = MemoryFrame(0, frame_of([0]).content, voxels)
-    return convert_block(Block((FrameJob(frame, False),), target, writer, RIG, VOXELS))[0]
+    return ScanBlock((ScanJob(frame, write=False),), target, writer, RIG, VOXELS).convert()[0]
 
 
 def test_own_voxels_are_mapped_mirrored_and_kept():
@@ -107,9 +108,9 @@ def test_own_voxels_are_mapped_mirrored_and_kept():
     known = np.ones(VOXELS.size, bool)
     known[2, 3, 1] = False
     writer = MemoryWriter()
-    target = Target(SEMANTICKITTI, TO_CARLA, mirrored=True, voxels=True)
+    target = AxesAndClasses(SEMANTICKITTI, TO_CARLA, mirrored=True)
     result = convert_voxels(target, voxels_of(labels, known), writer)
-    found, counts = result.outputs[f"{GRID}/labels"], result.outputs[f"{GRID}/counts"]
+    found, counts = result.fields[f"{GRID}/labels"], result.fields[f"{GRID}/counts"]
     assert found[0, -1, 0] == 7
     assert counts[0, -1, 0] == 1
     assert counts[1, -1, 0] == 0  # occupied, but of a class that has no target
@@ -122,24 +123,24 @@ def test_own_voxels_are_mapped_mirrored_and_kept():
 def test_voxels_that_are_written_already_are_not_read_again():
     writer = MemoryWriter()
     writer.write(f"{GRID}/counts", 0, np.ones(VOXELS.size))
-    target = Target(SEMANTICKITTI, None, mirrored=False, voxels=True)
+    target = AxesAndClasses(SEMANTICKITTI, None, mirrored=False)
     result = convert_voxels(target, voxels_of(np.zeros(VOXELS.size, np.uint16)), writer)
-    assert result.outputs == {}
+    assert result.fields == {}
     assert writer.texts == {}
 
 
 def test_a_frame_that_cannot_be_read_is_a_failure_and_a_store_that_cannot_be_written_ends_the_run():
-    jobs = (FrameJob(MemoryFrame(0, None), True), FrameJob(frame_of([0], number=1), True))
-    failed, read = convert_block(Block(jobs, RIGHT, MemoryWriter(), RIG))
+    jobs = (ScanJob(MemoryFrame(0, None)), ScanJob(frame_of([0], number=1)))
+    failed, read = ScanBlock(jobs, RIGHT, MemoryWriter(), RIG).convert()
     assert "expected points, found nothing" in failed.failure
     assert (failed.number, read.number, read.failure) == (0, 1, None)
-    assert "points" in read.outputs
+    assert "points" in read.fields
 
     class Full(MemoryWriter):
         def write_document(self, name, data):
             raise StorageError("disk", problem="is full")
 
-    target = Target(SEMANTICKITTI, None, mirrored=False, voxels=True)
+    target = AxesAndClasses(SEMANTICKITTI, None, mirrored=False)
     with pytest.raises(StorageError):
         convert_voxels(target, voxels_of(np.zeros(VOXELS.size, np.uint16)), Full())
 
@@ -157,7 +158,7 @@ def test_poses_are_relative_to_the_first_frame_and_in_the_frame_of_the_first_sen
     recording = recording_of(world)
     recording.sensors = (Sensor("roof", translation((1.0, 0.0, 1.5)) @ rotation_z(0.5)),)
     times = times_of(recording)
-    trajectory = read_trajectory(recording, times, "auto", force=False)
+    trajectory = read_trajectory(recording, times, PoseOptions("auto"))
     poses = scan_poses(trajectory, recording, times)
     scans = world @ translation((1.0, 0.0, 1.5))  # the axes are those of the vehicle
     np.testing.assert_allclose(poses, np.linalg.inv(scans[0]) @ scans, atol=1e-12)
@@ -184,7 +185,7 @@ def test_one_pose_with_a_time_is_not_that_of_many_scans():
     recording = recording_of(None)
     recording.poses = lambda *, force=False: Trajectory(np.eye(4)[None], np.array([0.0]))
     with pytest.raises(FormatError, match="memory: expected poses over the time of 2 scans, found one pose: copy"):
-        read_trajectory(recording, times_of(recording), "auto", force=False)
+        read_trajectory(recording, times_of(recording), PoseOptions("auto"))
 
 
 def test_poses_at_their_own_times_are_interpolated():
@@ -193,7 +194,7 @@ def test_poses_at_their_own_times_are_interpolated():
     recording.poses = lambda *, force=False: Trajectory(turning, np.array([10.0, 10.2]))
     recording.times = lambda: np.array([10.05, 10.1])
     times = times_of(recording)
-    poses = scan_poses(read_trajectory(recording, times, "auto", force=False), recording, times)
+    poses = scan_poses(read_trajectory(recording, times, PoseOptions("auto")), recording, times)
     half = translation((1, 0, 0)) @ rotation_z(0.2)
     quarter = translation((0.5, 0, 0)) @ rotation_z(0.1)
     np.testing.assert_allclose(poses[1], np.linalg.inv(quarter) @ half, atol=1e-12)
@@ -211,12 +212,12 @@ def test_the_jitter_of_poses_is_told_from_the_motion_of_the_vehicle():
 
 def test_poses_of_the_file_are_not_read_where_they_are_to_be_estimated():
     poses, times = np.tile(np.eye(4), (2, 1, 1)), np.arange(2.0)
-    assert read_trajectory(recording_of(poses), times, "kiss-icp", force=False) is None
-    assert read_trajectory(recording_of(None), times, "auto", force=False) is None
+    assert read_trajectory(recording_of(poses), times, PoseOptions("kiss-icp")) is None
+    assert read_trajectory(recording_of(None), times, PoseOptions("auto")) is None
     with pytest.raises(MissingDataError, match="memory: expected a file of poses, found none"):
-        read_trajectory(recording_of(None), times, "file", force=False)
+        read_trajectory(recording_of(None), times, PoseOptions("file"))
     with pytest.raises(FormatError, match="expected a pose for each frame up to 1, found 1 lines"):
-        read_trajectory(recording_of(poses[:1]), times, "file", force=False)
+        read_trajectory(recording_of(poses[:1]), times, PoseOptions("file"))
 
 
 def driving(speed, seconds):
@@ -224,7 +225,7 @@ def driving(speed, seconds):
     at = np.arange(-2.0, 5.0)
     poses = np.tile(np.eye(4), (len(at), 1, 1))
     poses[:, 0, 3] = speed * at
-    return Motion(Trajectory(poses, at), seconds)
+    return VehicleMotion(Trajectory(poses, at), seconds)
 
 
 def test_points_are_moved_to_the_time_of_the_frame_and_keep_the_place_of_their_ray():
@@ -287,7 +288,9 @@ def test_estimated_poses_of_an_earlier_run_are_used_in_right_handed_axes():
     writer = MemoryWriter()
     writer.write_document(layout.POSES, layout.encode_poses(stored))
     writer.write_document(layout.METADATA, Metadata(extra={"poses": "kiss-icp"}).to_json())
-    plan = plan_recording(recording_of(None), Lab, MemorySink(writer), "kiss-icp", flow=False, force=False)
+    plan = plan_recording(
+        recording_of(None), Lab, MemorySink(writer), LEFT, PoseOptions("kiss-icp"), flow=False, voxels=False
+    )
     begin(plan, LEFT, Metadata())
     np.testing.assert_allclose(plan.poses, mirror_poses(stored), atol=1e-9)
     np.testing.assert_allclose(layout.decode_poses(writer.texts[layout.POSES], "poses"), stored, atol=1e-9)
@@ -297,7 +300,9 @@ def test_poses_of_another_origin_are_a_conflict():
     writer = MemoryWriter()
     writer.write_document(layout.METADATA, Metadata(extra={"poses": "kiss-icp"}).to_json())
     poses = np.tile(np.eye(4), (2, 1, 1))
-    plan = plan_recording(recording_of(poses), Lab, MemorySink(writer), "file", flow=False, force=True)
+    plan = plan_recording(
+        recording_of(poses), Lab, MemorySink(writer), LEFT, PoseOptions("file", force=True), flow=False, voxels=False
+    )
     with pytest.raises(ConflictError, match="expected poses from file, found kiss-icp"):
         begin(plan, LEFT, Metadata())
 

@@ -5,12 +5,12 @@ import pytest
 from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
-from carlasc import Run
-from carlasc.converting import Sensor, convert
+from carlasc.converting import LayoutOptions, Sensor, convert
 from carlasc.core import GridSpec, translation
-from carlasc.groundtruth import FromScans
+from carlasc.groundtruth import FromScans, GridOptions
 from carlasc.groundtruth.heights import find_ground, fit_to_ground, share_below
 from carlasc.motion import MotionOptions
+from carlasc.running import Run
 from carlasc.testing import SimulatedDrive
 
 COARSE = GridSpec.published()
@@ -24,15 +24,14 @@ def drive_at(height_m):
     return Mounted
 
 
-def converted(height_m, tmp_path, **options):
+def converted(height_m, tmp_path, follow_ground=True):
     result = convert(
         drive_at(height_m),
         tmp_path,
         tmp_path.parent / f"{tmp_path.name}_out",
-        axes="right",
-        observe=ALONE,
-        workers=1,
-        **options,
+        layout=LayoutOptions(axes="right"),
+        grids=GridOptions(observe=ALONE, follow_ground=follow_ground),
+        run=Run(workers=1),
     )
     (sequence,) = carlasc.open(tmp_path.parent / f"{tmp_path.name}_out").sequences().values()
     (name,) = sequence.grids
@@ -67,7 +66,14 @@ def test_all_recordings_of_a_run_get_the_same_grid(tmp_path):
             return found
 
     (tmp_path / "in").mkdir()
-    result = convert(Two, tmp_path / "in", tmp_path / "out", axes="right", observe=ALONE, workers=1)
+    result = convert(
+        Two,
+        tmp_path / "in",
+        tmp_path / "out",
+        layout=LayoutOptions(axes="right"),
+        grids=GridOptions(observe=ALONE),
+        run=Run(workers=1),
+    )
     grids = [sequence.grids for sequence in carlasc.open(tmp_path / "out").sequences().values()]
     assert len(grids) == 2 and grids[0] == grids[1]
     ((spec,),) = (one.values() for one in grids[:1])

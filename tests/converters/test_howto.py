@@ -10,6 +10,8 @@ import pytest
 
 import carlasc
 from carlasc.converting import convert
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 
 PAGE = (Path(__file__).parents[2] / "docs" / "howto" / "converter.md").read_text()
 NAMES = ("lab_converter", "test_lab_converter")
@@ -53,7 +55,7 @@ def source(modules, tmp_path_factory):
 def test_it_converts_with_everything(modules, source, tmp_path):
     import lab_converter
 
-    result = convert(lab_converter.Lab, source, tmp_path / "out", workers=1, grids="none")
+    result = convert(lab_converter.Lab, source, tmp_path / "out", grids=None, run=Run(workers=1))
     assert result.failures == ()
     assert any("persons are blurred" in note for note in result.notes)
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
@@ -78,7 +80,9 @@ def test_a_damaged_scan_is_reported_and_the_others_are_converted(modules, tmp_pa
     source.mkdir()
     test_lab_converter.TestLab().write(source)
     damage(source / "drive_0" / "lower" / "000003.npz")
-    result = convert(lab_converter.Lab, source, tmp_path / "out", workers=1, grids="none", force=True)
+    result = convert(
+        lab_converter.Lab, source, tmp_path / "out", poses=PoseOptions(force=True), grids=None, run=Run(workers=1)
+    )
     assert [failure.frame for failure in result.failures] == [3]
     assert problem in result.failures[0].message
     assert result.made == 7

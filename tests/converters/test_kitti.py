@@ -8,20 +8,22 @@ import pytest
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.core.tables import REMAPS
+from carlasc.groundtruth import GridOptions
 from carlasc.inspection.validation import validate
+from carlasc.running import Run
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-PLAIN = {"grids": "none", "flow": "none", "workers": 1}
+PLAIN = {"grids": None, "layout": LayoutOptions(flow="none"), "run": Run(workers=1)}
 
 
 @pytest.fixture(scope="module")
 def converted(simulated, tmp_path_factory):
     """The simulated sequence in CarlaSC's frame and classes, with SemanticKITTI's voxels."""
     out = tmp_path_factory.mktemp("converted")
-    result = convert("kitti", simulated[0], out, grids="voxels", flow="none", workers=2)
+    result = convert("kitti", simulated[0], out, layout=LayoutOptions(flow="none"), grids="voxels", run=Run(workers=2))
     assert (result.made, result.skipped, result.failures) == (24, 0, ())
     return out
 
@@ -119,7 +121,8 @@ def test_validate_points_out_a_faulty_copy(simulated, converted, tmp_path, fault
 
 
 def test_labels_and_frame_of_kitti_leave_points_and_classes_as_they_are(simulated, tmp_path):
-    convert("kitti", simulated[0], tmp_path, classes="semantickitti", axes="right", **PLAIN)
+    layout = LayoutOptions("semantickitti", "right", "none")
+    convert("kitti", simulated[0], tmp_path, **PLAIN | {"layout": layout})
     sequence = sequence_of(tmp_path)
     points, both = raw(simulated[1].folder, 4)
     assert sequence.read("points", 4).tobytes() == points.tobytes()
@@ -153,7 +156,7 @@ def test_an_odometry_root_has_its_poses_beside_and_neither_labels_nor_flow(tmp_p
     folder = write_tiny_kitti(tmp_path / "in", labels=False)
     (tmp_path / "in" / "poses").mkdir()
     (folder / "poses.txt").rename(tmp_path / "in" / "poses" / "00.txt")
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", workers=1)
+    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids=None, run=Run(workers=1))
     assert sequence_of(tmp_path / "out").fields() == {"points"}
     assert sequence_of(tmp_path / "out").poses[2, 0, 3] == pytest.approx(1.0)
     assert "no labels" in result.notes[0]
@@ -163,7 +166,7 @@ def test_grids_are_made_from_scans_where_unlabelled_points_cast_no_vote(simulate
     folder = write_tiny_kitti(tmp_path / "in", points=2000)
     for frame in range(3):
         np.zeros(2000, "<u4").tofile(folder / "labels" / f"{frame:06d}.label")
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    result = convert("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     grid = sequence_of(tmp_path / "out").grid("evaluation", 1)
     assert result.grids
     assert not grid.labels.any()
@@ -175,7 +178,13 @@ def test_cylindrical_grids_stand_beside(tmp_path):
     from carlasc.core.grids import GridSpec
 
     write_tiny_kitti(tmp_path / "in", points=500)
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", spec=GridSpec.published("cylindrical"), workers=1)
+    result = convert(
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        grids=GridOptions(spec=GridSpec.published("cylindrical")),
+        run=Run(workers=1),
+    )
     assert not result.failures
     path = SEQUENCE.replace("cartesian", "cylindrical")
     assert sequence_of(tmp_path / "out", path).grid("evaluation", 2).labels.shape == (128, 128, 8)

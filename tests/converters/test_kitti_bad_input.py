@@ -6,10 +6,12 @@ from helpers.datasets.kitti import write_calibration
 from helpers.datasets.tiny_kitti import write_labels, write_tiny_kitti
 
 import carlasc
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 
-PLAIN = {"grids": "none", "flow": "none", "workers": 1}
+PLAIN = {"grids": None, "layout": LayoutOptions(flow="none"), "run": Run(workers=1)}
 SEQUENCE = "Train/KITTI_00/cartesian"
 
 
@@ -18,8 +20,18 @@ def folder(tmp_path):
     return write_tiny_kitti(tmp_path / "in", frames=4)
 
 
-def run(tmp_path, **options):
-    return convert("kitti", tmp_path / "in", tmp_path / "out", **{**PLAIN, **options})
+def run(tmp_path, *, poses="auto", force=False, grids=None, sequences=None, split="all", flow="none", **layout):
+    return convert(
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        sequences=sequences,
+        split=split,
+        layout=LayoutOptions(flow=flow, **layout),
+        poses=PoseOptions(poses, force),
+        grids=grids,
+        run=Run(workers=1),
+    )
 
 
 def written(tmp_path, field="points"):
@@ -167,12 +179,13 @@ def test_arguments_that_make_no_sense_are_named(tmp_path, folder):
     for name, value in (
         ("classes", "semanticposs"),
         ("axes", "up"),
-        ("grids", "all"),
         ("poses", "gps"),
         ("flow", "icp"),
     ):
         with pytest.raises(ArgumentError, match=f"{name}: expected one of"):
             run(tmp_path, **{name: value})
+    with pytest.raises(ArgumentError, match="grids: expected GridOptions"):
+        run(tmp_path, grids="scans")
     with pytest.raises(ArgumentError, match=r"name: expected one of .*kitti.*, found 'kiti'"):
         convert("kiti", tmp_path / "in", tmp_path / "out")
 

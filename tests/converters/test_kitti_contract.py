@@ -10,7 +10,8 @@ from converters.formats.semantickitti import CLASSES as SEMANTICKITTI_CLASSES
 from converters.formats.semantickitti import write_semantickitti
 
 import carlasc
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
+from carlasc.running import Run
 from carlasc.testing import ConverterContract, SimulatedDrive
 
 DRIVE = SimulatedDrive(8, PERIOD_S, rolling=True, clockwise=True)
@@ -39,7 +40,14 @@ class TestKittiRaw(OnlyInView):
     def test_a_missing_scan_is_no_failure_and_the_other_frames_keep_numbers_poses_and_times(self, sequence, tmp_path):
         folder = write_raw(tmp_path / "raw", KittiDrive(self.drive), BOXES)
         (folder / "velodyne_points/data/0000000003.bin").unlink()
-        result = convert("kitti-raw", folder, tmp_path / "out", axes="right", classes="kitti", grids="none", workers=1)
+        result = convert(
+            "kitti-raw",
+            folder,
+            tmp_path / "out",
+            layout=LayoutOptions(axes="right", classes="kitti"),
+            grids=None,
+            run=Run(workers=1),
+        )
         assert (result.made, result.failures) == (7, ())
         assert any(note.endswith("1 of the 8 frames from 0 to 7 have no scan") for note in result.notes)
         (found,) = carlasc.open(tmp_path / "out").sequences().values()

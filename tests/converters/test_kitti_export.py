@@ -7,7 +7,8 @@ from carlasc_converters.kitti_voxels import unpack_bits
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
-from carlasc.converting import convert, export
+from carlasc.converting import LayoutOptions, convert, export
+from carlasc.running import Run
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 
@@ -20,9 +21,14 @@ def frame_files(folder, name, suffix):
 def there_and_back(simulated, tmp_path_factory):
     middle, back = tmp_path_factory.mktemp("middle"), tmp_path_factory.mktemp("back")
     convert(
-        "kitti", simulated[0], middle, classes="semantickitti", axes="right", grids="voxels", flow="none", workers=1
+        "kitti",
+        simulated[0],
+        middle,
+        layout=LayoutOptions(classes="semantickitti", axes="right", flow="none"),
+        grids="voxels",
+        run=Run(workers=1),
     )
-    result = export("kitti", middle, back, workers=1)
+    result = export("kitti", middle, back, run=Run(workers=1))
     assert (result.made, result.failures, result.sequences) == (24, (), {SEQUENCE: "sequences/00"})
     return simulated[1].folder, back / "sequences" / "00"
 
@@ -49,8 +55,15 @@ def test_poses_come_back(there_and_back):
 
 
 def test_the_mirrored_frame_comes_back_too(simulated, tmp_path):
-    convert("kitti", simulated[0], tmp_path / "middle", classes="semantickitti", grids="voxels", flow="none", workers=1)
-    export("kitti", tmp_path / "middle", tmp_path / "back", workers=1)
+    convert(
+        "kitti",
+        simulated[0],
+        tmp_path / "middle",
+        layout=LayoutOptions(classes="semantickitti", flow="none"),
+        grids="voxels",
+        run=Run(workers=1),
+    )
+    export("kitti", tmp_path / "middle", tmp_path / "back", run=Run(workers=1))
     before, after = simulated[1].folder, tmp_path / "back" / "sequences" / "00"
     assert frame_files(before, "velodyne", ".bin") == frame_files(after, "velodyne", ".bin")
     assert frame_files(before, "voxels", ".label") == frame_files(after, "voxels", ".label")
@@ -62,9 +75,13 @@ def test_the_mirrored_frame_comes_back_too(simulated, tmp_path):
 def test_tiny_round_trip_of_several_sequences(tmp_path):
     for number in ("00", "08"):
         write_tiny_kitti(tmp_path / "in", number, voxels=True)
-    options = {"classes": "semantickitti", "axes": "right", "grids": "voxels", "flow": "none", "workers": 2}
+    options = {
+        "layout": LayoutOptions("semantickitti", "right", flow="none"),
+        "grids": "voxels",
+        "run": Run(workers=2),
+    }
     convert("kitti", tmp_path / "in", tmp_path / "middle", **options)
-    export("kitti", tmp_path / "middle", tmp_path / "out", workers=2)
+    export("kitti", tmp_path / "middle", tmp_path / "out", run=Run(workers=2))
     for number in ("00", "08"):
         for name, suffix in (("velodyne", ".bin"), ("voxels", ".occluded")):
             before, after = (
@@ -76,9 +93,15 @@ def test_tiny_round_trip_of_several_sequences(tmp_path):
 
 def test_a_grid_that_is_named_is_exported_instead_of_the_original_voxels(tmp_path):
     write_tiny_kitti(tmp_path / "in", frames=1, voxels=True)
-    options = {"classes": "semantickitti", "axes": "right", "grids": "voxels", "flow": "none", "workers": 1}
+    options = {
+        "layout": LayoutOptions("semantickitti", "right", flow="none"),
+        "grids": "voxels",
+        "run": Run(workers=1),
+    }
     convert("kitti", tmp_path / "in", tmp_path / "middle", **options)
-    export("kitti", tmp_path / "middle", tmp_path / "out", grid="evaluation_256x256x32", workers=1)
+    export(
+        "kitti", tmp_path / "middle", tmp_path / "out", options={"grid": "evaluation_256x256x32"}, run=Run(workers=1)
+    )
     before, after = (tmp_path / side / "sequences" / "00" / "voxels" for side in ("in", "out"))
     size = (256, 256, 32)
     labels = np.fromfile(after / "000000.label", "<u2").reshape(size)

@@ -5,8 +5,10 @@ import pytest
 from helpers.datasets.kitti import write_kitti
 
 import carlasc
-from carlasc.captures import Drive
-from carlasc.converting import convert
+from carlasc.captures import TownDrive
+from carlasc.converting import LayoutOptions, convert
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 MIRROR = np.array([1, -1, 1], np.float32)
@@ -14,8 +16,8 @@ MIRROR = np.array([1, -1, 1], np.float32)
 
 @pytest.mark.slow
 def test_flow_of_moving_vehicles_is_right_and_that_of_everything_static_exactly_zero(tmp_path):
-    truth = write_kitti(tmp_path / "in", Drive(7, "heavy"), range(240, 262), voxels_every=0)
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", workers=2)
+    truth = write_kitti(tmp_path / "in", TownDrive(7, "heavy"), range(240, 262), voxels_every=0)
+    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids=None, run=Run(workers=2))
     assert not result.failures
     sequence = carlasc.open(tmp_path / "out").sequences()[SEQUENCE]
     errors = []
@@ -51,7 +53,15 @@ def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
         np.column_stack([points, np.zeros(300)]).astype("<f4").tofile(folder / "velodyne" / f"{frame:06d}.bin")
         write_labels(folder, frame, np.full(300, 252 | 9 << 16))
     write_poses(folder / "poses.txt", np.stack(poses))
-    convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", axes="right", force=True, workers=1)
+    convert(
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        layout=LayoutOptions(axes="right"),
+        poses=PoseOptions(force=True),
+        grids=None,
+        run=Run(workers=1),
+    )
     sequence = carlasc.open(tmp_path / "out").sequences()[SEQUENCE]
     for frame in (8, 15, 22):
         car_in_sensor = (invert(poses[frame]) @ world_T_car[frame])[:3, :3]
@@ -65,6 +75,6 @@ def test_without_instances_moving_points_have_no_known_flow_and_that_is_said(tmp
     folder = write_tiny_kitti(tmp_path / "in", points=10)
     for frame in range(3):
         write_labels(folder, frame, np.full(10, 252))
-    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids="none", workers=1)
+    result = convert("kitti", tmp_path / "in", tmp_path / "out", grids=None, run=Run(workers=1))
     assert "30 moving points belong to no numbered actor" in result.notes[0]
     assert not carlasc.open(tmp_path / "out").sequences()[SEQUENCE].read("flow", 0).any()

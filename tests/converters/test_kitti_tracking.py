@@ -13,10 +13,10 @@ from converters.formats.kitti_drive import small_drive
 from converters.formats.kitti_tracking import OFFICIAL, OTHER, write_tracking
 
 import carlasc
-from carlasc import Run
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.running import Run
 
 LABELS = {
     kind: KITTI.id_of(name)
@@ -281,7 +281,7 @@ def test_scans_of_the_real_sample_fit_best_with_the_times_of_their_points(sample
 def converted(sample, tmp_path_factory):
     """The real sample in one command, without grids."""
     out = tmp_path_factory.mktemp("converted")
-    result = convert("kitti-tracking", sample, out, axes="right", grids="none", workers=2)
+    result = convert("kitti-tracking", sample, out, layout=LayoutOptions(axes="right"), grids=None, run=Run(workers=2))
     assert (result.made, result.failures) == (85, ())
     return out
 

@@ -8,8 +8,8 @@ from helpers.converters.deadly_converter import Deadly
 from helpers.converters.lab_converter import Lab
 from helpers.datasets.captures import read_tree
 
-from carlasc.converting import convert
-from carlasc.running import open_cluster
+from carlasc.converting import LayoutOptions, convert
+from carlasc.running import Run, open_cluster
 
 FRAMES = 12  # more than one task: a single one is done in this process
 
@@ -28,14 +28,18 @@ def drive(tmp_path: Path) -> Path:
 
 
 def check(drive: Path, out: Path, executor=None) -> None:
-    result = convert(Deadly, drive, out, grids="none", flow="none", workers=2, executor=executor)
+    result = convert(
+        Deadly, drive, out, layout=LayoutOptions(flow="none"), grids=None, run=Run(workers=2, executor=executor)
+    )
     assert [(failure.frame, failure.message[:38]) for failure in result.failures] == [
         (3, "a task: 3 worker processes died while ")
     ]
     assert result.made == FRAMES - 1
-    result = convert(Lab, drive, out, grids="none", flow="none", workers=1)  # the library was mended
+    result = convert(
+        Lab, drive, out, layout=LayoutOptions(flow="none"), grids=None, run=Run(workers=1)
+    )  # the library was mended
     assert (result.made, result.skipped, result.failures) == (1, FRAMES - 1, ())
-    convert(Lab, drive, out.with_name("whole"), grids="none", flow="none", workers=1)
+    convert(Lab, drive, out.with_name("whole"), layout=LayoutOptions(flow="none"), grids=None, run=Run(workers=1))
     left_out = "carlasc.json"  # it names the converter
     assert read_tree(out, left_out) == read_tree(out.with_name("whole"), left_out)
 

@@ -21,6 +21,7 @@ from converters.formats.nuscenes import (
     write_table,
 )
 
+from carlasc.converting import convert
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import transform_points
 from carlasc.core.tables import CARLA
@@ -184,15 +185,15 @@ def test_poses_and_times_are_those_of_the_simulation(root):
 
 
 def test_only_key_frames_are_frames_if_sweeps_are_not_wanted(root):
-    found = recording(root, sweeps="no")
+    found = recording(root, sweeps=False)
     assert [frame.number for frame in found.frames] == [0, 1, 2]
     np.testing.assert_allclose(found.times(), DRIVE.times[list(KEYS)], atol=1e-9)
     assert sorted(found.boxes()) == [0, 1, 2]
     np.testing.assert_allclose(found.poses().seconds, DRIVE.times, atol=1e-9)
     np.testing.assert_array_equal(found.frames[2].read()[0].points[:, :3], rows_of(DRIVE.scan(6))[:, :3])
     assert found.notes() == []
-    with pytest.raises(ArgumentError, match="sweeps: expected yes or no, found 'maybe'"):
-        NuScenes(root, sweeps="maybe").sequences()
+    with pytest.raises(ArgumentError, match="sweeps: expected true or false, found 'maybe'"):
+        convert("nuscenes", root, root.parent / "out", options={"sweeps": "maybe"})
 
 
 def test_without_files_between_key_frames_the_frames_are_the_key_frames(tables):

@@ -5,6 +5,8 @@ from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
 from carlasc.converting import convert
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 from carlasc.testing import SimulatedDrive
 from carlasc.testing.drives import Thing
 
@@ -21,7 +23,14 @@ class Overlapping(DriveConverter):
 
 def test_what_an_interrupted_run_made_from_boxes_does_not_change_what_is_added_later(tmp_path):
     def run():
-        convert(Overlapping, tmp_path, tmp_path.parent / "out", grids="none", workers=1, force=True)
+        convert(
+            Overlapping,
+            tmp_path,
+            tmp_path.parent / "out",
+            poses=PoseOptions(force=True),
+            grids=None,
+            run=Run(workers=1),
+        )
         return next(iter(carlasc.open(tmp_path.parent / "out").sequences().values()))
 
     sequence = run()

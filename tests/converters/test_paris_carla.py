@@ -19,9 +19,10 @@ from converters.formats.paris_carla import (
 )
 
 import carlasc
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.core.geometry import relative_to, transform_points
 from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.running import Run
 from carlasc.testing.drives import SimulatedDrive
 
 DRIVE = SimulatedDrive(frames=6, rolling=True)
@@ -108,7 +109,9 @@ def test_notes_say_what_the_licence_forbids(town: Path) -> None:
 
 
 def test_a_conversion_keeps_points_times_and_where_rays_began(town: Path, tmp_path: Path) -> None:
-    result = convert("paris-carla-3d", town.parent, tmp_path, axes="right", grids="none", workers=1)
+    result = convert(
+        "paris-carla-3d", town.parent, tmp_path, layout=LayoutOptions(axes="right"), grids=None, run=Run(workers=1)
+    )
     assert result.failures == ()
     assert any("CC BY-NC-ND" in note for note in result.notes)
     (sequence,) = carlasc.open(tmp_path).sequences().values()
@@ -130,10 +133,10 @@ def test_a_conversion_keeps_points_times_and_where_rays_began(town: Path, tmp_pa
 
 def test_an_interrupted_conversion_goes_on_to_the_same_bytes(town: Path, tmp_path: Path) -> None:
     for out in (tmp_path / "whole", tmp_path / "broken"):
-        convert("paris-carla-3d", town, out, grids="none", workers=1)
+        convert("paris-carla-3d", town, out, grids=None, run=Run(workers=1))
     for path in (tmp_path / "broken").rglob("000002.*"):
         path.unlink()
-    result = convert("paris-carla-3d", town, tmp_path / "broken", grids="none", workers=1)
+    result = convert("paris-carla-3d", town, tmp_path / "broken", grids=None, run=Run(workers=1))
     assert result.made == 1
     for path in (path for path in (tmp_path / "whole").rglob("*") if path.is_file()):
         assert (tmp_path / "broken" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()

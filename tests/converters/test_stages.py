@@ -10,6 +10,8 @@ from helpers.datasets.recordings import MemoryWriter
 
 import carlasc
 from carlasc.converting import Sensor, convert
+from carlasc.motion import PoseOptions
+from carlasc.running import Run
 from carlasc.storage import Sink
 from carlasc.testing import SimulatedDrive, Thing
 
@@ -39,11 +41,12 @@ class UnposedRolling(DriveConverter):
     )
 
 
-def reads_of(converter, out, **options):
+def reads_of(converter, out, workers=1):
     DriveFrame.reads.clear()
     (out.parent / "nothing").mkdir(exist_ok=True)
-    options = {"grids": "none", "force": True, "workers": 1} | options
-    result = convert(converter, out.parent / "nothing", out, **options)
+    result = convert(
+        converter, out.parent / "nothing", out, grids=None, poses=PoseOptions(force=True), run=Run(workers)
+    )
     assert result.failures == ()
     return sorted(DriveFrame.reads), result
 
@@ -88,7 +91,7 @@ class Memory(Sink):
 def test_a_store_that_cannot_be_read_back_gets_the_same(tmp_path):
     sink = Memory()
     (tmp_path / "nothing").mkdir()
-    convert(Boxed, tmp_path / "nothing", sink, grids="none", force=True, workers=1)
+    convert(Boxed, tmp_path / "nothing", sink, poses=PoseOptions(force=True), grids=None, run=Run(workers=1))
     reads_of(Boxed, tmp_path / "out")
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     for name in sequence.fields():

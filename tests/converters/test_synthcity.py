@@ -10,11 +10,12 @@ import pytest
 from carlasc_converters.synthcity import CLASSES, SynthCity, SynthCityArea
 
 import carlasc
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.core.geometry import relative_to, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.running import Run
 from carlasc.testing.drives import SimulatedDrive
 
 pa = pytest.importorskip("pyarrow")
@@ -154,8 +155,8 @@ def test_areas_are_found_below_the_folder(table: Path, tmp_path: Path) -> None:
     assert [area.name for area in SynthCity(tmp_path).sequences()] == ["SYNTHCITY_area1", "SYNTHCITY_area-2"]
     with pytest.raises(MissingDataError, match="Parquet tables, one per area"):
         SynthCity(tmp_path / "none").sequences()
-    with pytest.raises(ArgumentError, match="grid: expected one of cartesian, cartesian_fine, found cylindrical"):
-        SynthCity(tmp_path, grid="cylindrical").sequences()
+    with pytest.raises(ArgumentError, match="grid: expected one of cartesian, cartesian_fine, found 'cylindrical'"):
+        convert("synthcity", tmp_path, tmp_path / "out", options={"grid": "cylindrical"}, run=Run(1))
 
 
 def test_notes_say_that_nothing_is_free(table: Path) -> None:
@@ -165,7 +166,14 @@ def test_notes_say_that_nothing_is_free(table: Path) -> None:
 
 
 def test_a_conversion_writes_tiles_and_their_voxels(table: Path, tmp_path: Path) -> None:
-    result = convert("synthcity", table.parent, tmp_path, axes="right", classes="synthcity", grids="voxels", workers=1)
+    result = convert(
+        "synthcity",
+        table.parent,
+        tmp_path,
+        layout=LayoutOptions(axes="right", classes="synthcity"),
+        grids="voxels",
+        run=Run(workers=1),
+    )
     assert result.failures == ()
     (sequence,) = carlasc.open(tmp_path).sequences().values()
     area = recording(table)
@@ -185,14 +193,14 @@ def test_a_conversion_writes_tiles_and_their_voxels(table: Path, tmp_path: Path)
 
 
 def test_a_conversion_in_other_processes_finds_the_tiles(table: Path, tmp_path: Path) -> None:
-    result = convert("synthcity", table, tmp_path, grids="none", workers=2)
+    result = convert("synthcity", table, tmp_path, grids=None, run=Run(workers=2))
     assert result.failures == ()
     assert result.made == len(recording(table).frames)
 
 
 def test_grids_from_scans_are_refused_because_nothing_is_known_to_be_free(table: Path, tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match="grids: expected voxels or none, found scans for .*area_3.parquet"):
-        convert("synthcity", table, tmp_path / "out", grids="scans", workers=1)
+        convert("synthcity", table, tmp_path / "out", run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 
 

@@ -7,7 +7,11 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numba
 import pytest
+from numba.core import event
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.dispatcher import Dispatcher
 
 from carlasc.core import compiling
 
@@ -113,8 +117,45 @@ def test_a_process_that_is_stopped_while_it_compiles_does_not_stop_the_others(tm
         return x + 1
 
     monkeypatch.setattr(compiling, "_WAITED_S", 0.1)
-    place = Path(add._cache._cache_path)
-    with (place / f"{add._cache._impl.filename_base}.lock").open("ab") as held:
+    with add._cache._lock_path.open("ab") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         assert add(2) == 3
     assert add._cache._lock is None
+
+
+@pytest.mark.parametrize(
+    ("holder", "name"),
+    [
+        (numba.njit(compiling.fingerprint), "_cache"),
+        (Dispatcher, "enable_caching"),
+        (FunctionCache, "_impl_class"),
+        (FunctionCache, "cache_path"),
+        (FunctionCache, "load_overload"),
+        (FunctionCache, "save_overload"),
+        (CompileResultCacheImpl, "_locator_classes"),
+        (numba.core.config, "CACHE_DIR"),
+        (numba.core.config, "BOUNDSCHECK"),
+        (event, "Listener"),
+        (event, "register"),
+    ],
+)
+def test_numba_has_each_undocumented_name_that_the_cache_uses(holder, name) -> None:
+    assert hasattr(holder, name), f"Numba {numba.__version__} has no {name}, on which carlasc.core.compiling rests"
+
+
+def test_numba_asks_a_locator_for_no_more_than_ours_has() -> None:
+    wanted = {name for name, value in vars(_CacheLocator).items() if getattr(value, "__isabstractmethod__", False)}
+    missing = (wanted | {"ensure_cache_path", "from_function"}) - set(dir(compiling._SourceLocator))
+    assert not missing, f"Numba {numba.__version__} asks locators for {sorted(missing)}"
+
+
+def test_code_goes_through_our_cache_and_not_through_numbas_own() -> None:
+    @compiling.cached
+    def double(x):
+        return 2 * x
+
+    assert double(2) == 4
+    kept = list(Path(double._cache.cache_path).glob("*.double-*"))
+    assert {path.suffix for path in kept} == {".nbc", ".nbi", ".lock"}, (
+        f"Numba {numba.__version__} does not use the cache"
+    )

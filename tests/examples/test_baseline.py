@@ -152,6 +152,7 @@ def test_what_it_takes_is_measured_like_other_networks():
     assert (latency.network, latency.history) == ("baseline", 3) and latency.fastest_ms > 0
 
 
+@pytest.mark.needs("tensorboard")
 def test_a_sample_that_is_alone_in_its_batch_is_too_little_for_the_batch_norms_of_a_small_grid(data, tmp_path):
     config = Config("motionsc", epochs=1, batch_size=5, workers=0, class_weights="none")  # 6 samples, 16 x 16 cells
     with pytest.raises(CarlascError, match=r"epoch 1, batch 2: 1 sample is too little .*choose a batch_size") as error:

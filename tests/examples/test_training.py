@@ -154,11 +154,13 @@ def test_points_with_remission_train_the_network_that_takes_it(tmp_path):
     assert np.isfinite(progress.losses[0])
 
 
+@pytest.mark.needs("tensorboard")
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_batch(data, tmp_path):
     with pytest.raises(CarlascError, match=r"epoch 1, batch \d+: the loss is (nan|inf).*Town0\d_Light \d"):
         train(data, replace(QUICK, learning_rate=1e30, flips=""), tmp_path, ALONE)
 
 
+@pytest.mark.needs("tensorboard")
 def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monkeypatch):
     def no_memory(*_):
         raise torch.OutOfMemoryError("CUDA out of memory")

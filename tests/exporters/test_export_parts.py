@@ -6,7 +6,7 @@ from helpers.datasets.exported import files_and_bytes, write_scene
 
 from carlasc.converting import export
 from carlasc.errors import FormatError
-from carlasc.running import Part
+from carlasc.running import Part, Run
 from carlasc.storage import FolderSink
 
 
@@ -24,8 +24,8 @@ def scenes(tmp_path):
 @pytest.mark.parametrize("name", ["kitti", "occ3d", "sscbench", "opensceneflow"])
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1)])
 def test_parts_make_the_files_of_one_export(scenes, tmp_path, name, order):
-    whole = export(name, scenes, tmp_path / "whole", workers=1)
-    made = [export(name, scenes, tmp_path / "parts", part=Part(n, 3), workers=1).made for n in order]
+    whole = export(name, scenes, tmp_path / "whole", run=Run(workers=1))
+    made = [export(name, scenes, tmp_path / "parts", run=Run(part=Part(n, 3), workers=1)).made for n in order]
     assert sum(made) == whole.made == (2 if name == "sscbench" else 8)  # SSCBench has every fifth frame
     assert files_and_bytes(tmp_path / "parts") == files_and_bytes(tmp_path / "whole")
 

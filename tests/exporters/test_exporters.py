@@ -12,8 +12,9 @@ from helpers.datasets.exported import PATH, files_and_bytes, scene_grid, write_s
 from typer.testing import CliRunner
 
 from carlasc.cli import app
-from carlasc.converting import export, exporter_names, load_exporter, option_names
+from carlasc.converting import export, exporter_names, load_exporter, option_declarations
 from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
+from carlasc.running import Run
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "exporter.md"
 OURS = ("kitti", "occ3d", "openoccupancy", "opensceneflow", "sscbench")
@@ -50,12 +51,16 @@ def test_ours_are_there_and_have_titles_and_options():
     for name in OURS:
         assert f"{name}: {load_exporter(name).title}" in result.output
     assert "(options: grid, predictions, every)" in result.output
-    assert option_names(load_exporter("occ3d")) == ("grid", "predictions", "height_m")
+    assert tuple(option.name for option in option_declarations(load_exporter("occ3d"))) == (
+        "grid",
+        "predictions",
+        "height_m",
+    )
 
 
 def test_the_exporter_of_the_documentation_works(installed, tmp_path):
     assert "topviews" in exporter_names()
-    result = export("topviews", installed, tmp_path / "out", workers=1)
+    result = export("topviews", installed, tmp_path / "out", run=Run(workers=1))
     assert (result.made, result.failures) == (3, ())
     assert result.notes == ("unknown voxels are shown as free",)
     assert sorted(files_and_bytes(tmp_path / "out")) == [
@@ -90,8 +95,8 @@ def test_options_of_the_command_line_are_those_of_the_constructor(installed, tmp
         (("--option", "above_m"), "--option: expected NAME=VALUE, each name once, found 'above_m'"),
         (("--option", "a=1", "--option", "a=2"), "--option: expected NAME=VALUE, each name once, found 'a=2'"),
         (("--option", "above_m=high"), "above_m: expected a number, found 'high'"),
-        (("--option", "below_m=1"), "--option: expected one of grid, above_m, found below_m"),
-        (("--predictions",), "--option: expected one of grid, above_m, found predictions"),
+        (("--option", "below_m=1"), "options: expected one of grid, above_m, found below_m"),
+        (("--predictions",), "options: expected one of grid, above_m, found predictions"),
     ],
 )
 def test_wrong_options_are_named_and_the_exit_code_is_2(installed, tmp_path, options, message):
@@ -109,15 +114,15 @@ def test_an_exporter_that_does_not_load_is_named(installed, tmp_path):
     with pytest.raises(ArgumentError, match="name: expected one of .*topviews.*, found 'other'"):
         load_exporter("other")
     with pytest.raises(MissingDataError, match="expected the grid fine, found evaluation"):
-        export("topviews", installed, tmp_path / "out", grid="fine")
+        export("topviews", installed, tmp_path / "out", options={"grid": "fine"})
 
 
 def test_truth_values_are_read_from_text(installed, tmp_path):
     for text in ("true", "Yes", "1"):
-        export("kitti", installed, tmp_path / text, predictions=text, workers=1)
+        export("kitti", installed, tmp_path / text, options={"predictions": text}, run=Run(workers=1))
         assert (tmp_path / text / "sequences" / "00" / "predictions" / "000000.label").is_file()
     with pytest.raises(ArgumentError, match="predictions: expected true or false, found 'perhaps'"):
-        export("kitti", installed, tmp_path / "out", predictions="perhaps", workers=1)
+        export("kitti", installed, tmp_path / "out", options={"predictions": "perhaps"}, run=Run(workers=1))
 
 
 def test_frames_that_fail_are_listed_and_the_exit_code_is_1(installed, tmp_path):
@@ -131,7 +136,7 @@ def test_frames_that_fail_are_listed_and_the_exit_code_is_1(installed, tmp_path)
 
 def test_workers_write_the_same_files(installed, tmp_path):
     for place, workers in (("one", 1), ("two", 2)):
-        export("kitti", installed, tmp_path / place, workers=workers)
+        export("kitti", installed, tmp_path / place, run=Run(workers=workers))
     assert files_and_bytes(tmp_path / "one") == files_and_bytes(tmp_path / "two")
 
 
@@ -142,21 +147,21 @@ def test_figures_are_json(installed, tmp_path):
 
 
 def test_a_damaged_record_is_named(installed, tmp_path):
-    export("topviews", installed, tmp_path / "out", workers=1)
+    export("topviews", installed, tmp_path / "out", run=Run(workers=1))
     (tmp_path / "out" / "carlasc-export.json").write_text("{")
     with pytest.raises(ValueError, match=r"carlasc-export.json: expected JSON"):
-        export("topviews", installed, tmp_path / "out", workers=1)
+        export("topviews", installed, tmp_path / "out", run=Run(workers=1))
 
 
 def test_exporters_of_different_data_sets_do_not_share_a_record(installed, tmp_path):
-    export("topviews", installed, tmp_path / "out", workers=1)
-    assert export("kitti", installed, tmp_path / "out", workers=1).made == 3
+    export("topviews", installed, tmp_path / "out", run=Run(workers=1))
+    assert export("kitti", installed, tmp_path / "out", run=Run(workers=1)).made == 3
     with pytest.raises(ConflictError):
-        export("kitti", installed, tmp_path / "out", grid="evaluation", workers=1)
+        export("kitti", installed, tmp_path / "out", options={"grid": "evaluation"}, run=Run(workers=1))
 
 
 def test_two_sequences_of_one_name_are_not_written_to_one_place(installed, tmp_path):
     write_scene(installed, frames=1, grid="evaluation", path="Train/Town07_Light/cartesian")
     message = "expected sequences of different names, found Train/Town07_Light/cartesian and Val/Town07_Light/cartesian"
     with pytest.raises(FormatError, match=message):
-        export("topviews", installed, tmp_path / "out", workers=1)
+        export("topviews", installed, tmp_path / "out", run=Run(workers=1))

@@ -15,6 +15,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import REMAPS
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.metrics import evaluate
+from carlasc.running import Run
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.files import to_json
 
@@ -44,7 +45,7 @@ def write_carlasc(root, frame_name="carlasc", classes="carla"):
 
 def test_a_grid_of_carlasc_gets_masks_by_the_rules(tmp_path):
     points, labels, counts = write_carlasc(tmp_path / "in")
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     voxels = tmp_path / "out" / "sequences" / "00" / "voxels"
     expected = REMAPS["carla_to_semantickitti"](labels)[:, ::-1]
     assert np.array_equal(np.fromfile(voxels / "000000.label", "<u2").reshape(SPEC.size), expected)
@@ -60,7 +61,7 @@ def test_a_grid_of_carlasc_gets_masks_by_the_rules(tmp_path):
 
 def test_right_handed_sequences_are_not_mirrored(tmp_path):
     _, labels, _ = write_carlasc(tmp_path / "in", "kitti")
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     written = np.fromfile(tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.label", "<u2").reshape(SPEC.size)
     assert np.array_equal(written, REMAPS["carla_to_semantickitti"](labels))
 
@@ -85,7 +86,7 @@ def test_predictions_go_where_the_evaluator_looks(tmp_path, classes, labels, raw
     writer.write_document("evaluation/params.json", to_json(SPEC.to_params() | {"carlasc": {"classes": classes}}))
     grid = np.resize(np.array(labels, np.uint32), SPEC.size)
     writer.write("evaluation/labels", 5, grid)
-    export("kitti", tmp_path / "in", tmp_path / "out", predictions=True, workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": True}, run=Run(workers=1))
     written = np.fromfile(tmp_path / "out" / "sequences" / "08" / "predictions" / "000005.label", "<u2")
     assert np.array_equal(written.reshape(SPEC.size)[:, ::-1], np.resize(np.array(raw), SPEC.size))
     assert [path.name for path in (tmp_path / "out" / "sequences" / "08").iterdir()] == ["predictions"]
@@ -95,42 +96,44 @@ def test_sequences_get_numbers_by_the_whole_source_and_kittis_keep_theirs(tmp_pa
     write_dataset(tmp_path / "in")
     writer = FolderSink(tmp_path / "in").sequence("Train/KITTI_00/cartesian")
     writer.write("points", 0, np.ones((1, 4), np.float32))
-    result = export("kitti", tmp_path / "in", tmp_path / "out", sequences=["KITTI_00", "Town01_Light"], workers=1)
+    result = export(
+        "kitti", tmp_path / "in", tmp_path / "out", sequences=["KITTI_00", "Town01_Light"], run=Run(workers=1)
+    )
     assert result.sequences == {SEQUENCE: "sequences/00", "Train/Town01_Light/cartesian": "sequences/02"}
 
 
 def test_a_second_export_goes_on(tmp_path):
     write_carlasc(tmp_path / "in")
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
-    assert export("kitti", tmp_path / "in", tmp_path / "out", workers=1).skipped == 1
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    assert export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).skipped == 1
     (tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.bin").unlink()
-    assert export("kitti", tmp_path / "in", tmp_path / "out", workers=1).made == 1
+    assert export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made == 1
 
 
 def test_what_cannot_be_exported_is_named(tmp_path):
     write_carlasc(tmp_path / "in")
     with pytest.raises(ConflictError, match="expected a place outside"):
-        export("kitti", tmp_path / "in", tmp_path / "in" / "out", workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "in" / "out", run=Run(workers=1))
     with pytest.raises(MissingDataError, match="expected the sequences Town99"):
-        export("kitti", tmp_path / "in", tmp_path / "out", sequences=["Town99"], workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "out", sequences=["Town99"], run=Run(workers=1))
     with pytest.raises(MissingDataError, match="expected the grid fine, found small"):
-        export("kitti", tmp_path / "in", tmp_path / "out", grid="fine", workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
     with pytest.raises(ArgumentError, match="name: expected one of kitti, .*, found 'poss'"):
-        export("poss", tmp_path / "in", tmp_path / "out", workers=1)
-    with pytest.raises(ArgumentError, match="option: expected one of grid, predictions, found every"):
-        export("kitti", tmp_path / "in", tmp_path / "out", every=5, workers=1)
+        export("poss", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    with pytest.raises(ArgumentError, match="options: expected one of grid, predictions, found every"):
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"every": 5}, run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 
 
 def test_frames_are_written_again_only_if_asked_for(tmp_path):
     write_carlasc(tmp_path / "in")
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     scan = tmp_path / "out" / "sequences" / "00" / "velodyne" / "000000.bin"
     written = scan.read_bytes()
     scan.write_bytes(b"changed")
-    assert export("kitti", tmp_path / "in", tmp_path / "out", workers=1).made == 0
+    assert export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made == 0
     assert scan.read_bytes() == b"changed"
-    assert export("kitti", tmp_path / "in", tmp_path / "out", overwrite=True, workers=1).made == 1
+    assert export("kitti", tmp_path / "in", tmp_path / "out", overwrite=True, run=Run(workers=1)).made == 1
     assert scan.read_bytes() == written
 
 
@@ -138,7 +141,7 @@ def test_points_out_of_range_are_in_no_voxel(tmp_path):
     points, _, _ = write_carlasc(tmp_path / "in")
     ranges = {"frame": "carlasc", "classes": "carla", "min_range_m": 2.0, "max_range_m": 4.0}
     (tmp_path / "in" / "Val/Town07_Light/cartesian/carlasc.json").write_bytes(to_json(ranges))
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
     index = SPEC.flat_index(points[(distance >= 2) & (distance <= 4), :3] * [1, -1, 1])
     expected = np.zeros(SPEC.num_voxels, bool)
@@ -154,13 +157,13 @@ def test_the_finest_grid_is_taken_and_a_cylindrical_one_is_refused(tmp_path):
     writer.write_document("coarse/params.json", to_json(coarse.to_params()))
     writer.write("coarse/labels", 0, np.zeros(coarse.size, np.uint32))
     writer.write("coarse/counts", 0, np.ones(coarse.size, np.float32))
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     labels = tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.label"
     assert labels.stat().st_size == 2 * SPEC.num_voxels
     round_ = GridSpec("cylindrical", (4, 4, 2), (0.0, -3.0, -2.0), (8.0, 3.0, 0.5))
     writer.write_document("round/params.json", to_json(round_.to_params()))
     with pytest.raises(ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"):
-        export("kitti", tmp_path / "in", tmp_path / "other", grid="round", workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "other", options={"grid": "round"}, run=Run(workers=1))
 
 
 @pytest.mark.parametrize("order", [("cartesian", "cylindrical"), ("cylindrical", "cartesian")])
@@ -168,7 +171,7 @@ def test_of_two_coordinates_the_cartesian_sequence_is_exported(tmp_path, order):
     for coordinates in order:
         writer = FolderSink(tmp_path / "in").sequence(f"Val/Town07_Light/{coordinates}")
         writer.write("points", 0, np.ones((1, 4), np.float32))
-    result = export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert list(result.sequences) == ["Val/Town07_Light/cartesian"]
 
 
@@ -194,7 +197,7 @@ def test_ground_truth_keeps_the_ids_that_predictions_may_not_have(tmp_path):
     writer.write("evaluation/counts", 0, np.ones(SPEC.size, np.float32))
     folder = tmp_path / "out" / "sequences" / "08"
     for predictions, raw in ((False, (0, 99, 52, 52, 52, 99)), (True, (0, 50, 51, 50, 50, 50))):
-        export("kitti", tmp_path / "in", tmp_path / "out", predictions=predictions, workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": predictions}, run=Run(workers=1))
         name = "predictions" if predictions else "voxels"
         written = np.fromfile(folder / name / "000000.label", "<u2").reshape(SPEC.size)[:, ::-1]
         assert np.array_equal(written, np.resize(np.array(raw), SPEC.size))
@@ -202,30 +205,37 @@ def test_ground_truth_keeps_the_ids_that_predictions_may_not_have(tmp_path):
 
 def test_an_export_with_other_options_is_not_mixed_with_an_earlier_one(tmp_path):
     write_carlasc(tmp_path / "in")
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     with pytest.raises(ConflictError, match="expected frames that were exported with grid=small, .*found grid=None"):
-        export("kitti", tmp_path / "in", tmp_path / "out", grid="small", workers=1)
-    assert export("kitti", tmp_path / "in", tmp_path / "out", grid="small", overwrite=True, workers=1).made == 1
-    assert export("kitti", tmp_path / "in", tmp_path / "out", grid="small", workers=1).skipped == 1
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "small"}, run=Run(workers=1))
+    assert (
+        export(
+            "kitti", tmp_path / "in", tmp_path / "out", overwrite=True, options={"grid": "small"}, run=Run(workers=1)
+        ).made
+        == 1
+    )
+    assert (
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "small"}, run=Run(workers=1)).skipped == 1
+    )
 
 
 def test_a_folder_that_holds_another_sequence_is_not_continued(tmp_path):
     write_carlasc(tmp_path / "in")
-    export("kitti", tmp_path / "in", tmp_path / "out", workers=1)
+    export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     other = FolderSink(tmp_path / "other").sequence("Test/Town10_Light/cartesian")
     other.write("points", 0, np.ones((1, 4), np.float32))
     with pytest.raises(ConflictError, match="expected the sequence Test/Town10_Light.*, found Val/Town07_Light"):
-        export("kitti", tmp_path / "other", tmp_path / "out", workers=1)
+        export("kitti", tmp_path / "other", tmp_path / "out", run=Run(workers=1))
 
 
 def test_an_interrupted_export_gives_the_same_bytes(tmp_path):
     write_scene(tmp_path / "in", frames=3)
     for place in ("whole", "parts"):
-        export("kitti", tmp_path / "in", tmp_path / place, workers=1)
+        export("kitti", tmp_path / "in", tmp_path / place, run=Run(workers=1))
     folder = tmp_path / "parts" / "sequences" / "00"
     for name in ("velodyne/000001.bin", "voxels/000002.occluded", "poses.txt"):
         (folder / name).unlink()
-    result = export("kitti", tmp_path / "in", tmp_path / "parts", workers=1)
+    result = export("kitti", tmp_path / "in", tmp_path / "parts", run=Run(workers=1))
     assert (result.made, result.skipped) == (2, 1)
     assert files_and_bytes(tmp_path / "parts") == files_and_bytes(tmp_path / "whole")
 
@@ -235,21 +245,21 @@ def test_classes_without_a_map_are_named_before_anything_is_written(tmp_path, pr
     table = {"name": "lab", "names": {"0": "free", "1": "road"}, "colors": {"0": [0, 0, 0], "1": [1, 1, 1]}}
     write_scene(tmp_path / "in", frames=1, metadata={"classes": table})
     with pytest.raises(FormatError, match="expected classes with a map: carla, .*, found lab"):
-        export("kitti", tmp_path / "in", tmp_path / "out", predictions=predictions, workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": predictions}, run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 
 
 def test_predictions_without_a_grid_are_refused(tmp_path):
     FolderSink(tmp_path / "in").sequence("Val/A/cartesian").write("points", 0, np.ones((1, 4), np.float32))
     with pytest.raises(MissingDataError, match="expected a Cartesian grid, found none"):
-        export("kitti", tmp_path / "in", tmp_path / "out", predictions=True, workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": True}, run=Run(workers=1))
 
 
 def test_what_is_exported_is_scored_as_the_benchmark_scores_it(tmp_path):
     """Predictions in CarlaSC's classes, and the same ones as the benchmark's evaluator reads them."""
     write_scene(tmp_path / "in", frames=2)
     for predictions in (False, True):
-        export("kitti", tmp_path / "in", tmp_path / "out", predictions=predictions, workers=1)
+        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": predictions}, run=Run(workers=1))
     result = evaluate(tmp_path / "out", tmp_path / "out")
     assert (result.convention.name, result.frames, result.failures) == ("semantickitti", 2, [])
     scored = {name: value for name, value in result.class_iou.items() if not np.isnan(value)}

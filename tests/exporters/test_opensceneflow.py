@@ -9,6 +9,7 @@ from carlasc.core.axes import mirror_boxes, mirror_points, mirror_poses
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, rotate_vectors, transform_points
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.running import Run
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.files import to_json
 from carlasc.testing.drives import KINDS, MOVABLE, SimulatedDrive, world_T_sensor
@@ -85,7 +86,7 @@ def true_flow(frame, drive=DRIVE):
 @pytest.mark.parametrize("leave_out", [(), ("boxes",), ("flow",)])
 def test_flow_is_where_points_are_in_the_next_scan(tmp_path, axes, leave_out):
     write_drive(tmp_path / "in", axes=axes, leave_out=leave_out)
-    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert (result.made, result.failures) == (4, ())
     assert result.sequences == {"Train/Street.1/cartesian": "train/Street_1.h5"}
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
@@ -111,7 +112,7 @@ def test_flow_is_where_points_are_in_the_next_scan(tmp_path, axes, leave_out):
 
 def test_a_scan_has_the_types_of_the_format(tmp_path):
     write_drive(tmp_path / "in")
-    export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     group = read_log(tmp_path / "out" / "train" / "Street_1.h5")[FIRST]
     types = {name: (array.dtype.name, array.shape[1:]) for name, array in group.items()}
     assert types == {
@@ -137,7 +138,7 @@ def test_a_scan_has_the_types_of_the_format(tmp_path):
 
 def test_objects_keep_their_numbers_although_the_source_has_larger_ones(tmp_path):
     write_drive(tmp_path / "in")
-    export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
     pairs = set()
     for frame, time in enumerate(sorted(log, key=int)):
@@ -148,7 +149,7 @@ def test_objects_keep_their_numbers_although_the_source_has_larger_ones(tmp_path
 
 def test_flow_is_not_valid_where_a_box_vanishes(tmp_path):
     write_drive(tmp_path / "in", drop=((1, 1),))
-    export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
     assert (DRIVE.scan(0).instances == 1).sum() > 3
     assert np.array_equal(log[FIRST]["flow_is_valid"], DRIVE.scan(0).instances != 1)
@@ -158,7 +159,7 @@ def test_flow_is_not_valid_where_a_box_vanishes(tmp_path):
 def test_nothing_is_known_of_scans_without_annotations_and_flow(tmp_path):
     write_drive(tmp_path / "in", leave_out=("flow",))
     (tmp_path / "in" / "Train/Street.1/cartesian/boxes/000001.bin").unlink()
-    export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
     valid = [log[time]["flow_is_valid"] for time in ("0", "100000000", "200000000")]
     assert [bool(array.any()) for array in valid] == [False, False, True]
@@ -166,7 +167,7 @@ def test_nothing_is_known_of_scans_without_annotations_and_flow(tmp_path):
 
 def test_without_labels_the_ground_is_found_and_what_does_not_exist_is_absent(tmp_path):
     write_drive(tmp_path / "in", leave_out=("labels", "instances", "seconds", "sensor"))
-    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert any("has no labels: the ground is found by the shape of each scan" in note for note in result.notes)
     group = read_log(tmp_path / "out" / "train" / "Street_1.h5")[FIRST]
     assert not {"flow_category_indices", "flow_instance_id", "lidar_dt"} & set(group)
@@ -180,8 +181,8 @@ def test_the_index_lists_all_logs_of_a_folder(tmp_path):
     write_drive(tmp_path / "in")
     write_drive(tmp_path / "in", path="Val/Other/cartesian")
     write_drive(tmp_path / "more", path="Train/Second/cartesian")
-    export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
-    export("opensceneflow", tmp_path / "more", tmp_path / "out", workers=1)
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    export("opensceneflow", tmp_path / "more", tmp_path / "out", run=Run(workers=1))
     times = ["0", "100000000", "200000000", "300000000"]
     index = read_index(tmp_path / "out" / "train" / "index_total.pkl")
     assert index == [[log, time] for log in ("Second", "Street_1") for time in times]
@@ -192,10 +193,10 @@ def test_an_interrupted_export_gives_the_same_bytes(tmp_path):
     write_drive(tmp_path / "in")
     write_drive(tmp_path / "in", path="Train/Second/cartesian")
     for place in ("whole", "parts"):
-        export("opensceneflow", tmp_path / "in", tmp_path / place, workers=1)
+        export("opensceneflow", tmp_path / "in", tmp_path / place, run=Run(workers=1))
     second = tmp_path / "parts" / "train" / "Second.h5"
     second.rename(second.with_name("Second.h5.part"))  # as a run leaves it that is killed
-    result = export("opensceneflow", tmp_path / "in", tmp_path / "parts", workers=1)
+    result = export("opensceneflow", tmp_path / "in", tmp_path / "parts", run=Run(workers=1))
     assert (result.made, result.skipped) == (4, 4)
     assert files_and_bytes(tmp_path / "parts") == files_and_bytes(tmp_path / "whole")
 
@@ -208,15 +209,15 @@ def test_a_run_that_is_interrupted_leaves_no_file(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1, progress=stop)
+        export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1, progress=stop))
     assert not list((tmp_path / "out" / "train").iterdir())
-    assert export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1).made == 4
+    assert export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made == 4
 
 
 def test_workers_write_the_same_file(tmp_path):
     write_drive(tmp_path / "in")
     for place, workers in (("one", 1), ("two", 2)):
-        export("opensceneflow", tmp_path / "in", tmp_path / place, workers=workers)
+        export("opensceneflow", tmp_path / "in", tmp_path / place, run=Run(workers=workers))
     assert files_and_bytes(tmp_path / "one") == files_and_bytes(tmp_path / "two")
 
 
@@ -225,12 +226,12 @@ def test_a_frame_that_fails_is_made_again_with_the_others(tmp_path):
     labels = tmp_path / "in" / "Train/Street.1/cartesian/labels/000002.label"
     whole = labels.read_bytes()
     labels.write_bytes(whole[:8])
-    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert [failure.frame for failure in result.failures] == [2]
     assert "labels of frame 2: expected" in result.failures[0].message
     assert len(read_log(tmp_path / "out" / "train" / "Street_1.h5")) == 3
     labels.write_bytes(whole)
-    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+    result = export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert (result.made, result.skipped, result.failures) == (4, 0, ())
     assert len(read_log(tmp_path / "out" / "train" / "Street_1.h5")) == 4
     assert len(read_index(tmp_path / "out" / "train" / "index_total.pkl")) == 4
@@ -243,20 +244,20 @@ def test_what_cannot_be_exported_is_named_in_one_line(tmp_path):
     ):
         write_drive(tmp_path / field, leave_out=(field,))
         with pytest.raises(MissingDataError, match=message):
-            export("opensceneflow", tmp_path / field, tmp_path / "out", workers=1)
+            export("opensceneflow", tmp_path / field, tmp_path / "out", run=Run(workers=1))
     write_drive(tmp_path / "still", leave_out=("flow", "boxes"))
     with pytest.raises(MissingDataError, match="expected flow or boxes, which say how objects move, found none"):
-        export("opensceneflow", tmp_path / "still", tmp_path / "out", workers=1)
+        export("opensceneflow", tmp_path / "still", tmp_path / "out", run=Run(workers=1))
     write_drive(tmp_path / "in")
     folder = tmp_path / "in" / "Train/Street.1/cartesian"
     (folder / layout.TIMES).write_bytes(layout.encode_times(np.array([0.0, 0.1, 0.1, 0.3])))
     with pytest.raises(FormatError, match="times.txt: expected times that increase, found 0.1 s at frame 2"):
-        export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+        export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     (folder / layout.TIMES).write_bytes(layout.encode_times(DRIVE.times))
     table = {"name": "lab", "names": {"0": "free", "1": "road"}, "colors": {"0": [0, 0, 0], "1": [1, 1, 1]}}
     (folder / layout.METADATA).write_bytes(to_json({"classes": table}))
     with pytest.raises(FormatError, match="expected classes with a map: carla, .*, found lab"):
-        export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
+        export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 
 
@@ -265,5 +266,5 @@ def test_a_file_that_is_no_log_is_named(tmp_path):
     (tmp_path / "out" / "train").mkdir(parents=True)
     (tmp_path / "out" / "train" / "Street_1.h5").write_bytes(b"something else")
     with pytest.raises(FormatError, match="Street_1.h5: expected an HDF5 file of scans.*`overwrite=True`"):
-        export("opensceneflow", tmp_path / "in", tmp_path / "out", workers=1)
-    assert export("opensceneflow", tmp_path / "in", tmp_path / "out", overwrite=True, workers=1).made == 4
+        export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    assert export("opensceneflow", tmp_path / "in", tmp_path / "out", overwrite=True, run=Run(workers=1)).made == 4

@@ -6,8 +6,7 @@ import tarfile
 
 import numpy as np
 import pytest
-from carlasc_converters.exporters.classes import mapping_of
-from carlasc_converters.exporters.kinds import KINDS
+from carlasc_converters.exporters.classes import KINDS, mapping_of
 from carlasc_converters.exporters.kitti import TO_RAW
 from carlasc_converters.exporters.opensceneflow import CATEGORIES
 from helpers.converters.drive_converter import DriveConverter
@@ -18,7 +17,7 @@ import carlasc
 from carlasc import Run
 from carlasc.captures import Lidar, simulate
 from carlasc.cli import app
-from carlasc.converting import convert, converter_names, export, load_converter, remaps_to_carla
+from carlasc.converting import LayoutOptions, convert, converter_names, export, load_converter, remaps_to_carla
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.geometry import invert, transform_points
 from carlasc.testing.drives import MOVABLE, SimulatedDrive, world_T_sensor
@@ -40,8 +39,8 @@ def installed(monkeypatch):
 def test_boxes_become_flow_in_the_frame_of_the_next_scan(tmp_path):
     h5py = pytest.importorskip("h5py")
     (tmp_path / "in").mkdir()
-    convert(Boxed, tmp_path / "in", tmp_path / "layout", grids="none", workers=1)
-    result = export("opensceneflow", tmp_path / "layout", tmp_path / "out", workers=1)
+    convert(Boxed, tmp_path / "in", tmp_path / "layout", grids=None, run=Run(workers=1))
+    result = export("opensceneflow", tmp_path / "layout", tmp_path / "out", run=Run(workers=1))
     assert (result.made, result.failures) == (6, ())
     drive = Boxed.drive
     tracks = dict(enumerate((thing for thing in drive.things if thing.kind in MOVABLE), 1))
@@ -65,13 +64,20 @@ def test_boxes_become_flow_in_the_frame_of_the_next_scan(tmp_path):
 
 def test_classes_of_a_converter_go_by_way_of_those_of_carlasc(installed, tmp_path):
     (tmp_path / "in").mkdir()
-    convert(Boxed, tmp_path / "in", tmp_path / "layout", classes="drive", grids="none", workers=1)
+    convert(
+        Boxed,
+        tmp_path / "in",
+        tmp_path / "layout",
+        layout=LayoutOptions(classes="drive"),
+        grids=None,
+        run=Run(workers=1),
+    )
     (sequence,) = carlasc.open(tmp_path / "layout").sequences().values()
     assert sequence.metadata.classes.name == "drive"
     (remap,) = remaps_to_carla(sequence.metadata.classes)
     assert remap.name == "drive_to_carla"
     h5py = pytest.importorskip("h5py")
-    export("opensceneflow", tmp_path / "layout", tmp_path / "out", workers=1)
+    export("opensceneflow", tmp_path / "layout", tmp_path / "out", run=Run(workers=1))
     with h5py.File(tmp_path / "out" / "train" / "DRIVE_0.h5") as log:
         assert set(np.unique(log["0"]["flow_category_indices"][()])) <= {0, 17, 19}
         assert 19 in log["0"]["flow_category_indices"][()]
@@ -128,14 +134,14 @@ def capture(tmp_path_factory):
 def test_the_command_that_is_advised_makes_the_exact_grid(capture, tmp_path):
     root = capture.parents[1]
     assert runner.invoke(app, ["regrid", str(root), "--preset", "coarse", "--workers", "1"]).exit_code == 0
-    first = export("occ3d", root, tmp_path / "first", workers=1)
+    first = export("occ3d", root, tmp_path / "first", run=Run(workers=1))
     (advice,) = (note for note in first.notes if "carlasc regrid" in note)
     command = shlex.split(re.search(r"`carlasc (.*?)`", advice)[1])
     command = [str(root) if word == "SOURCE" else word for word in command]
     command[command.index("scans")] = "capture"
     ran = runner.invoke(app, [*command, "--workers", "1"])
     assert ran.exit_code == 0, ran.output
-    second = export("occ3d", root, tmp_path / "second", workers=1)
+    second = export("occ3d", root, tmp_path / "second", run=Run(workers=1))
     assert second.notes == ()
     (sequence,) = carlasc.open(root).sequences().values()
     _, arrays = read_occ3d(tmp_path / "second", "Town07_Light")
@@ -163,8 +169,8 @@ def test_flow_of_a_real_sample_is_that_of_its_data_set(real, tmp_path):
         pytest.skip(f"{archive} is not there")
     with tarfile.open(archive) as file:
         file.extractall(tmp_path, filter="data")
-    convert("argoverse2", tmp_path / "av2" / "val", tmp_path / "layout", grids="none", workers=1)
-    export("opensceneflow", tmp_path / "layout", tmp_path / "out", workers=1)
+    convert("argoverse2", tmp_path / "av2" / "val", tmp_path / "layout", grids=None, run=Run(workers=1))
+    export("opensceneflow", tmp_path / "layout", tmp_path / "out", run=Run(workers=1))
     (log,) = (tmp_path / "av2" / "val").iterdir()
     truth = feather.read_table(log / "flow_labels.feather")
     lasers = feather.read_table(sorted(log.glob("sensors/lidar/*"))[0])["laser_number"].to_numpy()

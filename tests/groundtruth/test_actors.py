@@ -9,11 +9,11 @@ import carlasc
 from carlasc import FromScans, Run
 from carlasc.errors import FormatError
 from carlasc.groundtruth.from_scans import sequences
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
 from carlasc.groundtruth.from_scans.sequences import TRACKS
 from carlasc.motion import Extent, MotionOptions, Track
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
 
 FRAMES = 12
@@ -50,7 +50,7 @@ def assert_equal(one, other):
     assert [dict(summary) for summary in one.summary] == [dict(summary) for summary in other.summary]
 
 
-ACTORS = Actors.of(
+ACTORS = MovingActors.of(
     [track(), track(speed=0.0), track(first=0, frames=4, label=4, instance=1 << 33, rigid=False)],
     {2: np.array([5, 9]), 4: np.array([], np.int64), 8: np.array([1])},
 )
@@ -69,9 +69,11 @@ class TestKept:
             "speed_m_s": 8.0, "size_m": None, "seen_m": [3.5, 1.3, 0.9], "faces": 2,
         }  # fmt: skip
 
-    @pytest.mark.parametrize("actors", [ACTORS, Actors(), Actors.of([], {3: np.array([2])}), Actors.of([track()])])
+    @pytest.mark.parametrize(
+        "actors", [ACTORS, MovingActors(), MovingActors.of([], {3: np.array([2])}), MovingActors.of([track()])]
+    )
     def test_what_is_kept_is_read_back_with_what_it_was_made_from(self, actors):
-        back, key = Actors.from_bytes(actors.to_bytes("a key"), "here")
+        back, key = MovingActors.from_bytes(actors.to_bytes("a key"), "here")
         assert key == "a key"
         assert_equal(back, actors)
 
@@ -79,14 +81,14 @@ class TestKept:
     def test_a_damaged_file_is_one_error_that_names_it(self, size):
         data = ACTORS.to_bytes("key")[:size]
         with pytest.raises(FormatError, match="^tracks.npz: .*expected "):
-            Actors.from_bytes(data, "tracks.npz")
+            MovingActors.from_bytes(data, "tracks.npz")
 
     @pytest.mark.parametrize("position", [60, 300, 1000])
     def test_a_file_with_a_damaged_part_is_refused(self, position):
         data = bytearray(ACTORS.to_bytes("key"))
         data[position : position + 20] = bytes(20)
         with pytest.raises(FormatError, match="^tracks.npz: .*expected "):
-            Actors.from_bytes(bytes(data), "tracks.npz")
+            MovingActors.from_bytes(bytes(data), "tracks.npz")
 
     def test_a_worker_gets_what_concerns_its_window(self):
         near = ACTORS.between(5, 8)
@@ -151,12 +153,12 @@ class TestPass:
         run(street, "after", (4, 6))
         assert len(passes) == 2
 
-    @pytest.mark.parametrize("data", [b"", b"not an archive", Actors().to_bytes("of another drive")])
+    @pytest.mark.parametrize("data", [b"", b"not an archive", MovingActors().to_bytes("of another drive")])
     def test_it_is_made_again_if_what_is_kept_is_damaged_or_of_something_else(self, street, passes, data):
         (street / "cartesian" / TRACKS).write_bytes(data)
         run(street, frames=(4, 5))
         assert len(passes) == 1
-        assert Actors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), TRACKS)[0].tracks
+        assert MovingActors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), TRACKS)[0].tracks
 
     def test_other_options_of_motion_need_another_one(self, street, passes):
         run(street, "fields", (4, 5))
@@ -172,7 +174,8 @@ class TestPass:
         (street / "cartesian" / TRACKS).unlink()
         assert one == run(street, "two", (3, 6), workers=2)
         assert_equal(
-            Actors.from_bytes(kept, "")[0], Actors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), "")[0]
+            MovingActors.from_bytes(kept, "")[0],
+            MovingActors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), "")[0],
         )
 
     def test_a_grid_does_not_depend_on_the_frames_of_the_run(self, street):

@@ -10,11 +10,11 @@ from carlasc.core.evidence import VoxelFlag
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import translation
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
-from carlasc.groundtruth.inputs import Plan
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.motion import Extent, MotionOptions, PoseOptions, Track
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
 
 ROAD, BUILDING, VEHICLE = CARLA.id_of("Road"), CARLA.id_of("Building"), CARLA.id_of("Vehicle")
@@ -43,7 +43,7 @@ def feed_of(folder, scans, pose=lambda frame: np.eye(4), **options):
 
 def merge(feed, actors, frame=NOW, spec=SPEC, evidence=True):
     voting = Voting(keep_evidence=evidence and feed.options.dynamic != "tube")
-    plan = Plan(spec, "evaluation", feed.options, voting, FrameRange())
+    plan = GridPlan(spec, "evaluation", feed.options, voting, FrameRange())
     return merge_frame(plan, feed, actors, frame, feed.window_of(frame))
 
 
@@ -65,7 +65,7 @@ class TestWhereTrafficPasses:
             for frame in FRAMES
         }
         feed = feed_of(folder, scans, **options)
-        return merge(feed, Actors(moving={frame: np.array([0]) for frame in range(16, 21)}))
+        return merge(feed, MovingActors(moving={frame: np.array([0]) for frame in range(16, 21)}))
 
     def test_what_only_other_times_saw_free_is_unknown(self, tmp_path):
         merged = self.make(tmp_path, lambda frame: not 8 <= frame <= 12, own_path=False)
@@ -97,7 +97,7 @@ class TestTheFramesOwnMover:
     def make(self, folder, dynamic, actors=None):
         scans = {frame: [(PLACE, VEHICLE) if frame == NOW else (BEHIND, BUILDING)] for frame in FRAMES}
         feed = feed_of(folder, scans, dynamic=dynamic)
-        return merge(feed, Actors(moving={NOW: np.array([0])}) if actors is None else actors)
+        return merge(feed, MovingActors(moving={NOW: np.array([0])}) if actors is None else actors)
 
     @pytest.mark.parametrize("dynamic", ["current", "align"])
     def test_it_is_kept(self, tmp_path, dynamic):
@@ -108,7 +108,7 @@ class TestTheFramesOwnMover:
         assert label == 0 and count > 0
 
     def test_a_point_that_does_not_move_is_outvoted(self, tmp_path):
-        assert at(self.make(tmp_path, "current", Actors()), PLACE)[0] == 0
+        assert at(self.make(tmp_path, "current", MovingActors()), PLACE)[0] == 0
 
 
 class TestBodies:
@@ -125,7 +125,7 @@ class TestBodies:
         lower, upper = -self.HALF - 0.1, self.HALF + 0.1
         extent = Extent(-self.HALF, self.HALF, (False, False, True, False), 1000, (0.0, -4.0))
         track = Track(VEHICLE, 0, members, 0, poses, np.zeros((len(FRAMES), 3)), lower, upper, extent)
-        return merge(feed, Actors({3: track}), spec=spec, evidence=evidence)
+        return merge(feed, MovingActors({3: track}), spec=spec, evidence=evidence)
 
     def test_the_side_that_no_scan_saw_is_taken_from_the_other_one_and_marked(self, tmp_path):
         merged = self.make(tmp_path)
@@ -187,7 +187,7 @@ class TestOwnPath:
             frame: things if 0 < frame < 3 or (seen_now and frame == 0) else [((0.1, 9, 0), 1)] for frame in range(11)
         }
         feed = feed_of(folder, scans, lambda frame: translation((float(frame), 0.0, 0.0)), **options)
-        return merge(feed, Actors(), 0)
+        return merge(feed, MovingActors(), 0)
 
     def test_it_clears_a_trace_and_neither_the_ground_nor_what_is_beside(self, tmp_path):
         merged = self.make(tmp_path)

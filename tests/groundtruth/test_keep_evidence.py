@@ -14,15 +14,15 @@ from carlasc import FromCapture, FromGrid, FromScans, GridSpec, Run, Voting
 from carlasc.cli import app
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.errors import ArgumentError, ConflictError, FormatError
-from carlasc.groundtruth import Evidence
+from carlasc.groundtruth import VoxelCertainty
 from carlasc.groundtruth.from_scans.sequences import ScanFrame
 from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE
-from carlasc.groundtruth.voting.evidence import class_shares
+from carlasc.groundtruth.voting.certainty import class_shares
 from carlasc.storage import FolderSink, layout
 
 SPEC = GridSpec.published().with_size((8, 8, 4))
 GRID = "cartesian/evaluation_8x8x4"
-EVIDENCE = Evidence(
+EVIDENCE = VoxelCertainty(
     np.linspace(0, 1, SPEC.num_voxels).reshape(SPEC.size),
     np.array([(3, 7, 65535), (9, 1, 20000)], layout.VOTES_DTYPE),
     np.full(SPEC.size, 5, np.uint8),

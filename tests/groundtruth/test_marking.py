@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.voting.marking import mark
+from carlasc.groundtruth.voting.kernel import mark
 
 SPECS = {
     "cartesian": GridSpec.published().with_size((16, 16, 8)),

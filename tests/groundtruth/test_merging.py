@@ -9,12 +9,12 @@ from carlasc.core.geometry import invert, rotation_z, transform_points, translat
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
-from carlasc.groundtruth.from_scans.regions import STATIC
-from carlasc.groundtruth.voting.observations import NOWHERE
+from carlasc.groundtruth.from_scans.frame import BodyRegions
+from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger, PreparedScan
+from carlasc.groundtruth.voting.ballot import NOWHERE
 from carlasc.motion import Extent, Track
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
 
 ROAD, VEHICLE, PEDESTRIAN = CARLA.id_of("Road"), CARLA.id_of("Vehicle"), CARLA.id_of("Pedestrian")
@@ -58,17 +58,17 @@ def track(label=VEHICLE, half=(1.0, 0.5, 1.0), frames=FRAMES, faces=(True, True,
 def merger(label=VEHICLE, dynamic="align", tracks=None):
     scans = {frame: scan(frame, label) for frame in FRAMES}
     tracks = [track(label)] if tracks is None else tracks
-    return Merger(scans, Actors.of(tracks), CARLA, dynamic)
+    return Merger(scans.__getitem__, MovingActors.of(tracks), CARLA, dynamic)
 
 
 def regions_of(merging, frame=15):
-    return merging.regions(instant(frame), FRAMES, SPEC)
+    return BodyRegions.at(merging, instant(frame), FRAMES, SPEC)
 
 
 def observe(merging, frame=15, window=FRAMES):
     """Return the observations of the static scene and of the actor."""
     now = instant(frame)
-    seen = list(merging.observations(now, window, merging.regions(now, window, SPEC)))
+    seen = list(merging.observations(now, window, BodyRegions.at(merging, now, window, SPEC).actors))
     return seen[: len(window)], seen[len(window) :]
 
 
@@ -115,10 +115,14 @@ def test_which_moving_points_vote(dynamic, own, others):
 
 def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
     unmarked = {frame: replace(scan(frame), moving=np.empty(0, np.int64)) for frame in FRAMES}
-    assert Merger(unmarked, Actors(), CARLA, "align").static(3).tolist() == [True, True, True]
-    assert Merger(unmarked, Actors.of([track()]), CARLA, "align").static(3).tolist() == [True, False, True]
-    untracked = Actors(moving={3: np.array([2])})
-    assert Merger(unmarked, untracked, CARLA, "align").static(3).tolist() == [True, True, False]
+    assert Merger(unmarked.__getitem__, MovingActors(), CARLA, "align").static(3).tolist() == [True, True, True]
+    assert Merger(unmarked.__getitem__, MovingActors.of([track()]), CARLA, "align").static(3).tolist() == [
+        True,
+        False,
+        True,
+    ]
+    untracked = MovingActors(moving={3: np.array([2])})
+    assert Merger(unmarked.__getitem__, untracked, CARLA, "align").static(3).tolist() == [True, True, False]
 
 
 def test_a_track_that_never_moves_is_part_of_the_static_scene():
@@ -169,24 +173,24 @@ def test_other_rules_have_no_regions(dynamic):
 
 
 def test_a_frame_without_its_own_scan_has_bodies_and_no_points():
-    regions = merger().regions(instant(15), [frame for frame in FRAMES if frame != 15], SPEC)
+    regions = BodyRegions.at(merger(), instant(15), [frame for frame in FRAMES if frame != 15], SPEC)
     assert list(regions.actors.values()) == [0]
-    assert not merger(tracks=[]).regions(instant(15), [14, 16], SPEC).of_voxel.any()
+    assert not BodyRegions.at(merger(tracks=[]), instant(15), [14, 16], SPEC).of_voxel.any()
 
 
 def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
     merging = merger()
-    merging.scans[20].points[1] += np.float32([0.0, 0.3, 0.1])
+    merging.scan_of(20).points[1] += np.float32([0.0, 0.3, 0.1])
     now = instant(15)
     for mirrored, plain in zip(
-        list(merging.mirrored(now, [20], regions_of(merging))), observe(merging, window=[20])[1], strict=True
+        list(merging.mirrored(now, [20], regions_of(merging).actors)), observe(merging, window=[20])[1], strict=True
     ):
         actor_T_grid = invert(invert(sensor_pose(15)) @ actor_pose(15))
         one = transform_points(actor_T_grid @ plain.grid_T_sensor, plain.points)
         other = transform_points(actor_T_grid @ mirrored.grid_T_sensor, mirrored.points)
         assert np.abs(one * [1, -1, 1] - other).max() < 1e-5
         assert mirrored.hit_region == mirrored.free_region == 1
-    assert not list(merger(PEDESTRIAN).mirrored(now, FRAMES, regions_of(merger(PEDESTRIAN))))
+    assert not list(merger(PEDESTRIAN).mirrored(now, FRAMES, regions_of(merger(PEDESTRIAN)).actors))
 
 
 def test_what_passes_is_where_it_was_seen_and_frees_nothing():

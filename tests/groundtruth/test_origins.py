@@ -7,14 +7,13 @@ import pytest
 from helpers.converters.drive_converter import DriveConverter
 
 import carlasc
-from carlasc import Run
-from carlasc.converting import Sensor, convert
+from carlasc.converting import LayoutOptions, Sensor, convert
 from carlasc.core import GridSpec, runs_of_origins, sorted_by_origin, translation
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.merging import PreparedScan
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
-from carlasc.motion import MotionOptions
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
+from carlasc.motion import MotionOptions, PoseOptions
+from carlasc.running import Run
 from carlasc.testing import SimulatedDrive, Thing
 
 SPEC = GridSpec("cartesian", (96, 80, 12), (-12.0, -10.0, -1.8), (12.0, 10.0, 1.2))
@@ -36,7 +35,15 @@ class TwoPlaces(DriveConverter):
 
 def grids_of(converter, folder):
     """Return the grids of the first frame, with the origins of rays and without them."""
-    convert(converter, folder, folder.parent / f"{folder.name}_out", axes="right", grids="none", force=True, workers=1)
+    convert(
+        converter,
+        folder,
+        folder.parent / f"{folder.name}_out",
+        layout=LayoutOptions(axes="right"),
+        poses=PoseOptions(force=True),
+        grids=None,
+        run=Run(workers=1),
+    )
     (sequence,) = carlasc.open(folder.parent / f"{folder.name}_out").sequences().values()
     found = []
     for name in ("own", "one"):
@@ -110,7 +117,15 @@ def test_a_lidar_that_turns_on_a_fast_vehicle_leaves_as_much_free_space_wrong_as
         )
 
     (tmp_path / "in").mkdir()
-    convert(Fast, tmp_path / "in", tmp_path / "out", axes="right", grids="none", force=True, workers=1)
+    convert(
+        Fast,
+        tmp_path / "in",
+        tmp_path / "out",
+        layout=LayoutOptions(axes="right"),
+        poses=PoseOptions(force=True),
+        grids=None,
+        run=Run(workers=1),
+    )
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     assert ("origins" in sequence.fields()) == rolling
     carlasc.regrid(

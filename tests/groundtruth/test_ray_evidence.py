@@ -5,7 +5,7 @@ import pytest
 
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth.voting.evidence import (
+from carlasc.groundtruth.voting.certainty import (
     GROUND_PER_M,
     MOVABLE_PER_M,
     SOLID_PER_M,

@@ -5,7 +5,8 @@ import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.from_scans.regions import STATIC, Regions
+from carlasc.groundtruth.from_scans.frame import BodyRegions
+from carlasc.groundtruth.from_scans.merging import STATIC
 from carlasc.motion import BODY_MARGIN_M, Extent, Track
 
 SPEC = GridSpec("cartesian", (50, 50, 10), (-10, -10, -2), (10, 10, 2))
@@ -21,7 +22,7 @@ def body(faces=ALL, half=HALF):
 
 
 def regions_of(pose, track):
-    return Regions.of_bodies(SPEC, np.eye(4), [(7, track, pose)])
+    return BodyRegions.of_bodies(SPEC, np.eye(4), [(7, track, pose)])
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 2, 2.5])
@@ -73,13 +74,13 @@ def test_points_without_a_body_have_a_region_of_their_own():
     assert np.count_nonzero(regions.of_voxel != with_body.of_voxel) == 1
     assert regions.actors == {1: 7}  # no actor is carried into the new region
     assert not with_body.of_voxel[SPEC.flat_index(points[:1])].any()  # the first regions stay as they were
-    alone = Regions.empty(SPEC).with_points(SPEC, points[:1])
+    alone = BodyRegions.of_bodies(SPEC, np.eye(4), []).with_points(SPEC, points[:1])
     assert alone.of_voxel[SPEC.flat_index(points[:1])] != STATIC
 
 
 def test_the_wider_cells_of_a_cylindrical_grid_are_touched_too():
     spec = GridSpec("cylindrical", (20, 36, 4), (0, -np.pi, -2), (20, np.pi, 2))
     pose = translation((9.0, 6.0, 0.0)) @ rotation_z(0.7)
-    regions = Regions.of_bodies(spec, np.eye(4), [(0, body(), pose)])
+    regions = BodyRegions.of_bodies(spec, np.eye(4), [(0, body(), pose)])
     inside = transform_points(pose, np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * HALF)
     assert (regions.of_voxel[spec.flat_index(inside)] == 1).all()

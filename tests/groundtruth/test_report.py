@@ -18,7 +18,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromGrid, FromScans, Voting, regrid
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
-from carlasc.groundtruth.inputs import Plan
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, Residual, actors_of, digest_of, sample_frames
 from carlasc.groundtruth.reporting.report import FileDigest, Report
 from carlasc.storage import FolderSink, layout
@@ -96,7 +96,7 @@ def test_digests_are_those_of_the_published_files(made):
 def test_convergence_compares_grids_made_with_and_without_a_tenth_of_the_scans(street):
     observe = FromScans(window=(-7, 7))
     (sequence,) = carlasc.open(street).sequences().values()
-    plan = Plan(SPEC, GRID, observe, Voting(), FrameRange.of(None))
+    plan = GridPlan(SPEC, GRID, observe, Voting(), FrameRange.of(None))
     frame = ScanSequence(sequence, plan, observe).frames[4]
     whole, thinned = frame.make(plan).grid, frame.thinned(plan)
     changes = Changes.between(whole, thinned)
@@ -143,7 +143,7 @@ def test_parts_of_a_sequence_add_up_in_the_report(street, made, tmp_path):
 
 def test_a_complete_run_measures_nothing_again(street, made, monkeypatch):
     before = next(made.rglob(layout.REPORT)).stat().st_mtime_ns
-    monkeypatch.setattr("carlasc.groundtruth.tasks.MeasureFrame.run", None)  # would fail
+    monkeypatch.setattr("carlasc.groundtruth.work.MeasureFrame.run", None)  # would fail
     assert make(street, made).skipped == FRAMES
     assert next(made.rglob(layout.REPORT)).stat().st_mtime_ns == before
 
@@ -188,7 +188,7 @@ def test_captures_and_finer_grids_have_reports_too(tmp_path):
 
 def test_the_report_is_the_same_in_a_store(street, made, tmp_path):
     pytest.importorskip("h5py")
-    from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
+    from carlasc.storage.hdf5.hdf5_sink import HDF5Sink
 
     with HDF5Sink(tmp_path / "made.h5") as sink:
         make(street, sink)

@@ -9,7 +9,7 @@ import carlasc
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
+from carlasc.groundtruth.from_scans.sequences import check_trajectory, with_estimated_poses
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.motion import PoseOptions
 from carlasc.storage import FolderSink, layout
@@ -119,7 +119,7 @@ def test_frames_without_a_scan_take_the_estimated_pose_of_the_scan_before(tmp_pa
         assert max_range_m == 100.0
         return np.stack([translation((number, 0, 0)) for number in range(len(sizes))])
 
-    monkeypatch.setattr("carlasc.groundtruth.from_scans.trajectory.estimate_poses", estimate)
+    monkeypatch.setattr("carlasc.groundtruth.from_scans.sequences.estimate_poses", estimate)
     estimated = with_estimated_poses(sequence)
     assert sizes == [(1, 3)] * 3
     assert estimated.poses[:, 0, 3].tolist() == [0, 0, 1, 1, 1, 2]

@@ -16,8 +16,7 @@ from carlasc.core.cells import fast_azimuth
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
-from carlasc.groundtruth.voting.ballot import Ballot, Votes, count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes, count_votes
 
 _PI32 = float(np.float32(np.pi))
 SPECS = {

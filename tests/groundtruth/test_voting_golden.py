@@ -10,8 +10,7 @@ import pytest
 from helpers.references.plain_voting import plain_grid, plain_votes
 
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 
 VARIANTS = {"cartesian": 1.5, "cylindrical": 1.5, "cartesian_fine": 1.5, "cartesian_step0.5": 0.5}
 

@@ -3,8 +3,7 @@ import pytest
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.voting.ballot import Ballot, count_votes
-from carlasc.groundtruth.voting.observations import NOWHERE, Observation
+from carlasc.groundtruth.voting.ballot import NOWHERE, Ballot, Observation, count_votes
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
 

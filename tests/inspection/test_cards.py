@@ -23,11 +23,12 @@ from typer.testing import CliRunner
 
 import carlasc
 from carlasc import CardDetails, Run
-from carlasc.captures.lidar import Lidar
+from carlasc.captures.settings import Lidar
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
 from carlasc.inspection.cards.responsibility import responsibility
+from carlasc.motion import PoseOptions
 from carlasc.testing.data import SCANS, WHOLE
 
 TOWN = "Train/Demo/cartesian"
@@ -491,7 +492,9 @@ def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_tiny_kitti(tmp_path / "kitti", frames=2)
-    carlasc.convert("kitti", tmp_path / "kitti", tmp_path / "out", grids="none", poses="file", workers=1)
+    carlasc.convert(
+        "kitti", tmp_path / "kitti", tmp_path / "out", poses=PoseOptions(source="file"), grids=None, run=Run(workers=1)
+    )
     assert write_card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == ("CC BY-NC-SA 3.0",)
     text, content = (tmp_path / "out" / "README.md").read_text(), croissant(tmp_path / "out")
     assert front_matter(tmp_path / "out")["license"] == "cc-by-nc-sa-3.0"
@@ -517,10 +520,10 @@ def test_data_that_were_converted_from_another_simulator_are_synthetic(tmp_path:
 
 @pytest.mark.needs("pyarrow")
 def test_rounded_coordinates_are_said(town: Path, tmp_path: Path) -> None:
-    from carlasc.storage.packed.protocol import Options
-    from carlasc.storage.packed.tables.writing import ParquetSink
+    from carlasc.storage.packed.stores import PackOptions
+    from carlasc.storage.parquet.parquet_sink import ParquetSink
 
-    with ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
+    with ParquetSink(tmp_path / "x.parquet", PackOptions(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
         writer.write("points", 0, np.ones((3, 4), np.float32))
     write_card(tmp_path / "x.parquet", **SAID, pictures=False)
     text = (tmp_path / "x.parquet" / "README.md").read_text()

@@ -17,7 +17,7 @@ from carlasc.groundtruth import FromScans, Voting
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.others import WithoutScans, feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
-from carlasc.groundtruth.inputs import Plan
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection import HeldOutScores, holdout
 from carlasc.inspection.heldout_scores import VEHICLE_M, swept_voxels
 from carlasc.storage import FolderSink, layout
@@ -37,7 +37,7 @@ def sequence_of(folder):
 
 
 def plan_of(observe):
-    return Plan(passing_car.SPEC, "evaluation", observe, Voting(), FrameRange.of(None))
+    return GridPlan(passing_car.SPEC, "evaluation", observe, Voting(), FrameRange.of(None))
 
 
 def grid_without(folder, frame, observe=OBSERVE):

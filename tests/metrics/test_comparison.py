@@ -3,7 +3,7 @@ import pytest
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.metrics import Outcome, compare_grids
+from carlasc.metrics import VoxelOutcome, compare_grids
 
 SPEC = GridSpec("cartesian", (7, 1, 1), (0, 0, 0), (7, 1, 1))
 
@@ -17,14 +17,14 @@ def test_each_kind_of_error_is_found_where_the_truth_is_known():
     prediction, truth = grid([7, 7, 0, 7, 0, 7, 0]), grid([7, 10, 7, 0, 0, 7, 7], [1, 1, 1, 1, 1, 0, 0])
     outcomes = compare_grids(prediction, truth)
     assert outcomes.dtype == np.uint8 and outcomes.shape == SPEC.size
-    none = Outcome.NOT_COMPARED
-    expected = [Outcome.RIGHT, Outcome.WRONG, Outcome.MISSED, Outcome.INVENTED, none, none, none]
+    none = VoxelOutcome.NOT_COMPARED
+    expected = [VoxelOutcome.RIGHT, VoxelOutcome.WRONG, VoxelOutcome.MISSED, VoxelOutcome.INVENTED, none, none, none]
     assert outcomes.reshape(-1).tolist() == expected
 
 
 def test_a_truth_without_counts_is_known_everywhere():
     outcomes = compare_grids(grid([0] * 6 + [3]), grid([0] * 7))
-    assert outcomes.reshape(-1).tolist() == [0] * 6 + [Outcome.INVENTED]
+    assert outcomes.reshape(-1).tolist() == [0] * 6 + [VoxelOutcome.INVENTED]
 
 
 def test_counts_of_the_prediction_are_ignored():

@@ -13,6 +13,7 @@ from carlasc.metrics import (
     CONVENTIONS,
     ConfusionMatrix,
     Evaluation,
+    Scoring,
     distance_band,
     evaluate,
     evaluate_by_all_conventions,
@@ -89,8 +90,10 @@ def test_frames_regions_and_masks_choose_what_counts(folders, world):
     result = evaluate(*folders, frames=(1, 2))
     assert result.matrix == expected_matrix(world, keep=lambda key: key[1] == 1)
     near = distance_band(SPEC, 0, 2)
-    assert evaluate(*folders, region=lambda spec: distance_band(spec, 0, 2)).matrix == expected_matrix(world, mask=near)
-    assert evaluate(*folders, voxels="all").matrix.total == 6 * np.prod(SHAPE)
+    assert evaluate(*folders, scoring=Scoring(region=lambda spec: distance_band(spec, 0, 2))).matrix == expected_matrix(
+        world, mask=near
+    )
+    assert evaluate(*folders, scoring=Scoring(voxels="all")).matrix.total == 6 * np.prod(SHAPE)
 
 
 def test_predictions_beside_the_data_are_found_by_the_name_of_their_grid(folders, world):
@@ -180,7 +183,7 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     with pytest.raises(MissingDataError, match="none in the range"):
         evaluate(pred, truth, frames=(7, 9))
     with pytest.raises(ArgumentError, match="voxels: expected known or all, found 'some'"):
-        evaluate(pred, truth, voxels="some")
+        evaluate(pred, truth, scoring=Scoring(voxels="some"))
     with pytest.raises(ArgumentError, match="frames: expected a range that holds a frame"):
         evaluate(pred, truth, frames=(2, 1))
     write_grids(tmp_path / "without_counts", world[0])
@@ -240,14 +243,14 @@ def test_five_sequences_have_an_interval_and_can_be_compared(tmp_path, world):
 
 
 def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world):
-    result = evaluate(*folders, by=("distance", "height", "visibility"))
+    result = evaluate(*folders, scoring=Scoring(by=("distance", "height", "visibility")))
     parts = result.breakdown
     assert sum(parts[name].total for name in ("visible", "hidden")) == result.matrix.total
     assert sum(m.total for name, m in parts.items() if name.endswith("up")) == result.matrix.total
     assert parts["0-10 m"].total == result.matrix.total
     assert result.tables()[-1].rows[0][0] == "0-10 m"
     with pytest.raises(ArgumentError, match="by: expected any of distance, height, visibility, motion, found 'colour'"):
-        evaluate(*folders, by=("colour",))
+        evaluate(*folders, scoring=Scoring(by=("colour",)))
 
 
 def test_tables_hold_the_figures_in_percent(folders):
@@ -289,14 +292,17 @@ def test_a_plain_folder_of_truth_has_counts_or_all_its_voxels_are_unknown(tmp_pa
     assert (result.matrix.total, result.matrix.accuracy) == (3, pytest.approx(2 / 3))
     without = write_plain(tmp_path / "without", {"000000.label": truth})
     assert "give `voxels=all`" in evaluate(source, without).failures[0][1]
-    assert evaluate(source, without, voxels="all").matrix.total == 4
+    assert evaluate(source, without, scoring=Scoring(voxels="all")).matrix.total == 4
 
 
 def test_plain_folders_of_different_sizes_are_told_by_the_size_of_their_files(tmp_path):
     source = write_plain(tmp_path / "source", {"000000.label": np.zeros(3, np.uint32)})
     without = write_plain(tmp_path / "without", {"000000.label": np.zeros(4, np.uint32)})
     counted = {"000000.label": np.zeros(4, np.uint32), "000000.bin": np.ones(4, np.float32)}
-    assert r"expected the truth's shape (4,), found (3,)" in evaluate(source, without, voxels="all").failures[0][1]
+    assert (
+        r"expected the truth's shape (4,), found (3,)"
+        in evaluate(source, without, scoring=Scoring(voxels="all")).failures[0][1]
+    )
     assert "expected 4 labels" in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]
 
 
@@ -311,7 +317,7 @@ def test_the_classes_of_plain_predictions_can_be_named(folders, world, tmp_path)
 def test_a_region_needs_grids_whose_geometry_is_known(tmp_path):
     folder = write_plain(tmp_path / "plain", {"000000.label": np.zeros(4, np.uint32)})
     with pytest.raises(ArgumentError, match="region: expected None for grids without geometry"):
-        evaluate(folder, folder, voxels="all", region=lambda spec: distance_band(spec, 0, 1))
+        evaluate(folder, folder, scoring=Scoring(voxels="all", region=lambda spec: distance_band(spec, 0, 1)))
 
 
 def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tmp_path):
@@ -325,7 +331,10 @@ def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tm
     result = evaluate(tmp_path / "a", tmp_path / "a", convention="semantickitti")
     assert result.matrix.total == 2
     half = evaluate(
-        tmp_path / "a", tmp_path / "a", convention="semantickitti", region=lambda spec: spec.centers()[..., 1] < 0
+        tmp_path / "a",
+        tmp_path / "a",
+        convention="semantickitti",
+        scoring=Scoring(region=lambda spec: spec.centers()[..., 1] < 0),
     )
     assert half.matrix.total == 1
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.metrics import distance_band, evaluate
+from carlasc.metrics import Scoring, distance_band, evaluate
 
 
 def write_occ3d(root, seed, keep=1.0, name="semantics", masks=True):
@@ -181,7 +181,7 @@ def test_files_of_semantickitti_are_read_as_they_are(tmp_path):
 
 def test_the_geometry_of_semantickitti_is_known(tmp_path):
     truth, prediction, invalid = write_kitti(tmp_path, np.random.default_rng(2))
-    near = evaluate(tmp_path, tmp_path, region=lambda spec: distance_band(spec, 0, 10))
+    near = evaluate(tmp_path, tmp_path, scoring=Scoring(region=lambda spec: distance_band(spec, 0, 10)))
     x, y = np.meshgrid((np.arange(256) + 0.5) * 0.2, (np.arange(256) + 0.5) * 0.2 - 25.6, indexing="ij")
     beyond = np.broadcast_to((np.hypot(x, y) >= 10)[:, :, None], truth.shape)
     ious, _ = official_ious(truth, prediction, invalid | beyond)
@@ -203,7 +203,7 @@ def test_labels_of_semantickitti_without_masks_have_two_bytes(tmp_path):
     write_kitti(tmp_path, np.random.default_rng(4), shape=(16, 16, 4))
     for suffix in ("invalid", "occluded", "bin"):
         (tmp_path / "sequences" / "08" / "voxels" / f"000000.{suffix}").unlink()
-    result = evaluate(tmp_path, tmp_path, voxels="all")
+    result = evaluate(tmp_path, tmp_path, scoring=Scoring(voxels="all"))
     truth = np.fromfile(tmp_path / "sequences" / "08" / "voxels" / "000000.label", "<u2")
     assert result.matrix.total == np.isin(truth, (52, 99), invert=True).sum()
 

@@ -262,7 +262,7 @@ def test_wrong_input_is_named():
 @pytest.mark.parametrize("seed", range(2))
 def test_tensors_are_cast_on_their_device_as_arrays_are_on_the_cpu(seed):
     torch = pytest.importorskip("torch")
-    from carlasc.metrics.tensor_casting import cast_rays_on_device
+    from carlasc.metrics.casting import cast_rays_on_device
 
     rng = np.random.default_rng(seed)
     labels = np.stack([scene(seed), scene(seed + 10)])

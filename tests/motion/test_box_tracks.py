@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc import Boxes, Scan
-from carlasc.captures import Drive
+from carlasc.captures import TownDrive
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.motion import segment_by_boxes, tracks_from_boxes
@@ -186,7 +186,7 @@ def test_a_point_in_two_boxes_belongs_to_the_smaller_one():
 @pytest.fixture(scope="module")
 def town():
     """Frames of a simulated drive: scans, poses, and the true boxes of all actors but the ego vehicle, with noise and gaps."""
-    rng, town, frames = np.random.default_rng(0), Drive(5, "light"), range(0, 30, 3)
+    rng, town, frames = np.random.default_rng(0), TownDrive(5, "light"), range(0, 30, 3)
     poses = {frame: town.sensor_poses(frame, 1)[0] for frame in frames}
     boxes = {}
     for frame in frames:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.scenes.moving_scenes import CAR, GROUND, PERSON, WALL, WALLS, car, film, person
 
-from carlasc.captures.lidar import Lidar
+from carlasc.captures.settings import Lidar
 from carlasc.errors import FormatError
 from carlasc.motion.evidence import HORIZON_S, Sighting, find_evidence
 

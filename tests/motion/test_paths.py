@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
-from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.motion.registration import best_sighting, follow
+from carlasc.motion.paths import best_sighting, estimate_path, follow, headings_of, is_standing
 
 FRAMES = range(25)
 SECONDS = np.array(FRAMES) * PERIOD_S

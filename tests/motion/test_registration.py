@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.geometry import rotation_z
-from carlasc.motion.registration import ends, lay, nearest_points
+from carlasc.motion.paths import ends, lay, nearest_points
 
 
 def test_nearest_points_are_those_of_all_pairs():

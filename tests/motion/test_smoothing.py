@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carlasc.motion.smoothing import _median, resample, smooth, smooth_at
+from carlasc.motion.paths import _median, resample, smooth, smooth_at
 
 TIMES = np.arange(40) * 0.1
 

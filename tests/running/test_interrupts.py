@@ -13,7 +13,7 @@ from carlasc.running.interrupts import postponed_interrupts
 
 PROGRAM = """
 import os, signal, threading
-from carlasc.storage.packed.arrays.chunks import in_threads
+from carlasc.storage.packed.chunks import in_threads
 
 start = threading.Thread.start
 

@@ -15,8 +15,8 @@ from carlasc.errors import FormatError
 from carlasc.storage import Sequence
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packed.output import TABLES_MARK
-from carlasc.storage.packed.protocol import Options
-from carlasc.storage.packed.tables.writing import ParquetSink
+from carlasc.storage.packed.stores import PackOptions
+from carlasc.storage.parquet.parquet_sink import ParquetSink
 from carlasc.testing.data import SCANS, WHOLE
 
 h5py = pytest.importorskip("h5py")
@@ -29,8 +29,8 @@ def points_of(count: int, seed: int = 0) -> np.ndarray:
     return points
 
 
-def write(path: Path, scans: list[np.ndarray], options: Options | None = None, field: str = "points") -> Sequence:
-    with open_sink(path, options or Options(), False) as sink, sink.sequence(SCANS) as writer:
+def write(path: Path, scans: list[np.ndarray], options: PackOptions | None = None, field: str = "points") -> Sequence:
+    with open_sink(path, options or PackOptions(), False) as sink, sink.sequence(SCANS) as writer:
         for frame, array in enumerate(scans):
             writer.write(field, frame, array)
     return carlasc.open(path).sequences()[SCANS]
@@ -39,7 +39,7 @@ def write(path: Path, scans: list[np.ndarray], options: Options | None = None, f
 def test_memory_is_used_again_only_where_shape_and_type_are_the_same(tmp_path: Path) -> None:
     scans = [points_of(300), points_of(40_000), points_of(17)]
     exact = write(tmp_path / "exact.h5", scans)
-    rounded = write(tmp_path / "rounded.h5", scans, Options(lossy_mm=1))
+    rounded = write(tmp_path / "rounded.h5", scans, PackOptions(lossy_mm=1))
     spare: list[np.ndarray] = []
     for frame in (0, 1, 0, 2, 1):
         for sequence, tolerance in ((exact, 0.0), (rounded, 0.00051)):
@@ -64,7 +64,7 @@ def test_a_4th_column_comes_back_bit_for_bit(tmp_path: Path, bits: int) -> None:
 def test_a_chunk_has_nine_eighths_of_the_first_scan_in_whole_pages(tmp_path: Path, count: int, chunk: int) -> None:
     write(tmp_path / "x.h5", [points_of(0), points_of(count), points_of(3)])
     with h5py.File(tmp_path / "x.h5") as file:
-        assert file[SCANS]["scans/points/xyz"].chunks == (3, chunk)
+        assert file[SCANS]["scans/points/xyz"].chunks == (1, 3, chunk)
 
 
 def test_a_grid_of_another_size_than_the_first_is_refused(tmp_path: Path) -> None:
@@ -73,12 +73,12 @@ def test_a_grid_of_another_size_than_the_first_is_refused(tmp_path: Path) -> Non
 
 
 def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_path: Path) -> None:
-    with open_sink(tmp_path / "x.h5", Options(), False) as sink, sink.sequence(SCANS) as writer:
+    with open_sink(tmp_path / "x.h5", PackOptions(), False) as sink, sink.sequence(SCANS) as writer:
         writer.write_document("poses.txt", b"not numbers")
         writer.write_document("times.txt", b"0\n1\n")
     assert carlasc.open(tmp_path / "x.h5").sequences()[SCANS].read_document("poses.txt") == b"not numbers"
     with h5py.File(tmp_path / "x.h5") as file:
-        assert set(file[SCANS]) == {"documents", "times"}
+        assert set(file[SCANS]) == {"documents", "times", "frames", "counts"}
 
 
 @pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])
@@ -86,7 +86,7 @@ def test_a_sequence_that_is_started_again_and_not_finished_is_not_listed(
     tmp_path: Path, kind: str, package: str
 ) -> None:
     pytest.importorskip(package)
-    with open_sink(tmp_path / f"x.{kind}", Options(), False) as sink:
+    with open_sink(tmp_path / f"x.{kind}", PackOptions(), False) as sink:
         for path in (SCANS, WHOLE):
             with sink.sequence(path) as writer:
                 writer.write("labels", 0, np.arange(3, dtype=np.uint32))
@@ -132,7 +132,7 @@ def test_what_a_run_left_that_was_killed_while_it_finished_a_store_of_tables_is_
 )
 def test_an_unfinished_store_of_any_format_says_the_same(tmp_path: Path, name: str, opened: str) -> None:
     pytest.importorskip("pyarrow")
-    sink = open_sink(tmp_path / name, Options(), False)
+    sink = open_sink(tmp_path / name, PackOptions(), False)
     with sink.sequence(SCANS) as writer:
         writer.write("points", 0, points_of(5))
     with pytest.raises(FormatError) as error:
@@ -151,7 +151,7 @@ def test_a_folder_with_the_ending_of_unfinished_stores_is_opened(tmp_path: Path)
 @pytest.mark.parametrize(("kind", "package"), [("h5", "hdf5plugin"), ("parquet", "pyarrow")])
 def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> None:
     pytest.importorskip(package)
-    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
+    writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     writer.write("labels", 3, np.arange(3, dtype=np.uint32))
     with pytest.raises(FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"):
         writer.write("labels", 3, np.arange(3, dtype=np.uint32))

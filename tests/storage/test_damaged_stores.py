@@ -19,8 +19,8 @@ import carlasc
 from carlasc.errors import FormatError
 from carlasc.storage import FolderSource, Sequence, Source, pack, unpack
 from carlasc.storage.opening import open_sink
-from carlasc.storage.packed.arrays.chunks import Encoding
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.chunks import Encoding
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.testing.data import SCANS, WHOLE
 
 PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
@@ -67,7 +67,7 @@ def test_a_sequence_whose_path_leads_elsewhere_is_not_unpacked(data: Path, tmp_p
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_fields_and_text_files_whose_names_lead_elsewhere_are_not_written(tmp_path: Path, kind: str) -> None:
-    writer = open_sink(tmp_path / f"x.{kind}", Options(), False).sequence(SCANS)
+    writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     with pytest.raises(FormatError, match="leads elsewhere"):
         writer.write("../../../../victim/labels", 0, np.zeros((2, 2, 2), np.uint32))
     with pytest.raises(FormatError, match="leads elsewhere"):
@@ -147,22 +147,18 @@ def remove_chunk(root: dict[str, Any]) -> None:
     del node(root, f"{WHOLE}/scans/points")["attributes"]["chunk"]
 
 
-def change_block(root: dict[str, Any]) -> None:
-    root["attributes"]["block"] = 0
-
-
 def forget_columns(root: dict[str, Any]) -> None:
     del node(root, f"{WHOLE}/counts")["attributes"]["columns"]
 
 
 def shorten(root: dict[str, Any]) -> None:
-    node(root, f"{WHOLE}/scans/points/xyz")["shape"][1] = 5 * 16 * 16384
+    node(root, f"{WHOLE}/scans/points/xyz")["shape"][0] = 5
 
 
 def flatten(root: dict[str, Any]) -> None:
     xyz = node(root, f"{WHOLE}/scans/points/xyz")
-    xyz["shape"][0] = xyz["chunk_grid"]["configuration"]["chunk_shape"][0] = 2
-    xyz["codecs"][0]["configuration"]["chunk_shape"][0] = 2
+    xyz["shape"][1] = xyz["chunk_grid"]["configuration"]["chunk_shape"][1] = 2
+    xyz["codecs"][0]["configuration"]["chunk_shape"][1] = 2
 
 
 def widen(root: dict[str, Any]) -> None:
@@ -171,17 +167,16 @@ def widen(root: dict[str, Any]) -> None:
 
 def make_larger(root: dict[str, Any]) -> None:
     xyz = node(root, f"{WHOLE}/scans/points/xyz")
-    xyz["codecs"][0]["configuration"]["chunk_shape"][1] = 1 << 15
+    xyz["codecs"][0]["configuration"]["chunk_shape"][2] = 1 << 15
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (remove_chunk, "expected the size of its chunks, found None: the store is damaged"),
-        (change_block, "expected a number of frames in block, found 0"),
         (forget_columns, r"expected \(4, 0\) numbers of elements, of rising frames, found others"),
-        (shorten, r"xyz: expected <f4 with room for frame 5, found <f4 of shape \(3, 1310720\)"),
-        (flatten, r"expected <f4 with room for frame 5, found <f4 of shape \(2, "),
+        (shorten, r"xyz: expected <f4 with room for frame 5, found <f4 of shape \(5, 3, 262144\)"),
+        (flatten, r"expected <f4 with room for frame 5, found <f4 of shape \(16, 2, "),
         (widen, r"expected <f4 with room for frame 5, found <f8"),
         (make_larger, "the checksum does not match|found none: the store is damaged"),
         (take_completeness, "expected a finished store, found one that is being written, or was interrupted"),
@@ -225,40 +220,53 @@ def edit_hdf5(store: Path, name: str, values: Any, **options: Any) -> None:
 LABELS = "Town01_Light/cartesian/scans/labels/values"
 
 
+SEQUENCE = "Town01_Light/cartesian"
+
+
 @pytest.mark.parametrize(
-    "last",
+    ("name", "values", "message"),
     [
-        [(2, 1), (2, 1002)],  # not at the start of a chunk
-        [(2, 0), (2, -5)],  # an end before its start
-        [(2, 0), (3, 1)],  # beyond the array
-        [(-1, 0), (0, 0)],
-        [],  # three frames
+        ("frames", [0, 1, 2, 2], "expected rising numbers of frames"),
+        ("frames", [-1, 1, 2, 5], "expected rising numbers of frames"),
+        ("frames", [0, 1, 2, 6], "expected u1 with room for frame 6"),
+        ("frames", [0, 1, 2, 2**62], f"expected u1 with room for frame {2**62}"),
+        ("frames", [0, 1, 2], r"expected \(3, [0-9]+\) numbers of elements, of rising frames, found others"),
+        ("counts", [0, 1, 777, 2**40], "expected u1 with room for frame 5"),
+        ("counts", [1, 1, 777, 1001], r"frame 0.*expected chunk 0 of .*values, found none: the store is damaged"),
+        ("counts", [0, 1, 777, 16385], r"frame 5.*expected chunk 81 of .*values, found none: the store is damaged"),
     ],
 )
-def test_wrong_offsets_are_one_clear_error(hdf5_store: Path, last: list[tuple[int, int]]) -> None:
+def test_wrong_frames_and_counts_are_one_clear_error(
+    hdf5_store: Path, name: str, values: list[int], message: str
+) -> None:
     import h5py
 
     with h5py.File(hdf5_store) as file:
-        step = file[LABELS].chunks[0]
-        assert file[LABELS].shape == (3 * step,)
-        right = file[f"{LABELS}_offsets"][:]
-    assert right.tolist() == [[0, 0], [0, 1], [step, step + 777], [2 * step, 2 * step + 1001]]
-    wrong = [chunk * step + element for chunk, element in last]
-    edit_hdf5(hdf5_store, f"{LABELS}_offsets", np.array([*right[:3].tolist(), *([wrong] if wrong else [])], np.int64))
-    with pytest.raises(FormatError, match="expected offsets of 4 frames inside the array"):
-        carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
+        assert file[LABELS].shape == (6, 16 * 16384)
+        assert file[SEQUENCE]["frames"][:].tolist() == [0, 1, 2, 5]
+        columns = json.loads(file[SEQUENCE]["counts"].attrs["columns:json"])
+        counts, place = file[SEQUENCE]["counts"][:], columns.index("scans/labels/values")
+    assert counts[:, place].tolist() == [0, 1, 777, 1001]
+    wrong = np.array(values, np.int64)
+    if name == "counts":
+        counts[:, place] = wrong
+        wrong = counts
+    edit_hdf5(hdf5_store, f"{SEQUENCE}/{name}", wrong)
+    sequence = carlasc.open(hdf5_store).sequences()[SEQUENCE]
+    with pytest.raises(FormatError, match=message):
+        sequence.read_many("labels", sequence.frames("labels"))
 
 
 def test_an_index_beyond_the_palette_is_one_clear_error(hdf5_store: Path) -> None:
     import h5py
 
-    name = "Town01_Light/cartesian/scans/flow/palette_offsets"
     with h5py.File(hdf5_store) as file:
-        offsets = file[name][:]
-    assert offsets[3, 1] - offsets[3, 0] == 4  # frame 5 has four distinct vectors
-    offsets[3, 1] -= 1
-    edit_hdf5(hdf5_store, name, offsets)
-    sequence = carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"]
+        columns = json.loads(file[SEQUENCE]["counts"].attrs["columns:json"])
+        counts, place = file[SEQUENCE]["counts"][:], columns.index("scans/flow/palette")
+    assert counts[3, place] == 4  # frame 5 has four distinct vectors
+    counts[3, place] -= 1
+    edit_hdf5(hdf5_store, f"{SEQUENCE}/counts", counts)
+    sequence = carlasc.open(hdf5_store).sequences()[SEQUENCE]
     with pytest.raises(FormatError, match="field flow, frame 5: .*expected indices below 3, found 3"):
         sequence.read("flow", 5)
     assert len(sequence.read("flow", 2)) == 777
@@ -271,14 +279,8 @@ def test_chunks_that_are_missing_are_one_clear_error(hdf5_store: Path) -> None:
         checksums = file[f"{LABELS}_crc32c"][:]
     for wrong in (checksums[:-1], np.append(checksums, checksums[:1])):
         edit_hdf5(hdf5_store, f"{LABELS}_crc32c", wrong)
-        with pytest.raises(FormatError, match=rf"expected {len(wrong)} chunks, found others"):
-            carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
-    edit_hdf5(hdf5_store, f"{LABELS}_crc32c", checksums)
-    with h5py.File(hdf5_store, "r+") as file:
-        file[LABELS].resize((4 * file[LABELS].chunks[0],))  # a chunk that was never written
-    edit_hdf5(hdf5_store, f"{LABELS}_crc32c", np.append(checksums, checksums[:1]))
-    with pytest.raises(FormatError, match="expected 4 chunks, found others"):
-        carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
+        with pytest.raises(FormatError, match=rf"expected {len(wrong)} chunks, found 3"):
+            carlasc.open(hdf5_store).sequences()[SEQUENCE].read("labels", 2)
 
 
 def test_bytes_that_cannot_be_decoded_name_field_and_frame(hdf5_store: Path) -> None:
@@ -394,7 +396,7 @@ def test_an_hdf5_store_shows_no_other_file(hdf5_store: Path, tmp_path: Path) -> 
 def test_a_chunk_of_an_hdf5_store_that_unpacks_to_more_than_its_array_is_refused(hdf5_store: Path) -> None:
     import h5py
 
-    name = f"{LABELS.rpartition('/')[0]}/frames"
+    name = f"{SEQUENCE}/frames"
     with h5py.File(hdf5_store, "r+") as file:
         attributes = dict(file[name].attrs)
         del file[name]

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +12,8 @@ from helpers.datasets.sequences import scan
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
 from carlasc.storage import FolderSource, Sink, Source
-from carlasc.storage.packed.arrays.hdf5_writing import HDF5Sink
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.hdf5.hdf5_sink import HDF5Sink
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.packing import pack
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
@@ -34,16 +37,44 @@ class TestHDF5Sink(SinkContract):
         return carlasc.open(out)
 
 
-def test_h5py_with_hdf5plugin_reads_the_same_numbers(published: Path, store: Path) -> None:
+def test_h5py_with_hdf5plugin_reads_the_same_numbers_as_the_page_says(
+    published: Path, store: Path, tmp_path: Path
+) -> None:
+    page = (Path(__file__).parents[2] / "docs/storage.md").read_text()
+    code = next(block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import h5py" in block)
     reference = FolderSource(published).sequences()[WHOLE]
+    for frame in sorted({*reference.frames("points").tolist()} & {*reference.frames("evaluation/labels").tolist()}):
+        found = run_page(code, store, frame, tmp_path)
+        assert np.array_equal(found["points"], reference.read("points", frame)[:, :3])
+        assert np.array_equal(found["labels"], reference.read("evaluation/labels", frame))
     with h5py.File(store) as file:
-        points = file[WHOLE]["scans/points"]
-        for frame, (start, end) in zip(points["frames"][:], points["xyz_offsets"][:], strict=True):
-            assert np.array_equal(points["xyz"][:, start:end].T, reference.read("points", int(frame))[:, :3])
-        cells = file[WHOLE]["grids/evaluation/counts"]
-        for position, frame in enumerate(cells["frames"][:]):
-            assert np.array_equal(cells["values"][position], reference.read("evaluation/counts", int(frame)))
         assert np.array_equal(file[WHOLE]["times"][:], reference.times)
+        assert np.array_equal(file[WHOLE]["poses"][:], reference.poses)
+
+
+def run_page(code: str, store: Path, frame: int, folder: Path) -> dict[str, np.ndarray]:
+    """Run the code of the page in a process that cannot import carlasc."""
+    assert code.count('"carlasc.h5"') == 1 and code.count("frame = 17") == 1
+    code = code.replace('"carlasc.h5"', repr(str(store))).replace("frame = 17", f"frame = {frame}")
+    code = (
+        "import sys\nsys.modules['carlasc'] = None\n"
+        + code
+        + "\nimport numpy\nnumpy.savez('x', points=points, labels=labels)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=folder)
+    with np.load(folder / "x.npz") as arrays:
+        return dict(arrays)
+
+
+def test_a_scan_of_more_than_sixteen_times_the_room_of_others_is_kept(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    scans = [scan(rng, count)["points"] for count in (300, 20 * 16384, 300)]
+    with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(SCANS) as writer:
+        for frame, points in enumerate(scans):
+            writer.write("points", frame, points)
+    sequence = carlasc.open(tmp_path / "x.h5").sequences()[SCANS]
+    for points, found in zip(scans, sequence.read_many("points", range(3)), strict=True):
+        assert np.array_equal(points, found)
 
 
 def test_nothing_is_in_a_global_heap_which_has_no_checksum(store: Path) -> None:
@@ -64,7 +95,7 @@ def test_every_data_set_says_type_version_dtype_and_unit(store: Path) -> None:
     assert len(found) > 30
 
 
-def test_types_widen_when_a_later_frame_needs_it(tmp_path: Path) -> None:
+def test_frames_that_do_not_fit_the_type_go_to_a_second_column(tmp_path: Path) -> None:
     values = [np.arange(20), np.array([256, 3]), np.array([2]), np.array([70000, 0])]
     with HDF5Sink(tmp_path / "x.h5") as sink, sink.sequence(SCANS) as writer:
         for frame, labels in enumerate(values):
@@ -103,10 +134,20 @@ def test_a_truncated_file_is_one_clear_error(store: Path) -> None:
         carlasc.open(store)
 
 
-def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
+@pytest.mark.parametrize(
+    ("version", "message"),
+    [
+        (7, "found version 7: upgrade carlasc"),
+        (
+            1,
+            "expected a store of version 3, found version 1: it was packed by an earlier, unreleased version of carlasc",
+        ),
+    ],
+)
+def test_a_store_of_another_version_says_so(store: Path, version: int, message: str) -> None:
     with h5py.File(store, "r+") as file:
-        file.attrs["version"] = 7
-    with pytest.raises(FormatError, match="found version 7: upgrade carlasc"):
+        file.attrs["version"] = version
+    with pytest.raises(FormatError, match=message):
         carlasc.open(store)
 
 
@@ -130,7 +171,7 @@ def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
 
 def test_pcodec_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"\.zarr"):
-        HDF5Sink(tmp_path / "x.h5", Options(small=True))
+        HDF5Sink(tmp_path / "x.h5", PackOptions(small=True))
 
 
 def test_another_file_is_not_overwritten(tmp_path: Path) -> None:

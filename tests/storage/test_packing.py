@@ -23,7 +23,7 @@ from carlasc import Run
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.storage import FolderSink, FolderSource, pack, unpack
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.stores import PackOptions
 
 for package in ("zarr", "h5py", "hdf5plugin", "pyarrow"):
     pytest.importorskip(package)
@@ -428,7 +428,7 @@ def test_a_continued_unpacking_counts_the_files_that_it_kept(data: Path, tmp_pat
 
 @pytest.mark.parametrize("millimetres", [0.001, 1000])
 def test_the_limits_of_quantisation(millimetres: float) -> None:
-    assert Options(lossy_mm=millimetres).scale_m == millimetres / 1000
+    assert PackOptions(lossy_mm=millimetres).scale_m == millimetres / 1000
 
 
 def test_leftovers_of_an_older_replacement_are_removed_and_a_copy_of_the_user_stays(data: Path, tmp_path: Path) -> None:

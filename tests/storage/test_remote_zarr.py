@@ -23,12 +23,12 @@ from storage.test_shared_writing import FRAMES, PATH, arrays_of, start_sink, wri
 import carlasc
 from carlasc import Run
 from carlasc.errors import ConflictError
-from carlasc.storage.packed.arrays.zarr_finish import finish
-from carlasc.storage.packed.arrays.zarr_writing import ZarrSink
 from carlasc.storage.packing import pack
 from carlasc.storage.remote import RemoteTarget, target_of
 from carlasc.storage.targets import LocalTarget, Target
 from carlasc.storage.unpacking import unpack
+from carlasc.storage.zarr.zarr_finish import finish
+from carlasc.storage.zarr.zarr_sink import ZarrSink
 
 for package in ("s3fs", "numcodecs", "google_crc32c"):
     pytest.importorskip(package)

@@ -25,10 +25,10 @@ import carlasc
 from carlasc import Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Sequence, pack, unpack
-from carlasc.storage.packed.arrays.zarr_finish import finish
-from carlasc.storage.packed.arrays.zarr_writing import ZarrSink, ZarrWriter
-from carlasc.storage.packed.protocol import Options
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.targets import LocalTarget
+from carlasc.storage.zarr.zarr_finish import finish
+from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
 for package in ("numcodecs", "google_crc32c"):
     pytest.importorskip(package)
@@ -107,7 +107,7 @@ import sys
 from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from storage.test_shared_writing import start, write_block
-from carlasc.storage.packed.arrays.zarr_finish import finish
+from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.targets import LocalTarget
 out = Path(sys.argv[1])
 writer = start(out)
@@ -185,11 +185,11 @@ def test_frames_written_in_any_order_together_or_alone_give_the_same_files(
 ) -> None:
     folder, count = tmp_path_factory.mktemp("orders"), 7
     given = {frame: arrays_of(frame) for frame in range(count)}
-    whole = ZarrSink(folder / "a.zarr", Options(block=block)).sequence(PATH)
+    whole = ZarrSink(folder / "a.zarr", PackOptions(block=block)).sequence(PATH)
     whole.expect({}, {"points": 140})
     whole.write_frames(given)
     finish(LocalTarget(folder / "a.zarr"))
-    writer: ZarrWriter = ZarrSink(folder / "b.zarr", Options(block=block)).sequence(PATH)
+    writer: ZarrWriter = ZarrSink(folder / "b.zarr", PackOptions(block=block)).sequence(PATH)
     writer.expect({}, {"points": 140})
     items = data.draw(st.permutations([(frame, name) for frame in given for name in given[frame]]))
     while items:
@@ -283,7 +283,7 @@ def test_finishing_again_changes_nothing_and_without_a_store_it_is_an_error(
         (out / name).write_bytes(data)
     assert finish(LocalTarget(out)).sequences[PATH]["points"] == FRAMES
     assert files_of(out) == reference
-    with pytest.raises(MissingDataError, match="expected a zarr store of version 2"):
+    with pytest.raises(MissingDataError, match="expected a zarr store of version 3"):
         finish(LocalTarget(tmp_path / "nothing"))
 
 
@@ -362,9 +362,13 @@ def test_a_source_names_the_files_that_hold_frames(tmp_path: Path, reference: di
         (tmp_path / "x.zarr" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "x.zarr" / name).write_bytes(data)
     sequence: Sequence = carlasc.open(tmp_path / "x.zarr").sequences()[PATH]
-    shards = f"{PATH}/scans/points/xyz/c/0"
-    assert sequence.files_of("points", [0, 5, 4]) == [f"{shards}/0"]
-    assert sequence.files_of("points", [39, 1]) == [f"{shards}/2", f"{shards}/0", f"{PATH}/scans/points/fourth/c/0"]
+    shards = f"{PATH}/scans/points/xyz/c"
+    assert sequence.files_of("points", [0, 5, 4]) == [f"{shards}/0/0/0"]
+    assert sequence.files_of("points", [39, 1]) == [
+        f"{shards}/2/0/0",
+        f"{shards}/0/0/0",
+        f"{PATH}/scans/points/fourth/c/0/0",
+    ]
     assert sequence.files_of("points", [3]) == []  # an empty scan
     assert set(sequence.files_of("evaluation/counts", [1, 4])) == {
         f"{PATH}/grids/evaluation/counts/{column}/c/0/0/0/0" for column in ("values", "values_wide")
@@ -374,11 +378,11 @@ def test_a_source_names_the_files_that_hold_frames(tmp_path: Path, reference: di
 @pytest.mark.parametrize("block", [0, 1025])
 def test_senseless_blocks_are_refused(block: int) -> None:
     with pytest.raises(ArgumentError, match="block: expected 1 to 1024 frames"):
-        Options(block=block)
+        PackOptions(block=block)
 
 
 def test_a_store_of_one_frame_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
-    with ZarrSink(tmp_path / "x.zarr", Options(block=1)) as sink, sink.sequence(PATH) as writer:
+    with ZarrSink(tmp_path / "x.zarr", PackOptions(block=1)) as sink, sink.sequence(PATH) as writer:
         writer.write_frames({0: arrays_of(1)})
         assert np.array_equal(writer.read("evaluation/counts", 0), arrays_of(1)["evaluation/counts"])
     sequence = carlasc.open(tmp_path / "x.zarr").sequences()[PATH]
@@ -387,7 +391,7 @@ def test_a_store_of_one_frame_in_blocks_of_one_frame_is_read(tmp_path: Path) -> 
 
 
 def test_a_store_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
-    with ZarrSink(tmp_path / "x.zarr", Options(block=1)) as sink, sink.sequence(PATH) as writer:
+    with ZarrSink(tmp_path / "x.zarr", PackOptions(block=1)) as sink, sink.sequence(PATH) as writer:
         writer.write_frames({frame: arrays_of(frame) for frame in range(FRAMES)})
     assert_whole(tmp_path / "x.zarr")
     assert len(list((tmp_path / "x.zarr" / PATH / "scans/labels/values/c").iterdir())) > 20

@@ -11,9 +11,9 @@ from helpers.datasets.sequences import FRAMES
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import FolderSource, Sink, Source, layout
-from carlasc.storage.packed.protocol import Options
-from carlasc.storage.packed.tables.writing import ParquetSink
+from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.packing import pack
+from carlasc.storage.parquet.parquet_sink import ParquetSink
 from carlasc.testing import SinkContract, SourceContract
 from carlasc.testing.data import SCANS, WHOLE
 
@@ -132,8 +132,8 @@ def test_a_missing_table_is_damage(store: Path) -> None:
 
 def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
     mark = store / "carlasc-tables.json"
-    mark.write_text(json.dumps(json.loads(mark.read_bytes()) | {"version": 3}))
-    with pytest.raises(FormatError, match="found version 3: upgrade carlasc"):
+    mark.write_text(json.dumps(json.loads(mark.read_bytes()) | {"version": 7}))
+    with pytest.raises(FormatError, match="found version 7: upgrade carlasc"):
         carlasc.open(store)
 
 
@@ -150,12 +150,12 @@ def test_a_second_run_keeps_finished_sequences(tmp_path: Path) -> None:
     sink = ParquetSink(tmp_path / "x.parquet")
     assert sink.finished(SCANS)
     assert not sink.finished(WHOLE)
-    assert not ParquetSink(tmp_path / "x.parquet", Options(lossy_mm=2)).finished(SCANS)
+    assert not ParquetSink(tmp_path / "x.parquet", PackOptions(lossy_mm=2)).finished(SCANS)
 
 
 def test_pcodec_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"\.zarr"):
-        ParquetSink(tmp_path / "x.parquet", Options(small=True))
+        ParquetSink(tmp_path / "x.parquet", PackOptions(small=True))
 
 
 def frames_table(store: Path) -> list[dict[str, object]]:

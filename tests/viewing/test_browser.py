@@ -5,14 +5,14 @@ import pytest
 from helpers.displays.browser import Page
 from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.scenes.road_blocks import write_blocks
-from helpers.viewing import write_page
 
 from carlasc.core.grids import GridSpec
+from carlasc.viewing import Scene, view
 
 
 @pytest.fixture(scope="module")
 def page_file(blocks, tmp_path_factory):
-    return write_page(blocks, tmp_path_factory.mktemp("page") / "scene.html").out
+    return view(blocks, tmp_path_factory.mktemp("page") / "scene.html").out
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_left_ahead_and_up_are_where_they_should_be(page):
 @pytest.mark.slow
 def test_data_with_y_on_the_left_is_drawn_so(browser, tmp_path):
     folder = write_blocks(tmp_path / "kitti" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
-    page = Page(browser, write_page(folder, tmp_path / "scene.html").out)
+    page = Page(browser, view(folder, tmp_path / "scene.html").out)
     canvas = page.canvas()
     assert middle_of(red_pixels(canvas))[0] < canvas.shape[1] / 2 - 30
     assert middle_of(blue_pixels(canvas))[0] > canvas.shape[1] / 2 + 30
@@ -154,7 +154,7 @@ def test_colours_can_show_height_or_votes(page, mode):
 @pytest.mark.slow
 def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browser, blocks, tmp_path):
     prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
-    result = write_page(prediction, tmp_path / "scene.html", truth=blocks)
+    result = view(Scene(prediction, truth=blocks), tmp_path / "scene.html")
     assert result.panels == ("prediction", "truth", "errors")
     page = Page(browser, result.out, (1200, 640))
     canvas = page.canvas("page_compared")
@@ -182,7 +182,7 @@ def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browse
 def test_wedges_of_a_cylindrical_grid_are_at_their_positions(browser, tmp_path):
     spec = GridSpec.published("cylindrical").with_size((64, 64, 4))
     folder = write_blocks(tmp_path / "Town01_Light" / "cylindrical", frames=1, spec=spec)
-    page = Page(browser, write_page(folder, tmp_path / "scene.html").out)
+    page = Page(browser, view(folder, tmp_path / "scene.html").out)
     page.click("#view-top")
     canvas = page.canvas("page_cylindrical")
     column, row = middle_of(red_pixels(canvas))
@@ -200,7 +200,7 @@ def test_points_alone_are_drawn(browser, tmp_path):
     writer = FolderSink(tmp_path).sequence("scan")
     cloud = np.random.default_rng(0).normal(0, (9, 9, 1, 0), (5000, 4)).astype(np.float32)
     writer.write("points", 0, cloud)
-    page = Page(browser, write_page(tmp_path / "scan", tmp_path / "scene.html").out)
+    page = Page(browser, view(tmp_path / "scan", tmp_path / "scene.html").out)
     assert len(np.unique(page.canvas("page_scan").reshape(-1, 3), axis=0)) > 3
     assert page.complaints() == []
 
@@ -209,7 +209,7 @@ def test_points_alone_are_drawn(browser, tmp_path):
 @pytest.mark.parametrize("size", [(1280, 800), (500, 900)])
 @pytest.mark.parametrize("compared", [False, True])
 def test_nothing_overlaps_and_nothing_is_cut_off(browser, blocks, tmp_path, size, compared):
-    result = write_page(blocks, tmp_path / "scene.html", truth=blocks if compared else None, frames=(0, 1))
+    result = view(Scene(blocks, truth=blocks if compared else None, frames=(0, 1)), tmp_path / "scene.html")
     page = Page(browser, result.out, size)
     page.picture(f"page_{size[0]}x{size[1]}{'_compared' if compared else ''}")
     found = page.run(

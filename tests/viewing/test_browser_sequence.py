@@ -7,7 +7,8 @@ import pytest
 from helpers.displays.browser import Page, serve_folder
 from helpers.readers.pixels import middle_of, red_pixels
 from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
-from helpers.viewing import write_page
+
+from carlasc.viewing import Scene, view
 
 pytestmark = pytest.mark.slow
 FRAMES = 12
@@ -67,14 +68,14 @@ def worse(drive, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drive_page(drive, tmp_path_factory):
-    return write_page(drive, tmp_path_factory.mktemp("page") / "scene.html").out
+    return view(drive, tmp_path_factory.mktemp("page") / "scene.html").out
 
 
 @pytest.fixture(scope="module")
 def compared(drive, worse, tmp_path_factory):
     shifted = write_blocks(tmp_path_factory.mktemp("shifted") / "Town01_Light" / "cartesian", FRAMES, shift=6.0)
     out = tmp_path_factory.mktemp("page") / "scene.html"
-    return write_page(worse, out, beside=shifted, truth=drive).out
+    return view(Scene(worse, truth=drive), out, beside=shifted).out
 
 
 def test_the_path_turns_to_the_side_to_which_the_vehicle_turns(browser, drive_page):
@@ -98,7 +99,7 @@ def test_the_path_turns_to_the_side_to_which_the_vehicle_turns(browser, drive_pa
 def test_data_with_y_on_the_left_have_a_path_that_turns_to_the_left(browser, tmp_path):
     folder = write_blocks(tmp_path / "Town01_Light" / "cartesian", FRAMES, metadata={"axes": "right"})
     add_poses(folder, list(np.radians(15) * np.arange(FRAMES)), step_m=4.0)
-    page = Page(browser, write_page(folder, tmp_path / "a.html").out)
+    page = Page(browser, view(folder, tmp_path / "a.html").out)
     page.click("#view-top")
     page.run("carlasc.panels.zoom(1.2)")
     columns = np.nonzero(path_pixels(page.canvas()))[1]
@@ -136,7 +137,7 @@ def test_while_it_follows_the_world_keeps_its_direction(browser, drive_page):
 
 
 def test_a_folder_is_read_frame_by_frame_and_few_are_kept(browser, drive, tmp_path):
-    out = write_page(drive, tmp_path / "page").out
+    out = view(drive, tmp_path / "page").out
     with serve_folder(out) as address:
         page = Page(browser, address)
         fetched = "return performance.getEntriesByType('resource').map((entry) => entry.name.split('/').pop())"
@@ -151,7 +152,7 @@ def test_a_folder_is_read_frame_by_frame_and_few_are_kept(browser, drive, tmp_pa
 
 
 def test_a_frame_that_the_server_lacks_is_said_and_the_page_goes_on(browser, drive, tmp_path):
-    out = write_page(drive, tmp_path / "page").out
+    out = view(drive, tmp_path / "page").out
     (out / "frames/000006.bin").unlink()
     with serve_folder(out) as address:
         page = Page(browser, address)
@@ -163,13 +164,13 @@ def test_a_frame_that_the_server_lacks_is_said_and_the_page_goes_on(browser, dri
 
 
 def test_a_folder_that_is_opened_from_the_disk_says_what_to_do(browser, drive, tmp_path):
-    page = Page(browser, write_page(drive, tmp_path / "page", frames=(0, 2)).out / "index.html")
+    page = Page(browser, view(Scene(drive, frames=(0, 2)), tmp_path / "page").out / "index.html")
     assert "python -m http.server" in page.text("#message")
 
 
 def test_the_divider_is_between_the_runs_and_moves_with_the_keyboard(browser, drive, tmp_path):
     shifted = write_blocks(tmp_path / "shifted" / "Town01_Light" / "cartesian", 2, shift=6.0, points=False)
-    page = Page(browser, write_page(drive, tmp_path / "a.html", beside=shifted).out)
+    page = Page(browser, view(drive, tmp_path / "a.html", beside=shifted).out)
     middle = page.canvas("page_divided")
     press(page, ".divider", KEY["end"])  # all of it shows the first run
     first = page.canvas()
@@ -257,7 +258,7 @@ def test_colours_show_the_evidence(browser, drive_page):
 
 
 def test_modes_without_data_are_not_offered(browser, blocks, tmp_path):
-    page = Page(browser, write_page(blocks, tmp_path / "a.html").out)
+    page = Page(browser, view(blocks, tmp_path / "a.html").out)
     assert page.text("#color-by").split() == ["class", "height", "votes"]
     assert not page.browser.find_element("css selector", "#follow").is_displayed()
     assert page.browser.find_elements("css selector", "[data-layer='path']") == []

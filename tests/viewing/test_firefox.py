@@ -7,7 +7,8 @@ from helpers.displays.firefox import start_firefox
 from helpers.displays.virtual_screen import virtual_screen
 from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
 from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
-from helpers.viewing import write_page
+
+from carlasc.viewing import Scene, view
 
 pytestmark = pytest.mark.slow
 READY = (
@@ -47,7 +48,7 @@ def check_picture(firefox, name):
 
 
 def test_a_page_in_one_file_is_drawn(firefox, drive, tmp_path):
-    firefox.open(write_page(drive, tmp_path / "a.html").out.absolute().as_uri(), (1000, 700))
+    firefox.open(view(drive, tmp_path / "a.html").out.absolute().as_uri(), (1000, 700))
     check_picture(firefox, "page_firefox")
     assert firefox.run("return carlasc.panels.renderer.getContext() instanceof WebGL2RenderingContext") is True
     assert firefox.run("return performance.getEntriesByType('resource').length") == 0
@@ -55,7 +56,7 @@ def test_a_page_in_one_file_is_drawn(firefox, drive, tmp_path):
 
 def test_a_folder_is_drawn_from_a_web_server(firefox, drive, tmp_path):
     shifted = write_blocks(tmp_path / "b" / "Town01_Light" / "cartesian", points=False)
-    result = write_page(shifted, tmp_path / "page", truth=drive, beside=drive)
+    result = view(Scene(shifted, truth=drive), tmp_path / "page", beside=drive)
     with serve_folder(result.out) as address:
         firefox.open(address, (1200, 760))
         assert firefox.run(READY) == ""

@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 from helpers.scenes.road_blocks import write_blocks
-from helpers.viewing import write_page
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.storage import open as open_source
+from carlasc.viewing import Scene, view
 from carlasc.viewing.page.coding import unpack_arrays
 
 
@@ -22,7 +22,7 @@ def read_page(path):
 
 
 def test_a_page_holds_the_grids_as_they_are(golden_capture, tmp_path):
-    result = write_page(golden_capture / "cartesian", tmp_path / "scene.html")
+    result = view(golden_capture / "cartesian", tmp_path / "scene.html")
     _, scene, frames = read_page(result.out)
     (sequence,) = open_source(golden_capture / "cartesian").sequences().values()
     assert scene["frames"] == [0, 1, 2] == list(result.frames)
@@ -38,7 +38,7 @@ def test_a_page_holds_the_grids_as_they_are(golden_capture, tmp_path):
 
 def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
     prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0)
-    _, scene, frames = read_page(write_page(prediction, tmp_path / "a.html", truth=blocks).out)
+    _, scene, frames = read_page(view(Scene(prediction, truth=blocks), tmp_path / "a.html").out)
     assert scene["leftHanded"] is True
     assert scene["tables"]["carla"][4] == ["Pedestrian", "#dc143c"]
     assert scene["tables"]["errors"][1:] == [
@@ -58,12 +58,12 @@ def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
 
 def test_data_with_y_on_the_left_say_so_in_the_page(tmp_path):
     folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
-    _, scene, _ = read_page(write_page(folder, tmp_path / "scene.html").out)
+    _, scene, _ = read_page(view(folder, tmp_path / "scene.html").out)
     assert (scene["leftHanded"], scene["hasPoints"], scene["hasFlow"]) == (False, False, False)
 
 
 def test_a_page_loads_nothing_from_a_network(golden_capture, tmp_path):
-    text, _, _ = read_page(write_page(golden_capture / "cartesian", tmp_path / "scene.html", frames=(0, 1)).out)
+    text, _, _ = read_page(view(Scene(golden_capture / "cartesian", frames=(0, 1)), tmp_path / "scene.html").out)
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=[\"'](?!data:)", text)
     assert "default-src 'none'" in text
     assert "Permission is hereby granted" in text  # three.js's licence goes with it
@@ -72,7 +72,7 @@ def test_a_page_loads_nothing_from_a_network(golden_capture, tmp_path):
 
 def test_a_name_cannot_break_the_page(tmp_path):
     folder = write_blocks(tmp_path / "a<script>alert(1)<b" / "cartesian", frames=1, points=False)
-    text, scene, _ = read_page(write_page(folder, tmp_path / "scene.html").out)
+    text, scene, _ = read_page(view(folder, tmp_path / "scene.html").out)
     assert scene["name"] == "a<script>alert(1)<b"
     assert "<script>alert" not in text
 
@@ -82,28 +82,28 @@ def test_a_page_shows_the_first_sixty_frames_unless_a_range_is_given(tmp_path):
     for frame in range(1, 65):
         for kind in ("label", "bin"):
             (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(folder / "evaluation" / f"000000.{kind}")
-    result = write_page(folder, tmp_path / "a.html")
+    result = view(folder, tmp_path / "a.html")
     assert result.frames == tuple(range(60)) and result.notes == ("65 frames found, showing the first 60",)
-    ranged = write_page(folder, tmp_path / "b.html", frames=(1, 65))
+    ranged = view(Scene(folder, frames=(1, 65)), tmp_path / "b.html")
     assert ranged.frames == tuple(range(1, 65)) and ranged.notes == ()
 
 
 def test_what_cannot_be_written_is_refused(blocks, tmp_path):
     with pytest.raises(MissingDataError, match="expected frames 7:9, found 0 to 2"):
-        write_page(blocks, tmp_path / "a.html", frames=(7, 9))
+        view(Scene(blocks, frames=(7, 9)), tmp_path / "a.html")
     with pytest.raises(ArgumentError, match=r"\.html"):
-        write_page(blocks, tmp_path / "a.pdf")
+        view(blocks, tmp_path / "a.pdf")
     with pytest.raises(ArgumentError, match="every"):
-        write_page(blocks, tmp_path / "a.html", every=0)
+        view(Scene(blocks, every=0), tmp_path / "a.html")
     with pytest.raises(ArgumentError, match="palette: expected class or colorblind"):
-        write_page(blocks, tmp_path / "a.html", palette="height")
+        view(Scene(blocks, palette="height"), tmp_path / "a.html")
     for thin_m in (0, 11):
         with pytest.raises(ArgumentError, match="thin_m: expected 0.01 to 10 metres"):
-            write_page(blocks, tmp_path / "a.html", thin_m=thin_m)
+            view(blocks, tmp_path / "a.html", thin_m=thin_m)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.html").write_text("mine")
     with pytest.raises(ConflictError, match="overwrite=True"):
-        write_page(blocks, tmp_path / "a.html")
+        view(blocks, tmp_path / "a.html")
 
 
 def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
@@ -131,7 +131,7 @@ def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     writer.write("points", 0, np.column_stack([points, np.zeros(len(points), np.float32)]))
     writer.write("labels", 0, labels.astype(np.uint32))
     assert len(points) > 90_000 and (grid > 0).sum() > 15_000
-    result = write_page(tmp_path / "cartesian", tmp_path / "scene.html")
+    result = view(tmp_path / "cartesian", tmp_path / "scene.html")
     text, _, _ = read_page(result.out)
     frame = len(re.search(r'id="frame0">(.*?)</script>', text)[1])
     assert result.size_bytes + 59 * frame < 15e6

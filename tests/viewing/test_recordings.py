@@ -18,13 +18,12 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, DependencyError, StorageError
-from carlasc.metrics import Outcome
+from carlasc.metrics import VoxelOutcome
 from carlasc.storage import FolderSink, layout
 from carlasc.viewing import Scene, ViewResult, view
 from carlasc.viewing.colors import ERRORS, PATH, UNLABELLED
-from carlasc.viewing.recordings.content import record_frames, thin_scan
-from carlasc.viewing.recordings.run import RECORDINGS
-from carlasc.viewing.recordings.wedges import class_surfaces
+from carlasc.viewing.recordings.content import class_surfaces, record_frames, thin_scan
+from carlasc.viewing.recordings.recording import RECORDINGS
 from carlasc.viewing.rendering.meshes import grid_mesh
 
 pytestmark = pytest.mark.needs("rerun", "foxglove")
@@ -256,7 +255,7 @@ def test_a_prediction_is_beside_its_truth_and_its_errors(blocks, tmp_path):
         np.testing.assert_array_equal(cells["label"], grid.labels)
         shown = grid.labels > 0
         np.testing.assert_array_equal(cells["rgba"][shown][:, :3], table.palette[grid.labels[shown]])
-    assert {Outcome.MISSED, Outcome.INVENTED} <= set(np.unique(content.grids[2].labels))
+    assert {VoxelOutcome.MISSED, VoxelOutcome.INVENTED} <= set(np.unique(content.grids[2].labels))
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +333,7 @@ def test_thinning_keeps_an_even_share_and_always_the_same_points(count):
 @pytest.mark.parametrize("ending", RECORDINGS)
 def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_first(ending, tmp_path, monkeypatch):
     folder = write_blocks(tmp_path / "cartesian", frames=6)
-    monkeypatch.setattr("carlasc.viewing.recordings.run.MAX_POINTS", 1000)
+    monkeypatch.setattr("carlasc.viewing.recordings.recording.MAX_POINTS", 1000)
     said = []
     thin = view(folder, tmp_path / f"thin{ending}", report=said.append)
     assert said == []
@@ -359,7 +358,7 @@ def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_fir
 
 @pytest.mark.parametrize("ending", RECORDINGS)
 def test_the_size_is_estimated_within_a_few_percent(ending, tmp_path):
-    from carlasc.viewing.recordings.run import estimate_size
+    from carlasc.viewing.recordings.recording import estimate_size
 
     folder = write_blocks(tmp_path / "cartesian", frames=12)
     result = view(folder, tmp_path / f"a{ending}", full_points=True)

@@ -13,7 +13,7 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.metrics import Outcome
+from carlasc.metrics import VoxelOutcome
 from carlasc.storage import FolderSink
 from carlasc.viewing import Scene
 from carlasc.viewing.colors import ERRORS
@@ -112,7 +112,7 @@ def test_a_prediction_beside_the_data_brings_points_and_truth_to_its_classes(pre
     reader = Scene(predicted, grid="completion", truth=predicted).open()
     content = reader.read(0)
     assert reader.table == CARLASC11
-    assert set(np.unique(content.grids[2].labels)) == {Outcome.NOT_COMPARED, Outcome.RIGHT}
+    assert set(np.unique(content.grids[2].labels)) == {VoxelOutcome.NOT_COMPARED, VoxelOutcome.RIGHT}
     assert set(np.unique(content.scan.labels)) == {4, CARLASC11.id_of("Road")}  # stored as CARLA's 4 and 7
     assert Scene(predicted).open().table == CARLA
 
@@ -121,8 +121,8 @@ def test_errors_have_the_counts_of_the_truth(blocks, tmp_path):
     prediction = write_blocks(tmp_path / "Town01_Light" / "cartesian", shift=3.0, points=False)
     own, truth, errors = Scene(prediction, truth=blocks).open().read(0).grids
     assert errors.counts is truth.counts
-    assert (errors.labels[(own.labels == 4) & (truth.labels == 0) & truth.known] == Outcome.INVENTED).all()
-    assert (errors.labels[(own.labels == 0) & (truth.labels == 4)] == Outcome.MISSED).all()
+    assert (errors.labels[(own.labels == 4) & (truth.labels == 0) & truth.known] == VoxelOutcome.INVENTED).all()
+    assert (errors.labels[(own.labels == 0) & (truth.labels == 4)] == VoxelOutcome.MISSED).all()
 
 
 def test_classes_may_be_chosen_and_those_of_the_source_told(blocks, tmp_path):

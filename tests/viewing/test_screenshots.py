@@ -8,7 +8,6 @@ import pytest
 from helpers.displays.browser import OUTPUT, Page
 from helpers.displays.virtual_screen import virtual_screen
 from helpers.readers.pixels import has_color
-from helpers.viewing import write_page
 
 from carlasc import Run, regrid, simulate
 from carlasc.captures import Lidar
@@ -16,6 +15,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError
 from carlasc.groundtruth import FromScans, Voting
+from carlasc.viewing import Scene, view
 from carlasc.viewing.window.libraries import import_open3d
 
 pytestmark = pytest.mark.slow
@@ -31,7 +31,7 @@ def street(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_page_of_a_street(browser, street, tmp_path):
-    page = Page(browser, write_page(street, tmp_path / "scene.html").out, (1280, 860))
+    page = Page(browser, view(street, tmp_path / "scene.html").out, (1280, 860))
     page.run("carlasc.panels.setShadows(true)")
     canvas = page.canvas("docs_page")
     for name in ("Road", "Sidewalk", "Vehicle"):  # open, level faces in the sun have the legend's colours
@@ -64,7 +64,7 @@ def drive(tmp_path_factory):
 @pytest.mark.slow
 def test_the_page_of_two_runs(browser, drive, tmp_path):
     truth = drive / "evaluation"
-    result = write_page(drive, tmp_path / "scene.html", grid="tube", beside_grid="align", truth=truth)
+    result = view(Scene(drive, grid="tube", truth=truth), tmp_path / "scene.html", beside_grid="align")
     page = Page(browser, result.out, (1280, 860))
     page.run("carlasc.panels.setShadows(true)")
     page.click("[data-panel='truth']")

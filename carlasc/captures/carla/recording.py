@@ -1,4 +1,4 @@
-"""`record`: a drive on a CARLA server, written as a raw capture (see the format page, `docs/format.md#raw-capture`)."""
+"""`record`: a drive on a CARLA server among spawned traffic, written as a raw capture (see the format page, `docs/format.md#raw-capture`)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ import numpy as np
 
 from carlasc.captures.carla.sensors import ActorNumbers, SensorRig
 from carlasc.captures.carla.server import Server
-from carlasc.captures.carla.traffic import spawn_actors
-from carlasc.captures.lidar import Lidar, sensor_offsets
-from carlasc.captures.raw import Capture, Recording
-from carlasc.captures.settings import TRAFFIC, TrafficLevel, check_at_least, check_traffic
+from carlasc.captures.raw import Capture, SensorRecording
+from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, check_traffic, sensor_offsets
 from carlasc.captures.writing import CaptureWriter, TimesLog
-from carlasc.errors import ConflictError, import_extra
+from carlasc.errors import ConflictError, MissingDataError, import_extra
 
 SETTINGS_FILE = "recording.json"
 _REPLAY_TOLERANCE_M = 0.02  # greatest distance of the ego sensor in a replay from where it was recorded
@@ -47,7 +45,7 @@ class RecordResult:
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _ServerSettings:
     """The settings of a capture, as recording.json holds them."""
 
     town: str
@@ -117,7 +115,7 @@ def record(
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0
     with Server(host, port, timeout_s, carla) as server:
-        settings = _Settings(town, traffic, sensors, seed, bev, server.version, lidar or Lidar())
+        settings = _ServerSettings(town, traffic, sensors, seed, bev, server.version, lidar or Lidar())
         writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc capture")
         complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev)}
         missing = set(range(count)) - (complete & writer.timed_frames(sensors))
@@ -147,7 +145,7 @@ def record(
     return RecordResult(writer.out, count, written, sensors, len(actors.vehicles), len(actors.walkers), server.version)
 
 
-def _write_frame(writer: CaptureWriter, frame: int, recordings: list[Recording], picture: bytes | None) -> None:
+def _write_frame(writer: CaptureWriter, frame: int, recordings: list[SensorRecording], picture: bytes | None) -> None:
     """Write a frame without its times."""
     for sensor, recording in enumerate(recordings):
         writer.write(sensor, frame, recording)
@@ -155,7 +153,7 @@ def _write_frame(writer: CaptureWriter, frame: int, recordings: list[Recording],
         writer.write_bev(frame, picture)
 
 
-def _check_replay(writer: CaptureWriter, frame: int, replayed: Recording) -> None:
+def _check_replay(writer: CaptureWriter, frame: int, replayed: SensorRecording) -> None:
     """Raise ConflictError where the ego sensor is not where it was when the frame was recorded."""
     recorded = Capture(writer.target.tree).read_pose(0, frame)
     distance_m = float(np.linalg.norm(recorded[:3, 3] - replayed.world_T_sensor[:3, 3]))
@@ -166,3 +164,96 @@ def _check_replay(writer: CaptureWriter, frame: int, replayed: Recording) -> Non
             found=f"the ego sensor {distance_m:.2f} m away from it",
             advice="the server's physics differ between runs: record to another folder",
         )
+
+
+EGO_BLUEPRINTS = ("vehicle.tesla.model3", "vehicle.lincoln.mkz_2017", "vehicle.lincoln.mkz_2020")
+WALKING_MPS = 1.4  # mean speed of the pedestrians
+_ATTEMPTS = 4  # positions that are tried per pedestrian: many are occupied or cannot be reached
+
+
+@dataclass(frozen=True)
+class SpawnedActors:
+    """CARLA's actors that move.
+
+    Attributes:
+        ego: the vehicle with the sensors.
+        vehicles: the other vehicles.
+        walkers: the pedestrians.
+    """
+
+    ego: Any
+    vehicles: tuple[Any, ...]
+    walkers: tuple[Any, ...]
+
+
+def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generator) -> SpawnedActors:
+    """Spawn the ego vehicle, other vehicles and pedestrians.
+
+    Args:
+        server: the server, with its town loaded.
+        number: number of other vehicles, and of pedestrians. Fewer are spawned where there is no room for more.
+        port: port of the traffic manager.
+        rng: source of the random numbers.
+
+    Raises:
+        MissingDataError: the town has no vehicles, or no room for the ego vehicle.
+        ServerError: the server does not answer.
+    """
+    spawn_points = server.spawn_points()
+    free = [spawn_points[i] for i in rng.permutation(len(spawn_points))]
+    blueprints = server.blueprints("vehicle.*")
+    by_name = {str(blueprint.id): blueprint for blueprint in blueprints}
+    ego_blueprints = [by_name[name] for name in EGO_BLUEPRINTS if name in by_name] or blueprints
+    if not ego_blueprints or not free:
+        raise MissingDataError(
+            server.where, expected="vehicles and places for them", found="none", advice="try another `town`"
+        )
+
+    ego = None
+    while ego is None and free:
+        ego = _spawn_vehicle(server, ego_blueprints[0], free.pop(), "hero", port)
+    vehicles: list[Any] = []
+    while free and len(vehicles) < number:
+        vehicle = _spawn_vehicle(server, blueprints[rng.integers(len(blueprints))], free.pop(), "autopilot", port)
+        vehicles += [] if vehicle is None else [vehicle]
+    if ego is None:
+        raise MissingDataError(server.where, expected="a free place for the ego vehicle", found="none")
+    return SpawnedActors(ego, tuple(vehicles), tuple(_spawn_walkers(server, number, rng)))
+
+
+def _spawn_vehicle(server: Server, blueprint: Any, transform: Any, role: str, port: int) -> Any | None:
+    """Spawn a vehicle on autopilot. Return None where there is no room for it."""
+    if blueprint.has_attribute("role_name"):
+        blueprint.set_attribute("role_name", role)
+    vehicle = server.spawn(blueprint, transform)
+    if vehicle is not None:
+        vehicle.set_autopilot(True, port)
+    return vehicle
+
+
+def _spawn_walkers(server: Server, number: int, rng: np.random.Generator) -> list[Any]:
+    """Spawn pedestrians, each with a controller that walks it to a random destination."""
+    blueprints = server.blueprints("walker.pedestrian.*")
+    controller_blueprints = server.blueprints("controller.ai.walker")
+    walkers: list[Any] = []
+    controllers: list[Any] = []
+    for _ in range(_ATTEMPTS * number if blueprints and controller_blueprints else 0):
+        if len(walkers) == number:
+            break
+        start = server.random_sidewalk_location()
+        walker = None
+        if start is not None:
+            walker = server.spawn(blueprints[rng.integers(len(blueprints))], server.transform_at(start))
+        if walker is None:
+            continue
+        walkers.append(walker)
+        controller = server.spawn(controller_blueprints[0], server.transform(), parent=walker, before_destroy="stop")
+        controllers += [] if controller is None else [controller]
+    server.tick()  # a controller can be started only after the world's first tick with it
+    for controller in controllers:
+        controller.start()
+        destination = server.random_sidewalk_location()
+        if destination is not None:
+            controller.go_to_location(destination)
+        controller.set_max_speed(float(np.clip(rng.normal(WALKING_MPS, 0.2), 0.8, 2.2)))
+    return walkers

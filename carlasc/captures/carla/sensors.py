@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.carla.server import SemanticSweep, Server, decode_sweep
-from carlasc.captures.lidar import Lidar
-from carlasc.captures.raw import Recording
-from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE
+from carlasc.captures.raw import SensorRecording
+from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar
 from carlasc.core.geometry import invert, rotate_vectors
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA, REMAPS
@@ -69,7 +68,7 @@ class SensorRig:
 
     def measure(
         self, tick: int, frame: int, numbers: ActorNumbers
-    ) -> tuple[list[Recording], list[float], bytes | None]:
+    ) -> tuple[list[SensorRecording], list[float], bytes | None]:
         """Collect the measurements of a tick.
 
         Args:
@@ -112,7 +111,7 @@ class SensorRig:
             raise MissingDataError(self._server.where, expected=f"room for {name}", found="none")
         return self._server.listen(sensor)
 
-    def _to_recording(self, sweep: SemanticSweep, numbers: ActorNumbers, rng: np.random.Generator) -> Recording:
+    def _to_recording(self, sweep: SemanticSweep, numbers: ActorNumbers, rng: np.random.Generator) -> SensorRecording:
         """Remove the points on the ego vehicle, add noise, and convert class ids and actor ids."""
         seen = sweep.detections[sweep.detections["actor"] != self._ego_id]
         points = np.stack([seen["x"], seen["y"], seen["z"]], axis=1)
@@ -127,7 +126,7 @@ class SensorRig:
         actors = np.unique(seen["actor"][seen["actor"] > 0])
         velocities = rotate_vectors(invert(sweep.world_T_sensor), self._server.velocities(actors))
         rows = np.column_stack([numbers.of(actors).astype(np.float64), velocities])
-        return Recording(Scan(points, labels, instances=numbers.of(seen["actor"])), sweep.world_T_sensor, rows)
+        return SensorRecording(Scan(points, labels, instances=numbers.of(seen["actor"])), sweep.world_T_sensor, rows)
 
 
 class ActorNumbers:

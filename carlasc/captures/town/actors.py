@@ -1,4 +1,7 @@
-"""The actors of the town in any frame: moving and parked vehicles, and pedestrians, each with its pose, velocity and shape."""
+"""The actors of the town in any frame: moving and parked vehicles, and pedestrians, each with its pose, velocity and shape.
+
+Pedestrians walk around blocks, or stand on the sidewalk.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.settings import TRAFFIC, TrafficLevel, check_traffic
-from carlasc.captures.town.meshes import Mesh
+from carlasc.captures.town.meshes import Mesh, close_loop
 from carlasc.captures.town.plan import KERB_M
 from carlasc.captures.town.shapes import (
     EGO_KIND,
@@ -19,11 +22,68 @@ from carlasc.captures.town.shapes import (
     pedestrian_mesh,
     vehicle_mesh,
 )
+from carlasc.captures.town.streets import HALF_ROAD_M, CityBlock
 from carlasc.captures.town.town import Town
 from carlasc.captures.town.traffic import Traffic, place_vehicles
-from carlasc.captures.town.walks import Walk, draw_walks
-from carlasc.core.geometry import Transform
+from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
+
+_OFFSETS_M = (1.1, 1.75, 2.3)
+"""Distance from the kerb of those who walk along the loop, of those who walk against it, and of those who stand."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """The walk of a pedestrian around a block.
+
+    Attributes:
+        loop: (P, 2) closed path, metres. The first point is repeated at the end.
+        start_m: distance along the loop at time 0.
+        speed_mps: speed along the loop. It is negative for those who walk against it, and 0 for those who stand.
+        heading_rad: heading of a pedestrian who stands.
+    """
+
+    loop: NDArray[np.float64]
+    start_m: float
+    speed_mps: float
+    heading_rad: float = 0.0
+
+    def pose(self, elapsed_s: float, height_m: float) -> Transform:
+        """Return (4, 4) world_T_pedestrian at a time. The feet are at a height."""
+        stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.loop, axis=0), axis=1))])
+        along = (self.start_m + self.speed_mps * elapsed_s) % stations[-1]
+        point = [np.interp(along, stations, self.loop[:, axis]) for axis in (0, 1)]
+        heading = self.heading_rad
+        if self.speed_mps:
+            step = min(int(np.searchsorted(stations, along, side="right")), len(stations) - 1)
+            ahead = (self.loop[step] - self.loop[step - 1]) * np.sign(self.speed_mps)
+            heading = float(np.arctan2(ahead[1], ahead[0]))
+        return translation((*point, height_m)) @ rotation_z(heading)
+
+
+def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: int) -> list[Walk]:
+    """Draw pedestrians: a third walk around a block in each direction, and a third stand.
+
+    Pedestrians of one block and direction have the same speed and distance from the kerb, so they do not meet.
+    """
+    speeds = rng.uniform(1.0, 1.8, (len(blocks), 2))
+    walks: list[Walk] = []
+    occupied: dict[tuple[int, int], list[float]] = {}
+    while len(walks) < count:
+        number, direction = int(rng.integers(len(blocks))), int(rng.integers(3))
+        loop = close_loop(blocks[number].outline.at(HALF_ROAD_M + _OFFSETS_M[direction]))
+        length = float(np.linalg.norm(np.diff(loop, axis=0), axis=1).sum())
+        start = float(rng.uniform(0, length))
+        if any(
+            min(abs(start - other), length - abs(start - other)) < 1.0
+            for other in occupied.get((number, direction), [])
+        ):
+            continue
+        occupied.setdefault((number, direction), []).append(start)
+        speed = float(speeds[number, direction]) * (1, -1)[direction] if direction < 2 else 0.0
+        walks.append(Walk(loop, start, speed, float(rng.uniform(-np.pi, np.pi))))
+    return walks
+
 
 EGO_ID = 1
 OCCUPIED_SHARE = 0.4  # share of the parking spaces that hold a vehicle
@@ -35,7 +95,7 @@ WHEELBASE = 0.7  # relative to the length of the vehicle
 
 
 @dataclass(frozen=True)
-class Actor:
+class TownActor:
     """A vehicle or a pedestrian at one instant.
 
     Attributes:
@@ -82,11 +142,11 @@ class Population:
         along, _ = self._traffic.at(frame)
         return self._traffic.pose(0, float(along[0]), self._wheelbases[0])
 
-    def at(self, frame: int) -> list[Actor]:
+    def at(self, frame: int) -> list[TownActor]:
         """Return all actors in a frame, the ego vehicle first."""
         return [*self._vehicles(frame), *self._pedestrians(frame), *self._parked]
 
-    def _vehicles(self, frame: int) -> list[Actor]:
+    def _vehicles(self, frame: int) -> list[TownActor]:
         along, speed = self._traffic.at(frame)
         actors = []
         for index, mesh in enumerate(self._shapes):
@@ -94,10 +154,10 @@ class Population:
             step_m = 0.01  # the velocity of the vehicle's middle is a finite difference along its route
             ahead = self._traffic.pose(index, float(along[index]) + step_m, self._wheelbases[index])
             velocity = (ahead[:3, 3] - pose[:3, 3]) / step_m * speed[index]
-            actors.append(Actor(EGO_ID + index, pose, velocity, mesh))
+            actors.append(TownActor(EGO_ID + index, pose, velocity, mesh))
         return actors
 
-    def _pedestrians(self, frame: int) -> list[Actor]:
+    def _pedestrians(self, frame: int) -> list[TownActor]:
         elapsed_s = frame * FRAME_PERIOD_S
         first = EGO_ID + len(self._shapes)
         return [
@@ -106,11 +166,11 @@ class Population:
         ]
 
 
-def _pedestrian(id: int, walk: Walk, elapsed_s: float, height_m: float) -> Actor:
+def _pedestrian(id: int, walk: Walk, elapsed_s: float, height_m: float) -> TownActor:
     pose = walk.pose(elapsed_s, KERB_M)
     cycle = (walk.start_m + abs(walk.speed_mps) * elapsed_s) / STRIDE_M
     phase = int(cycle * GAIT_PHASES) % GAIT_PHASES if walk.speed_mps else -1
-    return Actor(id, pose, abs(walk.speed_mps) * pose[:3, 0], pedestrian_mesh(round(height_m, 1), phase))
+    return TownActor(id, pose, abs(walk.speed_mps) * pose[:3, 0], pedestrian_mesh(round(height_m, 1), phase))
 
 
 def _draw_vehicles(rng: np.random.Generator, count: int) -> tuple[list[Mesh], list[float]]:
@@ -140,11 +200,11 @@ def _draw_ego_start(rng: np.random.Generator, town: Town) -> tuple[int, float]:
     return index, lane.length_m * float(rng.uniform(0.15, 0.35))
 
 
-def _draw_parked_vehicles(rng: np.random.Generator, town: Town, first_id: int) -> list[Actor]:
+def _draw_parked_vehicles(rng: np.random.Generator, town: Town, first_id: int) -> list[TownActor]:
     short = tuple(kind for kind in VEHICLE_KINDS if kind.length_m < LONGEST_PARKED_M)
-    parked: list[Actor] = []
+    parked: list[TownActor] = []
     for world_T_space in town.parking:
         if rng.random() < OCCUPIED_SHARE:
             mesh = vehicle_mesh(_draw_kind(rng, short))
-            parked.append(Actor(first_id + len(parked), world_T_space, np.zeros(3), mesh))
+            parked.append(TownActor(first_id + len(parked), world_T_space, np.zeros(3), mesh))
     return parked

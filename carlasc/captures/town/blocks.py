@@ -1,25 +1,103 @@
-"""The contents of a block: downtown buildings, houses with gardens, a park or a square."""
+"""The surfaces of the town, and the contents of a block: downtown buildings, houses with gardens, a park or a square."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.captures.town import furniture, plants
-from carlasc.captures.town.meshes import Mesh, at_height
-from carlasc.captures.town.paving import GROUND, ROAD_LINE, TERRAIN, WATER, lay_ground, lay_sidewalk
-from carlasc.captures.town.plan import INNER_M, KERB_M, PAINT_M, Plan
-from carlasc.captures.town.plots import Land, Rectangle
-from carlasc.captures.town.roadside import add_street_furniture, mark_parking_bay
-from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, Block, Side
+from carlasc.captures.town.buildings import add_building
+from carlasc.captures.town.furniture import add_street_furniture, mark_parking_bay
+from carlasc.captures.town.meshes import Mesh, at_height, close_loop
+from carlasc.captures.town.plan import INNER_M, KERB_M, PAINT_M, Land, Rectangle, TownPlan
+from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, CityBlock, Side, Streets
 from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.tables import CARLA
+
+ROAD, ROAD_LINE, SIDEWALK = (CARLA.id_of(name) for name in ("Road", "RoadLine", "Sidewalk"))
+GROUND, TERRAIN, WATER = (CARLA.id_of(name) for name in ("Ground", "Terrain", "Water"))
+
+
+def pave_roads(plan: TownPlan, streets: Streets) -> None:
+    """Add one level road surface below the whole town. The blocks lie on it."""
+    low, high = streets.nodes.min(axis=0) - 8, streets.nodes.max(axis=0) + 8
+    tile = 12.0  # metres: small triangles make rays exact and the search tree efficient
+    xs, ys = np.arange(low[0], high[0] + tile, tile), np.arange(low[1], high[1] + tile, tile)
+    for x, following in pairwise(xs):
+        plan.builder.ribbon(
+            ROAD, *(at_height(np.column_stack([np.full(len(ys), at), ys]), 0.0) for at in (x, following))
+        )
+
+
+def paint_markings(plan: TownPlan, streets: Streets) -> None:
+    """Add centre lines, edge lines, stop lines and crosswalks."""
+    for block in streets.blocks:
+        for side in block.sides:
+            if -np.pi / 2 < side.yaw_rad <= np.pi / 2:  # only one of a street's two sides adds the centre line
+                if plan.rng.random() < 0.4:
+                    for offset in (-0.12, 0.12):
+                        _paint_line(plan, side, offset, 0.0, side.length_m, dashed=False)
+                else:
+                    _paint_line(plan, side, 0.0, 0.0, side.length_m, dashed=True)
+            _paint_line(plan, side, HALF_ROAD_M - 0.25, 0.0, side.length_m, dashed=side.has_bay)
+            zebra = np.arange(0.4, HALF_ROAD_M, 0.9)
+            bars = np.array([side.point(-2.0 - 0.5, offset) for offset in zebra])
+            plan.builder.level_rectangles(ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad)
+            bars = np.array([side.point(side.length_m + 2.0 + 0.5, offset) for offset in zebra])
+            plan.builder.level_rectangles(ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad)
+            stop = side.point(side.length_m + 0.25, HALF_ROAD_M / 2)
+            plan.builder.level_rectangles(ROAD_LINE, (*stop, PAINT_M), (0.4, HALF_ROAD_M - 0.3), side.yaw_rad)
+
+
+def _paint_line(plan: TownPlan, side: Side, offset: float, start: float, end: float, dashed: bool) -> None:
+    length, gap = (3.0, 4.5) if dashed else (6.0, 0.0)
+    starts = np.arange(start, end - 0.5, length + gap)
+    lengths = np.minimum(length, end - starts)
+    middles = np.array([side.point(at + run / 2, offset) for at, run in zip(starts, lengths, strict=True)])
+    sizes = np.column_stack([lengths, np.full(len(starts), 0.15)])
+    plan.builder.level_rectangles(ROAD_LINE, at_height(middles, PAINT_M), sizes, side.yaw_rad)
+
+
+def lay_sidewalk(plan: TownPlan, block: CityBlock) -> NDArray[np.float64]:
+    """Add the kerb and sidewalk around a block. Return the (K, 2) loop behind the sidewalk."""
+    kerb, inner = close_loop(block.outline.at(HALF_ROAD_M)), block.outline.at(INNER_M)
+    plan.builder.ribbon(SIDEWALK, at_height(kerb, -0.05), at_height(kerb, KERB_M))
+    plan.builder.ribbon(SIDEWALK, at_height(kerb, KERB_M), at_height(close_loop(inner), KERB_M))
+    return inner
+
+
+def lay_ground(plan: TownPlan, loop: NDArray[np.float64], label: int) -> None:
+    """Add the land inside a loop as rings towards its middle. Terrain is slightly uneven.
+
+    Args:
+        plan: the town's plan.
+        loop: (K, 2) boundary, metres.
+        label: class id of the land.
+    """
+    centre, rings = loop.mean(axis=0), 10
+    relief = 0.35 if label == TERRAIN else 0.0
+    phase = plan.rng.uniform(0, 2 * np.pi, 4)
+    previous = at_height(close_loop(loop), KERB_M)
+    for ring in range(1, rings + 1):
+        points = close_loop(centre + (loop - centre) * (1 - ring / rings))
+        x, y = points[:, 0] / 7.0, points[:, 1] / 9.0
+        waves = np.sin(x + phase[0]) * np.sin(y + phase[1]) + 0.4 * np.sin(2.3 * x + phase[2]) * np.sin(
+            1.9 * y + phase[3]
+        )
+        height = KERB_M + relief * float(np.clip((ring - 2) / 4, 0, 1)) * (0.5 + 0.5 * waves)
+        current = at_height(points, height)
+        plan.builder.ribbon(label, previous, current)
+        previous = current
+
 
 BLOCK_USES = ("downtown", "houses", "houses", "park", "square")
 """Uses of a block. Houses are listed twice, so they are twice as frequent."""
 
 
-def fill_block(plan: Plan, block: Block, use: str) -> None:
+def fill_block(plan: TownPlan, block: CityBlock, use: str) -> None:
     """Add the sidewalk and land of a block, and what belongs to its use, one of BLOCK_USES."""
     inner = lay_sidewalk(plan, block)
     land = Land(inner)
@@ -37,7 +115,7 @@ def fill_block(plan: Plan, block: Block, use: str) -> None:
         mark_parking_bay(plan, side)
 
 
-def _add_row_of_buildings(plan: Plan, side: Side, land: Land, downtown: bool) -> None:
+def _add_row_of_buildings(plan: TownPlan, side: Side, land: Land, downtown: bool) -> None:
     """Add buildings along a street: without gaps downtown, with front gardens elsewhere."""
     rng, along = plan.rng, -6.0
     while along < side.length_m + 6:
@@ -49,7 +127,7 @@ def _add_row_of_buildings(plan: Plan, side: Side, land: Land, downtown: bool) ->
         footprint = Rectangle(middle, (width, depth), side.yaw_rad)
         if land.reserve(footprint, margin_m=0.0 if downtown else 2.0, edge_m=0.6):
             height = float(rng.uniform(8, 24) if downtown else rng.uniform(3.2, 7.0))
-            plan.add_building(footprint, height, pitched=not downtown)
+            add_building(plan, footprint, height, pitched=not downtown)
             if not downtown:
                 _add_front_garden(plan, side, land, along, width, back)
             along += width + float(rng.uniform(0.0, 0.4) if downtown else rng.uniform(3.0, 7.0))
@@ -59,7 +137,7 @@ def _add_row_of_buildings(plan: Plan, side: Side, land: Land, downtown: bool) ->
             along += 2.0
 
 
-def _add_front_garden(plan: Plan, side: Side, land: Land, along: float, width: float, back: float) -> None:
+def _add_front_garden(plan: TownPlan, side: Side, land: Land, along: float, width: float, back: float) -> None:
     """Add a fence, wall or hedge along the sidewalk, a driveway beside the house, and up to two bushes."""
     rng = plan.rng
     bay = BAY_M * side.has_bay
@@ -86,7 +164,7 @@ def _add_front_garden(plan: Plan, side: Side, land: Land, along: float, width: f
             plan.add(plan.plants.bush(), position, 0.0)
 
 
-def _add_yard(plan: Plan, block: Block, land: Land, attempts: int) -> None:
+def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> None:
     """Add trees, fences, walls, bushes and trash behind the buildings, each where the land is free."""
     rng = plan.rng
     span = np.ptp(land.boundary, axis=0)
@@ -111,7 +189,7 @@ def _add_yard(plan: Plan, block: Block, land: Land, attempts: int) -> None:
             plan.add(furniture.trash(rng), position, 0.0)
 
 
-def _add_park(plan: Plan, block: Block, land: Land) -> None:
+def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
     """Add a lawn with a pond, benches, bins and many trees, a low wall along one street and a fence along another."""
     rng, centre = plan.rng, land.boundary.mean(axis=0)
     radius = float(rng.uniform(5, 8))
@@ -146,13 +224,13 @@ def _add_park(plan: Plan, block: Block, land: Land) -> None:
             )
 
 
-def _add_square(plan: Plan, block: Block, land: Land) -> None:
+def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
     """Add a paved square: parking spaces, kiosks, planters, bollards along its edge, and one large building."""
     rng, centre = plan.rng, land.boundary.mean(axis=0)
     side = block.sides[int(rng.integers(len(block.sides)))]
     footprint = Rectangle(centre + side.normal * 6, (float(rng.uniform(18, 26)), 13.0), side.yaw_rad)
     if land.reserve(footprint, edge_m=3.0):
-        plan.add_building(footprint, float(rng.uniform(7, 14)), pitched=False)
+        add_building(plan, footprint, float(rng.uniform(7, 14)), pitched=False)
     for edge in block.sides:
         offset = INNER_M + BAY_M * edge.has_bay
         for at in np.arange(2.0, edge.length_m, 3.0):

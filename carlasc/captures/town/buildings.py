@@ -5,12 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from carlasc.captures.town.meshes import Mesh, MeshBuilder
-from carlasc.captures.town.plots import Rectangle
+from carlasc.captures.town.plan import KERB_M, Rectangle, TownPlan
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
 
 BUILDING = CARLA.id_of("Building")
 FOUNDATION_M = 1.0  # depth of the walls below the ground, which is not level
+
+
+def add_building(plan: TownPlan, footprint: Rectangle, height_m: float, pitched: bool, base_m: float = KERB_M) -> None:
+    """Add a building to the plan of a town.
+
+    Args:
+        plan: the town's plan.
+        footprint: the building's ground plan.
+        height_m: height of its walls.
+        pitched: whether its roof is pitched; it is flat otherwise.
+        base_m: z of its ground floor.
+    """
+    mesh, pose = make_building(plan.rng, footprint, height_m, pitched)
+    plan.builder.add_mesh(mesh, translation((0, 0, base_m)) @ pose)
+    plan.buildings.append((footprint, base_m + height_m))
 
 
 def make_building(

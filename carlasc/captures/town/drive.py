@@ -12,12 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.lidar import EGO_SENSOR_M, HEIGHTS_M, Lidar, sensor_offsets
-from carlasc.captures.raw import Recording
-from carlasc.captures.settings import TrafficLevel, check_at_least
-from carlasc.captures.town.actors import EGO_ID, Actor, Population
-from carlasc.captures.town.meshes import Mesh, concatenate
-from carlasc.captures.town.rays import RayScene, rotate_exactly
+from carlasc.captures.raw import SensorRecording
+from carlasc.captures.settings import EGO_SENSOR_M, HEIGHTS_M, Lidar, TrafficLevel, check_at_least, sensor_offsets
+from carlasc.captures.town.actors import EGO_ID, Population, TownActor
+from carlasc.captures.town.meshes import Mesh, RayScene, concatenate, rotate_exactly
 from carlasc.captures.town.town import Town, build_town
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.core.scans import Scan
@@ -45,13 +43,13 @@ class Snapshot:
 
     frame: int
     world_T_ego: Transform
-    actors: dict[int, Actor]
+    actors: dict[int, TownActor]
     mesh: Mesh
     instances: NDArray[np.uint32]
     scene: RayScene
 
 
-class Drive:
+class TownDrive:
     """A simulated drive: a town with traffic, and an ego vehicle with LiDARs that drives through it.
 
     Attributes:
@@ -89,7 +87,7 @@ class Drive:
         check_at_least(0, frame=frame)
         return self._population.ego_pose(frame)
 
-    def actors(self, frame: int) -> list[Actor]:
+    def actors(self, frame: int) -> list[TownActor]:
         """Return all actors of the town in a frame, the ego vehicle first.
 
         Raises:
@@ -118,7 +116,7 @@ class Drive:
         ego = self.ego_pose(frame)
         return np.stack([ego @ translation(offset) for offset in self.sensor_offsets(sensors)])
 
-    def record(self, frame: int, sensor: int = 0) -> Recording:
+    def record(self, frame: int, sensor: int = 0) -> SensorRecording:
         """Return what a sensor of the vehicle records in a frame. Sensor 0 is the ego sensor.
 
         Points are in the sensor's frame. Velocities are over ground (without ego motion), on the axes of the sensor's frame.
@@ -139,7 +137,7 @@ class Drive:
         recording = self.record(frame, sensor)
         return replace(recording.scan, flow=recording.flow())
 
-    def reference_observations(self, frame: int, sensors: int = 60, seed: int = 0) -> list[Recording]:
+    def reference_observations(self, frame: int, sensors: int = 60, seed: int = 0) -> list[SensorRecording]:
         """Return what additional sensors record at the instant of a frame: a reference for judging ground truth.
 
         These sensors are in free space anywhere within the area of the published grid, 1 to 5 m high; one in ten is near the ground
@@ -156,7 +154,7 @@ class Drive:
         check_at_least(1, sensors=sensors)
         rng = self._random(_REFERENCE, frame, seed)
         ego = self.ego_pose(frame) @ translation((*EGO_SENSOR_M[:2], 0.0))
-        recordings: list[Recording] = []
+        recordings: list[SensorRecording] = []
         while len(recordings) < sensors:
             kind = len(recordings) % 10
             heights = (0.4, 1.0) if kind == 4 else (7.0, 14.0) if kind == 9 else HEIGHTS_M
@@ -217,7 +215,9 @@ class Drive:
         return np.random.default_rng([self.seed, *stream])
 
 
-def scan_snapshot(snapshot: Snapshot, world_T_sensor: Transform, lidar: Lidar, rng: np.random.Generator) -> Recording:
+def scan_snapshot(
+    snapshot: Snapshot, world_T_sensor: Transform, lidar: Lidar, rng: np.random.Generator
+) -> SensorRecording:
     """Return what a LiDAR at a pose records of a snapshot.
 
     Points on the ego vehicle and unlabelled points are not recorded. Noise is drawn for every ray, so that it does not depend on
@@ -237,7 +237,7 @@ def scan_snapshot(snapshot: Snapshot, world_T_sensor: Transform, lidar: Lidar, r
     rays, distances, labels, instances = rays[keep], distances[keep], labels[keep], instances[keep]
     points = (lidar.directions[rays] * distances[:, None] + noise[rays]).astype(np.float32)
     scan = Scan(points, labels.astype(np.uint32), None, instances)
-    return Recording(scan, world_T_sensor, _velocities(snapshot, world_T_sensor, instances))
+    return SensorRecording(scan, world_T_sensor, _velocities(snapshot, world_T_sensor, instances))
 
 
 def _velocities(snapshot: Snapshot, world_T_sensor: Transform, instances: NDArray[np.uint32]) -> NDArray[np.float64]:

@@ -1,22 +1,85 @@
-"""A drive through the simulated town as a capture that is never written: recordings are computed when they are read."""
+"""A drive through the simulated town as a capture that is never written: recordings and bird's-eye pictures are computed when they are read."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Mapping
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.lidar import Lidar
-from carlasc.captures.raw import Capture, Recording
-from carlasc.captures.settings import TrafficLevel, check_at_least, check_traffic
-from carlasc.captures.town.birdseye import render_birdseye
-from carlasc.captures.town.drive import Drive
-from carlasc.core.geometry import Transform
+from carlasc.captures.raw import Capture, SensorRecording
+from carlasc.captures.settings import (
+    BEV_HEIGHT_M,
+    BEV_QUALITY,
+    BEV_SIZE,
+    Lidar,
+    TrafficLevel,
+    check_at_least,
+    check_traffic,
+)
+from carlasc.captures.town.drive import Snapshot, TownDrive
+from carlasc.core.geometry import Transform, rotate_vectors
 from carlasc.core.tables import CARLA
-from carlasc.errors import MissingDataError
+from carlasc.errors import MissingDataError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
+
+_SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
+_BACKGROUND = (255, 255, 255)
+_REDUCTION = 2  # rays are cast for every second row and column of pixels, and the picture is enlarged
+
+
+def render_birdseye(snapshot: Snapshot) -> bytes:
+    """Return the picture as JPEG bytes: 1920 x 1080 pixels, 90 degrees wide. Its upper edge is ahead of the vehicle.
+
+    Raises:
+        DependencyError: a package of the extra `simulate` is missing.
+    """
+    pixels = _render(snapshot, snapshot.world_T_ego, (0.0, 0.0, BEV_HEIGHT_M), _downward_rays())
+    image = import_extra("PIL.Image", "simulate")
+    picture = image.fromarray(pixels).resize(BEV_SIZE, image.Resampling.BICUBIC)
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=BEV_QUALITY)
+    return buffer.getvalue()
+
+
+def _render(
+    snapshot: Snapshot,
+    world_T_view: Transform,
+    origin: tuple[float, float, float],
+    directions: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """Return a picture of the surfaces that rays hit.
+
+    Args:
+        snapshot: the town.
+        world_T_view: (4, 4) frame of `origin` and `directions`.
+        origin: (3,) start of the rays, metres.
+        directions: (H, W, 3) unit vectors, one per pixel.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    height, width, _ = directions.shape
+    rays = rotate_vectors(world_T_view, directions.reshape(-1, 3))
+    eye = world_T_view[:3, :3] @ np.array(origin) + world_T_view[:3, 3]
+    hit, triangles, _ = snapshot.scene.cast(eye, rays, 1000.0)
+    normals = snapshot.scene.normals(triangles)
+    normals *= -np.sign(np.einsum("ri,ri->r", normals, rays[hit]))[:, None]  # towards the camera
+    light = 0.55 + 0.45 * np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0, 1)
+    pixels = np.full((height * width, 3), _BACKGROUND, np.uint8)
+    pixels[hit] = CARLA.palette[snapshot.mesh.labels[triangles]] * light[:, None]
+    return pixels.reshape(height, width, 3)
+
+
+def _downward_rays() -> NDArray[np.float64]:
+    """Return (H, W, 3) rays of a camera that looks down. Its upper edge is ahead, its right edge on the right."""
+    width, height = BEV_SIZE[0] // _REDUCTION, BEV_SIZE[1] // _REDUCTION
+    right = (np.arange(width) + 0.5 - width / 2) / (width / 2)
+    ahead = -(np.arange(height) + 0.5 - height / 2) / (width / 2)
+    rays = np.stack(np.broadcast_arrays(ahead[:, None], right[None, :], -1.0), axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 class SimulatedCapture(Capture):
@@ -62,7 +125,7 @@ class SimulatedCapture(Capture):
         """The frame numbers."""
         return np.array(self._frames, np.int64)
 
-    def read(self, sensor: int, frame: int) -> Recording:
+    def read(self, sensor: int, frame: int) -> SensorRecording:
         """Simulate what a sensor records in a frame."""
         self._check(frame)
         return self._drive.record(frame, sensor)
@@ -94,7 +157,7 @@ class SimulatedCapture(Capture):
         return self
 
     @property
-    def _drive(self) -> Drive:
+    def _drive(self) -> TownDrive:
         return _cached_drive(*self._drive_of)
 
     def _check(self, frame: int) -> None:
@@ -104,6 +167,6 @@ class SimulatedCapture(Capture):
 
 
 @lru_cache(maxsize=1)
-def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> Drive:
+def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> TownDrive:
     """Return the drive of this process: the town is built once."""
-    return Drive(seed, traffic, lidar)
+    return TownDrive(seed, traffic, lidar)

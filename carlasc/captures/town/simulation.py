@@ -10,8 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from carlasc.captures.lidar import Lidar
-from carlasc.captures.settings import TrafficLevel
+from carlasc.captures.settings import Lidar, TrafficLevel
 from carlasc.captures.town.simulated import SimulatedCapture
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
@@ -49,7 +48,7 @@ class SimulationResult:
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _SimulationSettings:
     """The settings of a capture, as simulation.json holds them."""
 
     seed: int
@@ -102,7 +101,7 @@ def simulate(
         count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev
     )
     check_shared(os.fspath(out), run)
-    settings = _Settings(seed, traffic, sensors, bev, lidar or Lidar())
+    settings = _SimulationSettings(seed, traffic, sensors, bev, lidar or Lidar())
     check_dependencies(bev)
     writer = CaptureWriter(out)
     writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc simulate")

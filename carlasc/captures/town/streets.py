@@ -77,7 +77,7 @@ class Side:
 
 
 @dataclass(frozen=True)
-class Block:
+class CityBlock:
     """The land between streets, or the land around the town.
 
     Attributes:
@@ -147,7 +147,7 @@ class Streets:
 
     nodes: Points
     edges: NDArray[np.int64]
-    blocks: tuple[Block, ...]
+    blocks: tuple[CityBlock, ...]
     lanes: tuple[Lane, ...]
 
     def degree(self, node: int) -> int:
@@ -245,7 +245,7 @@ def _corners_of(loop: list[int]) -> list[tuple[int, int, int]]:
 
 def _make_block(
     rng: np.random.Generator, nodes: Points, loop: list[int], stop_distances: dict[tuple[int, int], float]
-) -> Block:
+) -> CityBlock:
     corners = nodes[loop]
     following = np.roll(corners, -1, axis=0)
     outside = float((corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum()) < 0
@@ -263,7 +263,7 @@ def _make_block(
         depth = np.array([0.0, BAY_M, BAY_M, 0.0]) * side.has_bay
         anchors.append(side.start + stations[:, None] * leaving + depth[:, None] * side.normal)
         normals.append(np.tile(side.normal, (4, 1)))
-    return Block(Outline(np.concatenate(anchors), np.concatenate(normals)), tuple(sides), outside)
+    return CityBlock(Outline(np.concatenate(anchors), np.concatenate(normals)), tuple(sides), outside)
 
 
 def _rounded_corner(node: Points, arriving: Points, leaving: Points, turn: float) -> tuple[Points, Points]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +18,6 @@ from carlasc.core.geometry import Transform, thin
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.groundtruth.options import FromScans
@@ -34,6 +33,7 @@ from carlasc.motion import (
     segment_by_instances,
     standing_points,
 )
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
@@ -203,11 +203,11 @@ class ScanFeed:
         """Return (4, 4) first_T_sensor."""
         return self.sequence.read_pose(frame)
 
-    def merger(self, actors: Actors, frame: int) -> Merger:
+    def merger(self, actors: MovingActors, frame: int) -> Merger:
         """Return what merges scans into a frame, given the actors of its window. Its caches are kept from frame to frame."""
         with self._lock:
             if self._merger is None:
-                self._merger = Merger(_Scans(self), actors, self.classes, self.options.dynamic)
+                self._merger = Merger(self.read, actors, self.classes, self.options.dynamic)
             self._merger.actors = actors
             self._merger.forget_before(frame + self.options.window[0])
             return self._merger
@@ -226,27 +226,24 @@ class ScanFeed:
         """Read a scan for merging; the most recent ones are cached."""
         with self._lock:
             if frame not in self._scans:
-                self._scans[frame] = self._read(frame)
+                scan = self._voting_points(frame)
+                moving = np.isin(_labels(scan), sorted(self.classes.moving))
+                if "flow" in self.motion and scan.flow is not None:
+                    moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
+                self._scans[frame] = PreparedScan.of(
+                    frame,
+                    scan.points,
+                    _labels(scan),
+                    self.pose(frame),
+                    seconds=self.time(frame),
+                    moving=np.flatnonzero(moving),
+                    origins=scan.others.get("origins"),
+                )
                 first, last = self.options.window
                 while len(self._scans) > last - first + 2:
                     self._scans.popitem(last=False)
             self._scans.move_to_end(frame)
             return self._scans[frame]
-
-    def _read(self, frame: int) -> PreparedScan:
-        scan = self._voting_points(frame)
-        moving = np.isin(_labels(scan), sorted(self.classes.moving))
-        if "flow" in self.motion and scan.flow is not None:
-            moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
-        return PreparedScan.of(
-            frame,
-            scan.points,
-            _labels(scan),
-            self.pose(frame),
-            seconds=self.time(frame),
-            moving=np.flatnonzero(moving),
-            origins=scan.others.get("origins"),
-        )
 
     def sighting(self, frame: int, boxes: Sequence_[Track]) -> Sighting:
         """Return a scan as evidence of motion needs it; points of actors that the sequence's own fields show are marked.
@@ -308,22 +305,6 @@ class ScanFeed:
         found = np.asarray(labels, np.uint32).copy()
         found[ground_points(points) & (labels == self.classes.geometry_id)] = min(self.classes.ground)
         return found
-
-
-class _Scans(Mapping[int, PreparedScan]):
-    """A feed's prepared scans by frame, read on demand."""
-
-    def __init__(self, feed: ScanFeed) -> None:
-        self._feed = feed
-
-    def __getitem__(self, frame: int) -> PreparedScan:
-        return self._feed.read(frame)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._feed.frames.tolist())
-
-    def __len__(self) -> int:
-        return len(self._feed.frames)
 
 
 _FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key that its copies share: see ScanFeed

@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.classes import ClassTable
 from carlasc.core.evidence import VoxelFlag
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import Instant, Merger
-from carlasc.groundtruth.from_scans.regions import STATIC, Regions
-from carlasc.groundtruth.inputs import Plan
-from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.voting.ballot import Ballot, Votes
-from carlasc.groundtruth.voting.evidence import (
+from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
+from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
-    Evidence,
     Matter,
+    VoxelCertainty,
     class_shares,
     is_occupied,
     matter_of,
     probability,
 )
-from carlasc.groundtruth.voting.marking import mark
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.kernel import mark
+from carlasc.motion import BODY_MARGIN_M, Track
+from carlasc.motion.tracks import MovingActors
 
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
@@ -50,16 +48,64 @@ class MergedFrame:
 
     grid: Grid
     votes: Votes
-    evidence: Evidence | None = None
+    evidence: VoxelCertainty | None = None
 
 
-def merge_frame(plan: Plan, feed: ScanFeed, actors: Actors, frame: int, window: list[int]) -> MergedFrame:
-    """Make the grid of a frame from the scans of a window, which need not contain the frame itself."""
-    return _Merging(plan, feed, feed.merger(actors, frame), feed.instant(frame), window).run()
+def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int, window: list[int]) -> MergedFrame:
+    """Make the grid of a frame from the scans of a window.
+
+    Args:
+        plan: geometry of the grid, and how votes are counted.
+        feed: the scans of the sequence.
+        actors: what moves in them.
+        frame: frame number.
+        window: frames whose scans are merged; the frame itself need not be one of them.
+    """
+    merger, now, options, classes = feed.merger(actors, frame), feed.instant(frame), feed.options, feed.classes
+
+    # The static scene votes everywhere, and each moving actor in the voxels of its body.
+    regions = BodyRegions.at(merger, now, window, plan.spec)
+    steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
+    ballot = steps.vote(merger.observations(now, window, bodies), plan.needs_evidence)
+    votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
+    del ballot  # its memory is needed by the next ones
+    if plan.rule != "ray":
+        return MergedFrame(votes.to_grid(), votes)
+    made = steps.decide_seen(votes)
+
+    # What rays beside a body, or of other times, saw as free says nothing of these voxels.
+    contested = steps.contested()
+    doubtful = np.concatenate([regions.hidden, steps.unseen_now(contested)])
+    made.forget(doubtful[made.labels[doubtful] == 0])
+
+    # Actors are completed by their mirror images, then by the usual shapes of vehicles.
+    completing = list[Iterator[Observation]]()
+    if bodies and options.complete != "seen":
+        completing.append(merger.mirrored(now, window, bodies))
+        if options.complete == "body":
+            completing.append(merger.shells(now, bodies))
+    completed = [(_NO_VOXELS, votes.occupied)]
+    for observations in completing:
+        completions = steps.vote(observations).votes(copy=False)
+        completed.append(steps.complete(made, completions))
+
+    if options.own_path and options.dynamic != "tube":
+        driven = steps.driven(made)
+        made.labels[driven] = 0
+        made.set_probability(driven, _OWN_PROBABILITY)
+    if feed.finds_ground:  # ground that was found had a class for the votes only
+        made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
+    size = plan.spec.size
+    grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
+    if made.occupied is None or views is None:
+        return MergedFrame(grid, votes)
+    inferred, hits = (np.concatenate(parts) for parts in zip(*completed, strict=True))
+    flags, shares = steps.flags(inferred, contested), class_shares(hits, classes)
+    return MergedFrame(grid, votes, VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views))
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class _VoxelEvidence:
     """What votes say of N voxels.
 
     Attributes:
@@ -81,13 +127,13 @@ class _Evidence:
         """(N,) hits and free samples."""
         return self.hits + self.free
 
-    def at(self, chosen: NDArray[np.bool_]) -> _Evidence:
+    def at(self, chosen: NDArray[np.bool_]) -> _VoxelEvidence:
         """Return the evidence of some of the voxels."""
-        return _Evidence(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        return _VoxelEvidence(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 @dataclass
-class _Scene:
+class _UnfinishedGrid:
     """The grid while it is made.
 
     Attributes:
@@ -112,46 +158,22 @@ class _Scene:
 
 
 @dataclass(frozen=True)
-class _Merging:
-    """The steps by which the grid of a frame is made."""
+class _FrameSteps:
+    """The steps of `merge_frame`."""
 
-    plan: Plan
+    plan: GridPlan
     feed: ScanFeed
     merger: Merger
     now: Instant
     window: list[int]
+    regions: BodyRegions
 
-    def run(self) -> MergedFrame:
-        """Make the grid."""
-        ballot = self._vote(self.merger.observations(self.now, self.window, self.regions), self.plan.needs_evidence)
-        votes, views = ballot.votes(copy=False), ballot.views if self.plan.needs_evidence else None
-        del ballot  # its memory is needed by the next ones
-        if self.plan.rule != "ray":
-            return MergedFrame(votes.to_grid(), votes)
-        scene = self._scene(votes)
+    @cached_property
+    def in_body(self) -> NDArray[np.bool_]:
+        """(V,) bool, the voxels of these regions."""
+        return self.regions.of_voxel != STATIC
 
-        # What rays beside a body, or of other times, saw as free says nothing of these voxels.
-        contested = self._contested()
-        doubtful = np.concatenate([self.regions.hidden, self._unseen_now(contested)])
-        scene.forget(doubtful[scene.labels[doubtful] == 0])
-
-        completed = [(_NO_VOXELS, votes.occupied)]
-        completed += [self._complete(scene, completion) for completion in self._completions()]
-        if self.options.own_path and self.options.dynamic != "tube":
-            driven = self._driven(scene)
-            scene.labels[driven] = 0
-            scene.set_probability(driven, _OWN_PROBABILITY)
-        if self.feed.finds_ground:
-            scene.labels[np.isin(scene.labels, sorted(self.classes.ground))] = self.classes.geometry_id
-        size = self.spec.size
-        grid = Grid(self.spec, scene.labels.reshape(size), scene.counts.reshape(size))
-        if scene.occupied is None or views is None:
-            return MergedFrame(grid, votes)
-        inferred, hits = (np.concatenate(parts) for parts in zip(*completed, strict=True))
-        flags, shares = self._flags(inferred, contested), class_shares(hits, self.classes)
-        return MergedFrame(grid, votes, Evidence(scene.occupied.reshape(size), shares, flags.reshape(size), views))
-
-    def _scene(self, votes: Votes) -> _Scene:
+    def decide_seen(self, votes: Votes) -> _UnfinishedGrid:
         """Return what the votes for the static scene and in the actors' bodies say."""
         evidence = self.plan.needs_evidence
         labels, hits = votes.elect_occupied()
@@ -159,28 +181,28 @@ class _Merging:
         found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
         labels[found.voxels] = self._decide(found)
         counts = np.add(hits, free, out=hits)
-        scene = _Scene(labels, counts)
+        made = _UnfinishedGrid(labels, counts)
         if evidence:
-            scene.occupied = np.full(len(labels), UNKNOWN, np.float32)
-            scene.occupied[found.voxels] = self._probability(found)
-        return scene
+            made.occupied = np.full(len(labels), UNKNOWN, np.float32)
+            made.occupied[found.voxels] = self._probability(found)
+        return made
 
-    def _complete(self, scene: _Scene, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
         """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes."""
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
-        found = found.at((scene.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
-        scene.labels[found.voxels] = self._decide(found)
-        scene.counts[found.voxels] = found.counts
-        scene.set_probability(found.voxels, self._probability(found))
+        found = found.at((made.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
+        made.labels[found.voxels] = self._decide(found)
+        made.counts[found.voxels] = found.counts
+        made.set_probability(found.voxels, self._probability(found))
         return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
 
-    def _flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return (V,) the flags of each voxel."""
         own = [self.now.frame] if self.now.frame in self.window else []
-        now = self._vote(self.merger.observations(self.now, own, replace(self.regions, actors={})))
-        flags = np.zeros(self.spec.num_voxels, np.uint8)
+        now = self.vote(self.merger.observations(self.now, own, {}))
+        flags = np.zeros(self.plan.spec.num_voxels, np.uint8)
         for where, flag in (
             (inferred, VoxelFlag.INFERRED),
             (contested, VoxelFlag.CONTESTED),
@@ -190,91 +212,170 @@ class _Merging:
             flags[where] |= np.uint8(flag)
         return flags
 
-    @property
-    def spec(self) -> GridSpec:
-        return self.plan.spec
-
-    @property
-    def classes(self) -> ClassTable:
-        return self.feed.classes
-
-    @property
-    def options(self) -> FromScans:
-        return self.feed.options
-
-    @cached_property
-    def regions(self) -> Regions:
-        return self.merger.regions(self.now, self.window, self.spec)
-
-    @cached_property
-    def in_body(self) -> NDArray[np.bool_]:
-        return self.regions.of_voxel != STATIC
-
-    def _vote(self, observations: Iterable[Observation], count_views: bool = False) -> Ballot:
+    def vote(self, observations: Iterable[Observation], count_views: bool = False) -> Ballot:
+        """Return the votes of observations, each in its region."""
         regions, step = self.regions.of_voxel, self.plan.voting.free_step_m
         ballot = Ballot(
-            self.spec, self.classes, rule=self.plan.rule, free_step_m=step, regions=regions, count_views=count_views
+            self.plan.spec,
+            self.feed.classes,
+            rule=self.plan.rule,
+            free_step_m=step,
+            regions=regions,
+            count_views=count_views,
         )
         for observation in observations:
             ballot.add(observation)
         return ballot
 
-    def _evidence(self, votes: Votes, labels: NDArray[Any], hits: NDArray[Any], voxels: NDArray[np.int64]) -> _Evidence:
+    def _evidence(
+        self, votes: Votes, labels: NDArray[Any], hits: NDArray[Any], voxels: NDArray[np.int64]
+    ) -> _VoxelEvidence:
         """Return what votes say of some voxels; `labels` and `hits` are those of `Votes.elect_occupied`."""
         labels = labels[voxels]
-        matter = matter_of(labels, self.in_body[voxels], self.classes)
-        return _Evidence(voxels, labels, hits[voxels], votes.free.reshape(-1)[voxels], matter)
+        matter = matter_of(labels, self.in_body[voxels], self.feed.classes)
+        return _VoxelEvidence(voxels, labels, hits[voxels], votes.free.reshape(-1)[voxels], matter)
 
-    def _decide(self, evidence: _Evidence) -> NDArray[np.unsignedinteger]:
-        if self.options.dynamic == "tube":
+    def _decide(self, evidence: _VoxelEvidence) -> NDArray[np.unsignedinteger]:
+        if self.feed.options.dynamic == "tube":
             return evidence.labels
         free_m = evidence.free * self.plan.voting.free_step_m
         return np.where(is_occupied(evidence.hits, free_m, evidence.matter), evidence.labels, 0).astype(
             evidence.labels.dtype
         )
 
-    def _probability(self, evidence: _Evidence) -> NDArray[np.float32]:
+    def _probability(self, evidence: _VoxelEvidence) -> NDArray[np.float32]:
         step = self.plan.voting.free_step_m
         return probability(
-            evidence.hits, evidence.free * step, evidence.matter, self.in_body[evidence.voxels], self.spec, step
+            evidence.hits, evidence.free * step, evidence.matter, self.in_body[evidence.voxels], self.plan.spec, step
         )
 
-    def _contested(self) -> NDArray[np.int64]:
+    def contested(self) -> NDArray[np.int64]:
         """Return the voxels outside of bodies where something that moves passes at other times."""
-        if self.options.dynamic != "align":
+        if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        return np.flatnonzero(self._vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body)
+        return np.flatnonzero(self.vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body)
 
-    def _unseen_now(self, voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+    def unseen_now(self, voxels: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return those of some voxels that the scans just before and after the frame did not see."""
         if not len(voxels):
             return voxels
-        return voxels[~self._vote(self.merger.recent(self.now, self.window)).seen(voxels)]
+        return voxels[~self.vote(self.merger.recent(self.now, self.window)).seen(voxels)]
 
-    def _completions(self) -> Iterable[Votes]:
-        """Yield the votes of what completes actors: of their mirror images, then of their usual shapes."""
-        if not self.regions.actors or self.options.complete == "seen":
-            return
-        yield self._vote(self.merger.mirrored(self.now, self.window, self.regions)).votes(copy=False)
-        if self.options.complete == "body":
-            yield self._vote(self.merger.shells(self.now, self.regions)).votes(copy=False)
-
-    def _driven(self, scene: _Scene) -> NDArray[np.int64]:
+    def driven(self, made: _UnfinishedGrid) -> NDArray[np.int64]:
         """Return the occupied voxels that the recording vehicle drove through at other frames, without the ground and what is there now."""
-        apart = float(self.spec.voxel_size[[0, 2]].min()) / 2
+        apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-        path = np.zeros(self.spec.num_voxels, np.bool_)
+        path = np.zeros(self.plan.spec.num_voxels, np.bool_)
         for other in self.window:
             if other != self.now.frame:
-                mark(body, self.now.grid_T_world @ self.feed.pose(other), self.spec, path)
-        voxels = np.flatnonzero(path & (scene.labels > 0))
-        solid = ~np.isin(scene.labels[voxels], sorted(self.classes.ground))
-        return voxels[solid & ~self._hit_now()[voxels]]
+                mark(body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path)
+        voxels = np.flatnonzero(path & (made.labels > 0))
+        solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
+        there_now = self.in_body  # and where the frame's own scan has points
+        if self.now.frame in self.window:
+            scan = self.feed.read(self.now.frame)
+            there_now = there_now | mark(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec)
+        return voxels[solid & ~there_now[voxels]]
 
-    def _hit_now(self) -> NDArray[np.bool_]:
-        """Return the voxels in which the frame's own scan has points, or that belong to an actor at the frame."""
-        if self.now.frame not in self.window:
-            return self.in_body
-        scan = self.merger.scans[self.now.frame]
-        return self.in_body | mark(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.spec)
+
+@dataclass(frozen=True)
+class BodyRegions:
+    """Which voxels belong to which actor.
+
+    Attributes:
+        of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
+        actors: number of the actor by region, for the regions that have voxels.
+        hidden: (H,) flat indices of voxels of a body's face that no scan saw. Rays beside the body go through them: they say nothing of it.
+        hidden_ends: (E,) those of a face that is hidden also if the body is completed by its mirror image.
+    """
+
+    of_voxel: NDArray[np.uint16]
+    actors: Mapping[int, int]
+    hidden: NDArray[np.int64]
+    hidden_ends: NDArray[np.int64]
+
+    @classmethod
+    def at(cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec) -> BodyRegions:
+        """Return the regions of a frame: of the bodies of what moves, and of moving points without a body.
+
+        Args:
+            merger: what moves, and the scans.
+            now: the frame.
+            window: frames whose scans are merged.
+            spec: the grid.
+        """
+        tracks = merger.actors.tracks.items() if merger.dynamic == "align" else ()
+        present = [(number, track, pose) for number, track in tracks if (pose := track.pose(now.frame)) is not None]
+        regions = cls.of_bodies(spec, now.world_T_grid, present)
+        if merger.dynamic in ("align", "current") and now.frame in window:
+            scan = merger.scan_of(now.frame)
+            moving = scan.points[~merger.static(now.frame)]
+            return regions.with_points(spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving))
+        return regions
+
+    def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
+        """Return the regions with one more, of the voxels of points that move and belong to no body: only the frame's own rays vote there.
+
+        Args:
+            spec: the grid.
+            points: (M, 3) metres, grid frame.
+        """
+        of_voxel = self.of_voxel.copy()
+        voxels = spec.flat_index(points)
+        voxels = voxels[voxels >= 0]
+        of_voxel[voxels[of_voxel[voxels] == STATIC]] = max(self.actors, default=0) + 1
+        return replace(self, of_voxel=of_voxel)
+
+    @classmethod
+    def of_bodies(cls, spec: GridSpec, world_T_grid: Transform, bodies: Sequence[tuple[int, Track, Transform]]) -> Self:
+        """Return the regions of bodies: (number, track, world_T_actor) of each actor.
+
+        A body has all voxels that it touches. Where bodies overlap, the smaller one takes precedence.
+        """
+        of_voxel = np.zeros(spec.num_voxels, np.uint16)
+        hidden, hidden_ends = np.zeros(spec.num_voxels, np.bool_), np.zeros(spec.num_voxels, np.bool_)
+        size = spec.voxel_size
+        # x and y of the centres of the columns of cells, (C, 2), z of the centres in each, and half the extent of the cells.
+        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[:, :, 0, :2].reshape(-1, 2)
+        columns, heights = columns.astype(np.float64), spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2]
+        width = np.hypot(columns[:, 0], columns[:, 1]) * size[1] if spec.coordinates == "cylindrical" else size[1]
+        across, up = np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)), float(size[2] / 2)
+        largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
+        for region, (_, track, pose) in enumerate(largest_first, 1):
+            actor_T_grid = invert(pose) @ world_T_grid
+            turned = np.abs(actor_T_grid[:3, :3])
+            middle = invert(actor_T_grid)[:2, 3]
+            reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
+            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
+            cells = np.column_stack([np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))])
+            slack = np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1) + up * turned[:, 2]
+            body = transform_points(actor_T_grid, cells)
+            inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
+            own = (near[:, None] * len(heights) + np.arange(len(heights))).reshape(-1)[inside]
+            of_voxel[own] = region
+            rear, front, low, high = track.extent.faces
+            mirrored = (rear, front, low or high, low or high)
+            hidden[own] = _on_hidden_face(track, body[inside], slack[inside], track.extent.faces)
+            hidden_ends[own] = _on_hidden_face(track, body[inside], slack[inside], mirrored)
+        present = np.unique(of_voxel[of_voxel != STATIC]).tolist()
+        actors = {region: largest_first[region - 1][0] for region in present}
+        return cls(of_voxel, actors, np.flatnonzero(hidden), np.flatnonzero(hidden_ends))
+
+
+def _on_hidden_face(
+    track: Track, cells: NDArray[np.float64], slack: NDArray[np.float64], faces: tuple[bool, bool, bool, bool]
+) -> NDArray[np.bool_]:
+    """Return which cells, (C, 3) centres in the actor's frame, touch a face that was not seen, and none that was seen.
+
+    Args:
+        track: the actor.
+        cells: centres of cells that its body touches.
+        slack: (C, 3) half the extent of each cell along the axes of the actor.
+        faces: whether the rear, the front, the side of low y and the side of high y were seen.
+    """
+    lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
+    away = np.stack([cells[:, 0] - lower[0], upper[0] - cells[:, 0], cells[:, 1] - lower[1], upper[1] - cells[:, 1]])
+    touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
+    seen = np.array(faces)[:, None]
+    return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)

@@ -7,7 +7,7 @@ time of the frame. Free space that other scans saw of the static scene does not 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points, translation
-from carlasc.core.grids import GridSpec
 from carlasc.core.scans import runs_of_origins
-from carlasc.groundtruth.from_scans.actors import Actors
-from carlasc.groundtruth.from_scans.regions import STATIC, Regions
 from carlasc.groundtruth.options import Dynamic
-from carlasc.groundtruth.voting.observations import NOWHERE, Observation
-from carlasc.motion import Track, usual_shell
+from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
+from carlasc.motion import usual_shell
+from carlasc.motion.tracks import MovingActors
 
+STATIC = 0  # region of the voxels that belong to no actor
 _DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
 _RECENT_S = 0.25  # what scans saw within this time before and after a frame is so at the frame
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -49,7 +48,7 @@ class Instant:
 
 
 @dataclass(frozen=True)
-class Rays:
+class RaysFromPlace:
     """Those rays of a scan that began at one place.
 
     Attributes:
@@ -67,7 +66,7 @@ class Rays:
     azimuth: NDArray[np.float32]
 
     @classmethod
-    def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> Rays:
+    def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> RaysFromPlace:
         """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan."""
         own = points[part] - origin.astype(np.float32) if origin.any() else points[part]
         azimuth = np.arctan2(own[:, 1], own[:, 0])
@@ -139,7 +138,7 @@ class PreparedScan:
     reach_m: float
     seconds: float
     moving: NDArray[np.int64]
-    rays: tuple[Rays, ...]
+    rays: tuple[RaysFromPlace, ...]
 
     @classmethod
     def of(
@@ -156,7 +155,7 @@ class PreparedScan:
         """Prepare the voting points of a scan. Those with the same origin, (N, 3), must be next to each other; None: all are at the sensor."""
         reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
         moving = np.empty(0, np.int64) if moving is None else moving
-        rays = tuple(Rays.of(points, part, origin) for part, origin in runs_of_origins(origins, len(points)))
+        rays = tuple(RaysFromPlace.of(points, part, origin) for part, origin in runs_of_origins(origins, len(points)))
         return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, rays)
 
     def observations(
@@ -184,16 +183,16 @@ class Merger:
     """Merges the scans of a window into the observations of one frame.
 
     Args:
-        scans: prepared scans by frame.
+        scan_of: returns the prepared scan of a frame.
         actors: what moves.
         classes: class table of the labels.
         dynamic: what happens to moving points.
     """
 
     def __init__(
-        self, scans: Mapping[int, PreparedScan], actors: Actors, classes: ClassTable, dynamic: Dynamic
+        self, scan_of: Callable[[int], PreparedScan], actors: MovingActors, classes: ClassTable, dynamic: Dynamic
     ) -> None:
-        self.scans, self.actors, self.classes, self.dynamic = scans, actors, classes, dynamic
+        self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         self._static: dict[int, NDArray[np.bool_]] = {}
         self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
 
@@ -202,32 +201,24 @@ class Merger:
         self._static = {key: value for key, value in self._static.items() if key >= frame}
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
-    def regions(self, now: Instant, window: Collection[int], spec: GridSpec) -> Regions:
-        """Return which voxels belong to which actor: those that its body touches, and those of moving points without a body."""
-        regions = Regions.empty(spec)
-        if self.dynamic == "align":
-            tracks = self.actors.tracks.items()
-            present = [(number, track, pose) for number, track in tracks if (pose := track.pose(now.frame)) is not None]
-            regions = Regions.of_bodies(spec, now.world_T_grid, present)
-        if self.dynamic in ("align", "current") and now.frame in window:
-            scan = self.scans[now.frame]
-            moving = scan.points[~self.static(now.frame)]
-            regions = regions.with_points(spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving))
-        return regions
-
-    def observations(self, now: Instant, window: Iterable[int], regions: Regions) -> Iterator[Observation]:
+    def observations(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield the observations of a frame's grid: each scan of the static scene, then each actor's scans in its body.
 
         Static surfaces vote everywhere, so the road below an actor is kept. Free space that was seen at other times does not count
         inside an actor's body. The frame's own rays always count.
+
+        Args:
+            now: the frame.
+            window: frames of the scans.
+            bodies: number of the actor by region, for the actors that vote in their bodies.
         """
         window, grid_T_world = list(window), now.grid_T_world
         for other in window:
-            scan, own = self.scans[other], other == now.frame
+            scan, own = self.scan_of(other), other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
             hits = None if everything else self.static(other)
             yield from scan.observations(grid_T_world, hits, free_region=None if own else STATIC)
-        for region, number in regions.actors.items():
+        for region, number in bodies.items():
             pose = self.actors.tracks[number].pose(now.frame)
             if pose is None:
                 continue
@@ -240,13 +231,13 @@ class Merger:
                         hit_region=region,
                     )
 
-    def mirrored(self, now: Instant, window: Iterable[int], regions: Regions) -> Iterator[Observation]:
+    def mirrored(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield what the scans of actors would have seen if they had looked at the actors' other side.
 
         Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body.
         """
         window, grid_T_world = list(window), now.grid_T_world
-        for region, number in regions.actors.items():
+        for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
             if not track.rigid or pose is None:
@@ -264,7 +255,7 @@ class Merger:
     def passing(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
         """Yield the moving points of each scan where that scan saw them. No ray votes for free space."""
         for other in window:
-            scan = self.scans[other]
+            scan = self.scan_of(other)
             moving = ~self.static(other)
             if other != now.frame and moving.any():
                 pose = now.grid_T_world @ scan.world_T_sensor
@@ -273,13 +264,13 @@ class Merger:
     def recent(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
         """Yield the scans of the instant: those just before and after the frame."""
         for other in window:
-            scan = self.scans[other]
+            scan = self.scan_of(other)
             if abs(scan.seconds - now.seconds) <= _RECENT_S:
                 yield from scan.observations(now.grid_T_world)
 
-    def shells(self, now: Instant, regions: Regions) -> Iterator[Observation]:
+    def shells(self, now: Instant, bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield the surface of each vehicle as it usually is, for what no scan saw of it. No ray votes for free space."""
-        for region, number in regions.actors.items():
+        for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
             points = usual_shell(track.lower, track.upper, track.extent) if track.rigid else None
@@ -290,7 +281,7 @@ class Merger:
     def static(self, frame: int) -> NDArray[np.bool_]:
         """Return (N,) bool: the points of a scan that do not belong to anything that moves."""
         if frame not in self._static:
-            scan = self.scans[frame]
+            scan = self.scan_of(frame)
             static = np.ones(len(scan.points), np.bool_)
             static[scan.moving] = False
             static[self.actors.moving.get(frame, [])] = False
@@ -302,25 +293,17 @@ class Merger:
     def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
         """Return a scan's rays through an actor's body, in the actor's frame; none if it had another shape then."""
         track = self.actors.tracks[number]
-        if not track.rigid and abs(self.scans[other].seconds - now.seconds) > _DEFORMABLE_S:
+        if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return ()
-        key = (number, other)
-        if key not in self._carried:
-            self._carried[key] = self._cut(track, other)
-        return self._carried[key]
-
-    def _cut(self, track: Track, frame: int) -> tuple[Observation, ...]:
-        pose = track.pose(frame)
-        if pose is None:
-            return ()
-        scan = self.scans[frame]
-        own = np.zeros(len(scan.points), np.bool_)
-        own[track.members.get(frame, [])] = True
-        found = []
-        for rays in scan.rays:
-            actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
-            crossing = rays.through(actor_T_place, track.lower, track.upper)
-            if len(crossing):
-                labels, hits = scan.labels[rays.part][crossing], own[rays.part][crossing]
-                found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
-        return tuple(found)
+        pose, found = track.pose(other), list[Observation]()
+        if (number, other) not in self._carried and pose is not None:
+            scan = self.scan_of(other)
+            own = np.zeros(len(scan.points), np.bool_)
+            own[track.members.get(other, [])] = True
+            for rays in scan.rays:
+                actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
+                crossing = rays.through(actor_T_place, track.lower, track.upper)
+                if len(crossing):
+                    labels, hits = scan.labels[rays.part][crossing], own[rays.part][crossing]
+                    found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
+        return self._carried.setdefault((number, other), tuple(found))

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import invert, transform_points
-from carlasc.groundtruth.from_scans.actors import FIRST_MOVER, Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed, ScanMotion
 from carlasc.motion import (
     HORIZON_S,
     Chain,
-    Evidence,
+    FreeSpaceEvidence,
     Linker,
     Segment,
     Track,
@@ -35,6 +34,7 @@ from carlasc.motion import (
     seen_from,
     tracks_from_boxes,
 )
+from carlasc.motion.tracks import FIRST_MOVER, MovingActors
 from carlasc.running.options import Run
 from carlasc.running.processes import run_all
 from carlasc.storage import layout
@@ -69,7 +69,7 @@ class _FindEvidence:
     feed: ScanFeed
     boxes: tuple[Track, ...]
 
-    def __call__(self, block: tuple[int, ...]) -> list[Evidence]:
+    def __call__(self, block: tuple[int, ...]) -> list[FreeSpaceEvidence]:
         times = self.feed.times
         near = [f for f, s in times.items() if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S]
         scans = (self.feed.sighting(frame, self.boxes) for frame in near)
@@ -91,8 +91,8 @@ class _MakeTrack:
 
 
 @dataclass(frozen=True)
-class _Pass:
-    """The pass over one sequence.
+class _MotionPass:
+    """The steps of `find_actors`.
 
     Attributes:
         feed: its scans.
@@ -104,25 +104,15 @@ class _Pass:
     run: Run
     steps: Callable[[int], None] | None
 
-    def find(self) -> Actors:
-        boxes = _box_tracks(self.feed)
-        moving_boxes = tuple(track for track in boxes if track.moves)
-        tracks = self._boxed(boxes, moving_boxes) if boxes else self._linked()
-        moving: dict[int, NDArray[np.integer]] = {}
-        if "evidence" in self.feed.motion:
-            movers, moving = self._movers(moving_boxes)
-            tracks += movers
-        return Actors.of(tracks if boxes else complete_bodies(tracks), moving)
-
-    def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-        with closing(run_all(function, items, self.run)) as results:
-            yield from results
+    def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> closing[Generator[Result]]:
+        """Return the results of a function of each item, in a context that ends the work."""
+        return closing(run_all(function, items, self.run))
 
     def _count(self, scans: int) -> None:
         if self.steps is not None:
             self.steps(scans)
 
-    def _linked(self) -> list[Track]:
+    def linked(self) -> list[Track]:
         """Return the tracks of the actors that flow or instances show."""
         frames, times = list(self.feed.times), self.feed.times
         linker, tracks = Linker(), list[Track]()
@@ -132,31 +122,33 @@ class _Pass:
             return tracks
         for begin in range(0, len(frames), _BATCH):
             ended: list[Chain] = []
-            for scan in self._each(_FindSegments(self.feed, ()), frames[begin : begin + _BATCH]):
-                ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.standing)
-                self._count(1)
+            with self._each(_FindSegments(self.feed, ()), frames[begin : begin + _BATCH]) as scans:
+                for scan in scans:
+                    ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.standing)
+                    self._count(1)
             if begin + _BATCH >= len(frames):
                 ended += linker.finish()
-            tracks += self._estimate([(chain, None) for chain in ended])
+            tracks += self._estimate([(linked, None) for linked in ended])
         return tracks
 
-    def _boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
+    def boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
         """Return the tracks of annotated boxes, with the points that are in them."""
         segments: dict[int, list[Segment]] = {}
-        for scan in self._each(_FindSegments(self.feed, moving), list(self.feed.times)):
-            for segment in scan.segments:
-                segments.setdefault(segment.instance, []).append(replace(segment, points=segment.points[:0]))
-            self._count(1)
+        with self._each(_FindSegments(self.feed, moving), list(self.feed.times)) as scans:
+            for scan in scans:
+                for segment in scan.segments:
+                    segments.setdefault(segment.instance, []).append(replace(segment, points=segment.points[:0]))
+                self._count(1)
         return [_with_members(track, segments.get(track.instance, [])) for track in boxes]
 
-    def _movers(self, boxes: tuple[Track, ...]) -> tuple[list[Track], dict[int, NDArray[np.integer]]]:
+    def movers(self, boxes: tuple[Track, ...]) -> tuple[list[Track], dict[int, NDArray[np.integer]]]:
         """Return the tracks of what moved although no field shows it, and the moved points of each frame that belong to none."""
         frames = list(self.feed.times)
         blocks = [tuple(frames[begin : begin + _BLOCK]) for begin in range(0, len(frames), _BLOCK)]
 
-        def evidence() -> Iterator[Evidence]:
-            for block in self._each(_FindEvidence(self.feed, boxes), blocks):
-                for found in block:
+        def evidence() -> Iterator[FreeSpaceEvidence]:
+            with self._each(_FindEvidence(self.feed, boxes), blocks) as results:
+                for found in chain.from_iterable(results):
                     yield found
                     self._count(1)
 
@@ -174,14 +166,15 @@ class _Pass:
         return tracks, _untracked(moved, tracks)
 
     def _estimate(self, actors: Sequence[tuple[Chain, bool | None]]) -> list[Track]:
-        return list(self._each(_MakeTrack(self.feed.times, self.feed.classes.deformable), actors))
+        with self._each(_MakeTrack(self.feed.times, self.feed.classes.deformable), actors) as tracks:
+            return list(tracks)
 
 
 def find_actors(
     feed: ScanFeed,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
     steps: Callable[[int], None] | None = None,
-) -> Actors:
+) -> MovingActors:
     """Find the actors of a sequence.
 
     Args:
@@ -192,7 +185,15 @@ def find_actors(
     Raises:
         FormatError: a scan is not valid.
     """
-    return _Pass(feed, run, steps).find()
+    by = _MotionPass(feed, run, steps)
+    boxes = _box_tracks(feed)
+    moving_boxes = tuple(track for track in boxes if track.moves)
+    tracks = by.boxed(boxes, moving_boxes) if boxes else by.linked()
+    moving: dict[int, NDArray[np.integer]] = {}
+    if "evidence" in feed.motion:
+        movers, moving = by.movers(moving_boxes)
+        tracks += movers
+    return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving)
 
 
 def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict[int, NDArray[np.integer]]:

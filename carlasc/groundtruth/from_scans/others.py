@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.grids import Grid
-from carlasc.groundtruth.from_scans.actors import Actors
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
-from carlasc.groundtruth.inputs import Plan
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
@@ -76,7 +76,7 @@ def feed_without(inputs: ScanSequence, hidden: Collection[int]) -> ScanFeed:
     return ScanFeed(WithoutScans(inputs.feed.sequence, hidden), replace(inputs.options, own_path=False))
 
 
-def grid_from_others(feed: ScanFeed, actors: Actors, frame: int, plan: Plan) -> Grid:
+def grid_from_others(feed: ScanFeed, actors: MovingActors, frame: int, plan: GridPlan) -> Grid:
     """Return the grid at a frame whose scan is hidden, in the sensor frame of that scan.
 
     Args:

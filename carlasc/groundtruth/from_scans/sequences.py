@@ -1,4 +1,4 @@
-"""Sequences whose grids are made from scans: each frame's grid from the scans around it in time."""
+"""Sequences whose grids are made from scans, each frame's from the scans around it in time, and the check of the trajectory that this needs."""
 
 from __future__ import annotations
 
@@ -12,19 +12,16 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import transform_points
+from carlasc.core.geometry import check_rigid, transform_points
 from carlasc.core.grids import Grid
-from carlasc.errors import CarlascError, MissingDataError
-from carlasc.groundtruth.from_scans.actors import FIRST_MOVER, Actors
+from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
-from carlasc.groundtruth.from_scans.trajectory import check_trajectory, with_estimated_poses
-from carlasc.groundtruth.heights import ground_of
 from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
-    Plan,
+    GridPlan,
     SequenceInput,
     StoredSequence,
     choose_frames,
@@ -33,7 +30,9 @@ from carlasc.groundtruth.inputs import (
 )
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.facts import Residual
-from carlasc.motion import LONGEST_M
+from carlasc.motion import LONGEST_M, ground_points
+from carlasc.motion.odometry import estimate_poses
+from carlasc.motion.tracks import FIRST_MOVER, MovingActors
 from carlasc.running.options import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
@@ -42,6 +41,8 @@ from carlasc.storage.sinks import SequenceWriter
 
 TRACKS = "tracks.npz"
 """The document that keeps the actors of a sequence beside its grids. It may be deleted: the next run makes it again."""
+_MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
+_RANGE_M = 100.0  # of a sensor whose range carlasc.json does not give
 _TENTH = 10
 _LOOKED_AT = 3  # scans that are looked at for ground below the grid
 _BELOW = 0.2  # share of ground points below the grid that is worth a note: on hills, some are
@@ -52,7 +53,7 @@ class ScanWindow:
     """What a worker needs of a sequence for one frame: its scans, and the actors in the window of the frame."""
 
     feed: ScanFeed
-    actors: Actors
+    actors: MovingActors
 
 
 @dataclass(frozen=True)
@@ -73,14 +74,14 @@ class ScanFrame(FrameInput):
         """Return the names of the scan fields that the frame has."""
         return scan_fields(self.inputs.feed.sequence, self.number)
 
-    def make(self, plan: Plan) -> FrameData:
+    def make(self, plan: GridPlan) -> FrameData:
         """Read the frame's own files, and count the votes of the scans in its window."""
         feed = self.inputs.feed
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec))
         return FrameData(fields, merged.grid, merged.votes, merged.evidence)
 
-    def thinned(self, plan: Plan) -> Grid:
+    def thinned(self, plan: GridPlan) -> Grid:
         """Return the grid without every tenth of the scans of other frames."""
         feed = self.inputs.feed
         window = feed.reaching(self.number, plan.spec)
@@ -110,10 +111,10 @@ class ScanFrame(FrameInput):
 class ScanSequence(StoredSequence):
     """A sequence whose scans are merged over time."""
 
-    def __init__(self, sequence: Sequence, plan: Plan, options: FromScans) -> None:
+    def __init__(self, sequence: Sequence, plan: GridPlan, options: FromScans) -> None:
         super().__init__(sequence, plan)
         self.options = options
-        self.actors = Actors()
+        self.actors = MovingActors()
 
     @cached_property
     def estimates_poses(self) -> bool:
@@ -226,25 +227,26 @@ class ScanSequence(StoredSequence):
                 scan = feed.sequence.scan(frame, () if feed.finds_ground else ("labels",))
             except CarlascError:
                 continue
-            ground = ground_of(scan.points, scan.labels, feed.classes.ground)
-            heights.append(ground[np.hypot(ground[:, 0], ground[:, 1]) < abs(spec.upper[0]), 2])
+            points, labels, classes = scan.points, scan.labels, sorted(feed.classes.ground)
+            ground = ground_points(points) if labels is None or not classes else np.isin(labels, classes)
+            heights.append(points[ground & (np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])), 2])
         below = np.concatenate(heights) < spec.lower[2]
         return float(below.mean()) if len(below) else 0.0
 
 
-def _read_actors(writer: SequenceWriter, key: str) -> Actors | None:
+def _read_actors(writer: SequenceWriter, key: str) -> MovingActors | None:
     """Return the actors that an earlier run kept; None if there are none, or they were made from something else."""
     data = writer.read_document(TRACKS)
     if data is None:
         return None
     try:
-        actors, made_from = Actors.from_bytes(data, TRACKS)
+        actors, made_from = MovingActors.from_bytes(data, TRACKS)
     except CarlascError:  # of another version, or damaged: it is only a copy of what the scans say
         return None
     return actors if made_from == key else None
 
 
-def scan_sequences(source: str | os.PathLike[str] | Source, plan: Plan, options: FromScans) -> list[SequenceInput]:
+def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, options: FromScans) -> list[SequenceInput]:
     """Find the sequences of a source that have scans.
 
     Raises:
@@ -260,3 +262,83 @@ def scan_sequences(source: str | os.PathLike[str] | Source, plan: Plan, options:
     if not chosen:
         raise MissingDataError(source, expected="sequences with scans (velodyne/)", found="none")
     return [ScanSequence(sequence, plan, options) for sequence in chosen]
+
+
+def with_estimated_poses(sequence: Sequence) -> Sequence:
+    """Return a sequence with poses estimated by KISS-ICP.
+
+    Lines of frames without a scan repeat the pose of the last scan.
+
+    Raises:
+        DependencyError: kiss-icp is not installed.
+    """
+    frames = sequence.frames("points")
+    scans = (sequence.read("points", int(frame))[:, :3] for frame in frames)
+    poses = estimate_poses(scans, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
+    lines = np.clip(np.searchsorted(frames, np.arange(frames[-1] + 1), side="right") - 1, 0, None)
+    return sequence.with_poses(poses[lines])
+
+
+def check_trajectory(sequence: Sequence, options: FromScans) -> None:
+    """Check that a sequence has rigid poses without jumps, and that its times, if it has any, increase.
+
+    Raises:
+        MissingDataError: it has no poses.
+        FormatError: nobody knows where points were seen from, a pose is not rigid, or jumps without `options.poses.force`, or a time does not increase; names the frame.
+    """
+    where = f"{sequence.location}/{layout.POSES}"
+    if not sequence.metadata.has_rays:
+        raise FormatError(
+            sequence.location,
+            expected="scans of a sensor whose place is known",
+            found='"rays": false in carlasc.json',
+            advice="free space cannot be told from unknown space: take the grids that came with the data",
+        )
+    if options.poses.source == "file" and layout.POSES not in sequence.documents():
+        raise MissingDataError(
+            where,
+            expected="poses, which merging scans needs",
+            found="none",
+            advice='estimate them with KISS-ICP (`poses=PoseOptions("kiss-icp")`)',
+        )
+    check_rigid(sequence.poses, where)
+    frames = sequence.frames("points")
+    _check_times(sequence, frames)
+    if not options.poses.force:
+        _check_speed(sequence, frames, where)
+
+
+def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> None:
+    poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
+    if layout.TIMES in sequence.documents():
+        elapsed_s = np.diff([sequence.read_time(int(frame)) for frame in frames])
+    else:
+        elapsed_s = np.diff(frames) * layout.FRAME_PERIOD_S
+    speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / elapsed_s
+    traces = np.einsum("fij,fij->f", poses[1:, :3, :3], poses[:-1, :3, :3])
+    turn = np.arccos(np.clip((traces - 1) / 2, -1, 1)) / elapsed_s
+    jumps = np.flatnonzero((speed > _MAX_SPEED_M_S) | (turn > _MAX_TURN_RAD_S))
+    if len(jumps):
+        row = int(jumps[0])
+        found = f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s at frame {frames[row + 1]}"
+        raise FormatError(
+            where,
+            expected=f"at most {_MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RAD_S:g} rad/s",
+            found=f"{found} ({len(jumps)} in all)",
+            advice="fix the poses, or continue with `force=True`",
+        )
+
+
+def _check_times(sequence: Sequence, frames: NDArray[np.int64]) -> None:
+    if layout.TIMES not in sequence.documents():
+        return
+    times = np.array([sequence.read_time(int(frame)) for frame in frames])
+    falls = np.flatnonzero(~(np.diff(times) > 0))
+    if len(falls):
+        row = int(falls[0])
+        raise FormatError(
+            f"{sequence.location}/{layout.TIMES}",
+            expected="increasing times",
+            found=f"{times[row]:g} s and {times[row + 1]:g} s at frames {frames[row]} and {frames[row + 1]}",
+            advice="fix the file, or remove it: frames are then 0.1 s apart",
+        )

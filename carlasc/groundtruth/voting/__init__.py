@@ -1,6 +1,5 @@
 """Voting: observations are turned into votes, and votes into a grid."""
 
-from carlasc.groundtruth.voting.ballot import Ballot, VoteRule, Votes, count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, VoteRule, Votes, count_votes
 
 __all__ = ["Ballot", "Observation", "VoteRule", "Votes", "count_votes"]

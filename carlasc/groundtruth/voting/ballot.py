@@ -1,4 +1,4 @@
-"""Votes of observations on the voxels of a grid, and the grid that the votes decide.
+"""Observations (the points of a scan, their labels, the pose of the sensor), their votes on the voxels of a grid, and the grid that these decide.
 
 Every labelled point votes for its class in its voxel, and free samples on its ray vote for free space (class 0) in their voxels. A voxel
 takes the class with most votes, ties go to the lowest id, and a voxel without votes is unknown: see the format page,
@@ -10,22 +10,64 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.errors import ArgumentError
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
-VoteRule = Literal["sensor", "sample", "ray"]
-
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
+NOWHERE = 65534
+"""A region without voxels: rays with it do not vote."""
 OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One voter: the scan of one sensor at one instant. Its points vote for their classes, its rays for free space.
+
+    Attributes:
+        points: (N, 3) float32, metres, in the sensor's frame. The rounding to float32 is part of the rule: see the format page,
+            `docs/format.md#votes`.
+        labels: (N,) unsigned integer class ids. Points labelled 0 and their rays do not vote.
+        grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's.
+        hits: (N,) bool, points that vote for their class; of the other points only the rays vote. None: all points.
+        hit_region: region of the grid in which the points vote; None for the whole grid.
+        free_region: region of the grid in which the rays vote; None for the whole grid.
+
+    Raises:
+        FormatError: points and labels differ in length, have another shape or type, or the transform is not rigid.
+    """
+
+    points: NDArray[np.float32]
+    labels: NDArray[np.unsignedinteger]
+    grid_T_sensor: Transform
+    hits: NDArray[np.bool_] | None = None
+    hit_region: int | None = None
+    free_region: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
+            found = f"{self.points.shape} {self.points.dtype}"
+            raise FormatError("observation points", expected="shape (N, 3) float32", found=found)
+        if self.labels.shape != (len(self.points),):
+            expected = f"shape ({len(self.points)},), one per point"
+            raise FormatError("observation labels", expected=expected, found=str(self.labels.shape))
+        if self.labels.dtype.kind != "u":
+            raise FormatError("observation labels", expected="unsigned integers", found=str(self.labels.dtype))
+        if self.hits is not None and self.hits.shape != self.labels.shape:
+            raise FormatError("observation hits", expected=f"shape ({len(self.points)},)", found=str(self.hits.shape))
+        check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
+
+    def __len__(self) -> int:
+        return len(self.points)
 
 
 def count_votes(
@@ -43,7 +85,7 @@ def count_votes(
         spec: geometry of the grid.
         classes: class table of the labels.
         rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample" and "ray": every sample
-            counts (they differ in what the votes decide: see `carlasc.groundtruth.voting.evidence`).
+            counts (they differ in what the votes decide: see `carlasc.groundtruth.voting.certainty`).
         free_step_m: distance between two free samples on a ray, in metres.
 
     Raises:
@@ -129,10 +171,8 @@ class Ballot:
         from carlasc.groundtruth.voting import kernel, rays
 
         self.classes.check(observation.labels, "observation labels")
-        hit_region, free_region = (
-            kernel.ANYWHERE if region is None else region
-            for region in (observation.hit_region, observation.free_region)
-        )
+        hit_region = kernel.ANYWHERE if observation.hit_region is None else observation.hit_region
+        free_region = kernel.ANYWHERE if observation.free_region is None else observation.free_region
         if not len(self._tally.regions) and (hit_region, free_region) != (kernel.ANYWHERE, kernel.ANYWHERE):
             raise ArgumentError(
                 "observation", expected="no region, as the ballot has none", found="one that votes in a region"
@@ -145,12 +185,12 @@ class Ballot:
             labels,
             labels if observation.hits is None else np.where(observation.hits, labels, np.uint16(0)),
             pose,
-            rays.View.of(pose, self._cells),
+            rays.GridView.of(pose, self._cells),
             self._cells,
             self.free_step_m,
             self.num_observations,
             hit_region,
-            free_region,
+            kernel.NOT_AT_ALL if free_region == NOWHERE else free_region,
             self._tally,
         )
         self.num_observations += 1
@@ -181,11 +221,11 @@ class Ballot:
         Args:
             copy: whether later observations leave the result as it is; without a copy, the ballot must take no more of them.
         """
-        from carlasc.groundtruth.voting import results
+        from carlasc.groundtruth.voting import kernel
 
         candidates = self._tally.candidates[: self._tally.used[0]]
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
-        results.collect(self._tally.heads, candidates, occupied)
+        kernel.collect(self._tally.heads, candidates, occupied)
         free = self._tally.free[:-1].reshape(self.spec.size)
         return Votes(self.spec, self.classes, free.copy() if copy else free, occupied)
 
@@ -226,10 +266,10 @@ class Votes:
 
     def _elect(self, counts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return (V,) the class with most votes, ties to the lowest id, and (V,) the sum of the votes, in `counts`: those of class 0."""
-        from carlasc.groundtruth.voting import results
+        from carlasc.groundtruth.voting import kernel
 
         labels = np.zeros(len(counts), self.classes.dtype)
-        results.elect(self.occupied, labels, counts)
+        kernel.elect(self.occupied, labels, counts)
         return labels, counts
 
     def occupied_counts(self) -> NDArray[np.int64]:
@@ -245,11 +285,11 @@ class Votes:
         Returns:
             (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
         """
-        from carlasc.groundtruth.voting import results
+        from carlasc.groundtruth.voting import kernel
 
         votes = np.empty(
             np.count_nonzero(self.free) + len(self.occupied),
             VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE,
         )
-        results.interleave(self.free.reshape(-1), self.occupied, votes, _MOST_VOTES)
+        kernel.interleave(self.free.reshape(-1), self.occupied, votes, _MOST_VOTES)
         return votes

@@ -1,7 +1,7 @@
-"""The compiled loops of the voting: they add the votes of one observation.
+"""The compiled loops of the voting: they add the votes of one observation, read the votes that were counted, and mark the voxels of points.
 
 Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the voxels of their samples; where rounding
-could change the voxel, rule.py finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
+could change the voxel, its rule finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
 per voxel.
 """
 
@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Cells, Pose, transform
+from carlasc.core.cells import Cells, Pose, as_pose, find_voxel, transform
 from carlasc.core.compiling import cached, inlined, jit
-from carlasc.groundtruth.voting.observations import NOWHERE
+from carlasc.core.geometry import Transform
+from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
     DOUBTFUL,
@@ -23,20 +24,22 @@ from carlasc.groundtruth.voting.rays import (
     MARGIN,
     SURE,
     UNSURE,
-    Rays,
-    View,
+    GridView,
+    RayBlock,
     clip,
     empty_rays,
     narrow,
     place_cartesian,
     place_cylindrical,
     place_points,
+    sample_voxel,
+    unit_ray,
 )
-from carlasc.groundtruth.voting.rule import sample_voxel, unit_ray
 
 BLOCK = 256  # number of rays whose coordinates fit into the L1 cache
 NONE = -1  # end of a voxel's list of candidates
 ANYWHERE = -1  # region of votes that count in all regions
+NOT_AT_ALL = -2  # region of rays that do not vote
 OUTSIDE = np.iinfo(np.uint16).max  # region of samples outside the grid
 
 CANDIDATE_DTYPE = np.dtype(
@@ -84,7 +87,7 @@ def count_view(voxel: int, voter: int, tally: Tally) -> None:
 def vote_occupied(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
-    rays: Rays,
+    rays: RayBlock,
     hits: NDArray[np.int32],
     pose: Pose,
     cells: Cells,
@@ -129,9 +132,9 @@ def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
 def vote_free(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
-    rays: Rays,
+    rays: RayBlock,
     pose: Pose,
-    view: View,
+    view: GridView,
     cells: Cells,
     free_step_m: float,
     voter: int,
@@ -193,13 +196,13 @@ def vote_free_by_rule(
     y: np.float32,
     z: np.float32,
     pose: Pose,
-    view: View,
+    view: GridView,
     cells: Cells,
     free_step_m: float,
     region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of one ray's free samples by rule.py alone, clipped to the grid with a wide margin."""
+    """Add the votes of one ray's free samples by the rule alone, clipped to the grid with a wide margin."""
     norm, ux, uy, uz = unit_ray(x, y, z)
     starts = transform(view.pose, x, y, z)
     units = transform(view.pose, ux, uy, uz)
@@ -226,7 +229,7 @@ def vote(
     labels: NDArray[np.uint16],
     hit_labels: NDArray[np.uint16],
     pose: Pose,
-    view: View,
+    view: GridView,
     cells: Cells,
     free_step_m: float,
     voter: int,
@@ -246,7 +249,7 @@ def vote(
         free_step_m: distance between two free samples, metres.
         voter: number of the observation.
         hit_region: region in which points vote, or ANYWHERE.
-        free_region: region in which rays vote, ANYWHERE, or NOWHERE.
+        free_region: region in which rays vote, ANYWHERE, or NOT_AT_ALL.
         tally: the votes so far, with room for N more candidates.
     """
     rays, hits = empty_rays(BLOCK), np.empty(BLOCK, np.int32)
@@ -257,7 +260,7 @@ def vote(
         place_points(rays, view, hits)
         own = hit_labels[begin : begin + BLOCK]
         vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
-        if free_region != NOWHERE:
+        if free_region != NOT_AT_ALL:
             vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
     if tally.once:
         if free_region != ANYWHERE:
@@ -266,3 +269,95 @@ def vote(
         for v in range(len(tally.passed)):
             tally.free[v] += tally.passed[v]
             tally.passed[v] = 0
+
+
+@cached
+def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[Any]) -> None:
+    """Write the candidates of all voxels into a table, sorted by voxel, then by label.
+
+    Args:
+        heads: (V,) index of the first candidate of each voxel, or NONE.
+        candidates: (C,) CANDIDATE_DTYPE.
+        rows: (C,) output, `voxel`, `label`, `votes`.
+    """
+    end = 0
+    for head in heads:
+        begin, entry = end, head
+        while entry != NONE:
+            row = end
+            while row > begin and rows[row - 1].label > candidates[entry].label:
+                rows[row] = rows[row - 1]
+                row -= 1
+            rows[row].voxel = candidates[entry].voxel
+            rows[row].label = candidates[entry].label
+            rows[row].votes = candidates[entry].votes
+            end += 1
+            entry = candidates[entry].next
+
+
+@cached
+def elect(rows: NDArray[Any], labels: NDArray[Any], counts: NDArray[Any]) -> None:
+    """Find the class with most votes of each voxel, where ties go to the lowest id, and the sum of its votes.
+
+    Args:
+        rows: (M,) `voxel`, `label`, `votes` of the classes other than 0, sorted by voxel, then by label.
+        labels: (V,) zeros; output, the classes.
+        counts: (V,) votes of class 0; output, the sums.
+    """
+    row = 0
+    while row < len(rows):
+        voxel = rows[row].voxel
+        label, most = np.uint16(0), np.int64(counts[voxel])
+        while row < len(rows) and rows[row].voxel == voxel:
+            votes = rows[row].votes
+            counts[voxel] += votes
+            if votes > most:
+                label, most = rows[row].label, votes
+            row += 1
+        labels[voxel] = label
+
+
+@cached
+def interleave(free: NDArray[Any], rows: NDArray[Any], votes: NDArray[Any], most: int) -> None:
+    """Write the votes of all classes into one table, sorted by voxel, then by label.
+
+    Args:
+        free: (V,) votes of class 0.
+        rows: (M,) `voxel`, `label`, `votes` of the other classes, in this order.
+        votes: output, `voxel`, `label`, `votes`, with a row for each element of `free` that is not 0 and for each of `rows`.
+        most: numbers of votes above it are written as `most`.
+    """
+    row, end = 0, 0
+    for voxel in range(len(free)):
+        if free[voxel]:
+            votes[end].voxel, votes[end].label, votes[end].votes = voxel, 0, min(np.int64(free[voxel]), most)
+            end += 1
+        while row < len(rows) and rows[row].voxel == voxel:
+            votes[end].voxel, votes[end].label = voxel, rows[row].label
+            votes[end].votes = min(rows[row].votes, most)
+            row, end = row + 1, end + 1
+
+
+def mark(
+    points: NDArray[np.floating], grid_T_points: Transform, spec: GridSpec, marked: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    """Return which voxels have points, (V,) bool: what `GridSpec.flat_index` finds, without an array for each step.
+
+    Args:
+        points: (N, 3) metres.
+        grid_T_points: (4, 4), from the frame of the points to the grid's.
+        spec: geometry of the grid.
+        marked: (V,) bool, voxels that are marked already; it is changed, and returned. None: no voxel is.
+    """
+    marked = np.zeros(spec.num_voxels, np.bool_) if marked is None else marked
+    _mark(np.ascontiguousarray(points, np.float64), as_pose(grid_T_points), Cells.of(spec), marked)
+    return marked
+
+
+@cached
+def _mark(points: NDArray[np.float64], pose: Pose, cells: Cells, marked: NDArray[np.bool_]) -> None:
+    for i in range(len(points)):
+        x, y, z = transform(pose, points[i, 0], points[i, 1], points[i, 2])
+        voxel = find_voxel(x, y, z, cells)
+        if voxel < len(marked):
+            marked[voxel] = True

@@ -1,9 +1,12 @@
-"""The fast twin of rule.py: it finds the voxels of many samples at once, in vectorised code, and never another voxel than rule.py.
+"""The rule that places the samples of a ray in voxels, and its fast twin, which never finds another voxel.
 
-Rays are clipped to the grid's box. Samples are computed in working coordinates: cells, counted from the grid's lower corner (for a
-cylindrical grid: metres in x and y, cells in z). There a sample is `start - step * stride`, which differs from rule.py's only by rounding, by
-far less than `MARGIN` cells. So a sample that is farther than this from the edges of its cell is in the same voxel as by rule.py. The few
-others, some in a million, are DOUBTFUL, and rule.py finds their voxels.
+`sample_voxel` is the rule, bit for bit, one sample at a time (see the format page, `docs/format.md#votes`): norm and unit ray are float32, as
+the points are; distances, differences and the transform are float64; the cell is that of `carlasc.core.cells.find_voxel`.
+
+The twin finds the voxels of many samples at once, in vectorised code. RayBlock are clipped to the grid's box. Samples are computed in working
+coordinates: cells, counted from the grid's lower corner (for a cylindrical grid: metres in x and y, cells in z). There a sample is
+`start - step * stride`, which differs from the rule's only by rounding, by far less than `MARGIN` cells. So a sample that is farther than this
+from the edges of its cell is in the same voxel as by the rule. The few others, some in a million, are DOUBTFUL, and the rule finds their voxels.
 """
 
 from __future__ import annotations
@@ -14,16 +17,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import AZIMUTH_ERROR, Cells, Pose, Real, Triple, fast_azimuth, transform
+from carlasc.core.cells import (
+    AZIMUTH_ERROR,
+    Cells,
+    Pose,
+    Real,
+    Triple,
+    fast_azimuth,
+    find_voxel,
+    transform,
+)
 from carlasc.core.compiling import fused, inlined, jit
-from carlasc.groundtruth.voting.rule import before_sensor, unit_ray
 
 DOUBTFUL = -1  # index of a sample that is too near an edge of its cell
 
 # The states of a ray:
 SURE = 0.0
 DROPPED = 1.0  # it does not vote
-UNSURE = 2.0  # rule.py must find its samples: they are too far away, or one is at the sensor
+UNSURE = 2.0  # the rule must find its samples: they are too far away, or one is at the sensor
 
 CHUNK = 8  # number of samples of a ray that are processed at once: the width of a vector register
 MARGIN = 1e-7  # cells
@@ -31,7 +42,34 @@ _ROUNDING = 2.0**-48  # bound on the relative error of a coordinate: 16 times th
 _NEAR_AXIS = 256.0  # azimuths are exact to the margin down to 1 / 256 of the radius at which cells are as wide as deep
 
 
-class View(NamedTuple):
+@inlined
+def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
+    """Return the norm of a point and the unit ray to it, all float32."""
+    norm = np.sqrt(x * x + y * y + z * z)
+    return norm, x / norm, y / norm, z / norm
+
+
+@inlined
+def before_sensor(x: Real, ux: Real) -> bool:
+    """Return whether a sample is kept: its x over the unit ray's is positive. A ray whose x is 0 drops out altogether."""
+    return bool(x / ux > 0.0 and ux != 0.0)
+
+
+@jit
+def sample_voxel(
+    x: Real, y: Real, z: Real, step: float, free_step_m: float, pose: Pose, cells: Cells
+) -> tuple[bool, int]:
+    """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and its voxel."""
+    _, ux, uy, uz = unit_ray(x, y, z)
+    back = step * free_step_m
+    sx, sy, sz = np.float64(x) - ux * back, np.float64(y) - uy * back, np.float64(z) - uz * back
+    if not before_sensor(sx, ux):
+        return False, cells.size[0] * cells.size[1] * cells.size[2]
+    gx, gy, gz = transform(pose, sx, sy, sz)
+    return True, find_voxel(gx, gy, gz, cells)
+
+
+class GridView(NamedTuple):
     """The grid as seen from one sensor, in working coordinates.
 
     Attributes:
@@ -61,7 +99,7 @@ class View(NamedTuple):
     reach: float
 
     @classmethod
-    def of(cls, pose: Pose, cells: Cells) -> View:
+    def of(cls, pose: Pose, cells: Cells) -> GridView:
         """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
         size, lower, upper = (np.array(v, np.float64) for v in (cells.size, cells.lower, cells.upper))
         voxel = np.array(cells.voxel_size)
@@ -96,7 +134,7 @@ class View(NamedTuple):
         )
 
 
-class Rays(NamedTuple):
+class RayBlock(NamedTuple):
     """A block of rays in working coordinates, (n,) float64 each.
 
     Attributes:
@@ -119,10 +157,10 @@ class Rays(NamedTuple):
 
 
 @jit
-def empty_rays(n: int) -> Rays:
+def empty_rays(n: int) -> RayBlock:
     """Return memory for a block of `n` rays."""
     x, y, z, dx, dy, dz = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    return Rays(x, y, z, dx, dy, dz, np.empty(n), np.empty(n), np.empty(n))
+    return RayBlock(x, y, z, dx, dy, dz, np.empty(n), np.empty(n), np.empty(n))
 
 
 @inlined
@@ -138,7 +176,9 @@ def narrow(first: Real, last: Real, start: float, stride: Real, low: Real, high:
 
 
 @jit
-def clip(points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: float, view: View, rays: Rays) -> None:
+def clip(
+    points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: float, view: GridView, rays: RayBlock
+) -> None:
     """Transform points (3 n,) with labels (n,) to working coordinates, and find the free samples inside the grid's box."""
     low, high = view.low, view.high
     for i in range(len(labels)):
@@ -167,7 +207,7 @@ def clip(points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: f
 
 
 @jit
-def place_points(rays: Rays, view: View, voxels: NDArray[np.int32]) -> None:
+def place_points(rays: RayBlock, view: GridView, voxels: NDArray[np.int32]) -> None:
     """Find the voxels of the points of a block: their index, the number of voxels for points outside the grid, or DOUBTFUL."""
     if view.cylindrical:
         for i in range(len(voxels)):
@@ -178,13 +218,13 @@ def place_points(rays: Rays, view: View, voxels: NDArray[np.int32]) -> None:
 
 
 @fused
-def place_cartesian(u: float, v: float, w: float, view: View) -> np.int32:
+def place_cartesian(u: float, v: float, w: float, view: GridView) -> np.int32:
     """Return the voxel of a sample given in cells: its index, the number of voxels for a sample outside the grid, or DOUBTFUL."""
     return voxel_of(u, v, w, 0.0, view)
 
 
 @fused
-def place_cylindrical(x: float, y: float, w: float, view: View) -> np.int32:
+def place_cylindrical(x: float, y: float, w: float, view: GridView) -> np.int32:
     """Return the voxel of a sample given in metres in x and y, and cells in z, as `place_cartesian` does."""
     radius = np.sqrt(x * x + y * y)
     v = fast_azimuth(x, y) * view.scale[1] - view.offset[1]
@@ -195,7 +235,7 @@ def place_cylindrical(x: float, y: float, w: float, view: View) -> np.int32:
 
 
 @fused
-def voxel_of(u: float, v: float, w: float, off: float, view: View) -> np.int32:
+def voxel_of(u: float, v: float, w: float, off: float, view: GridView) -> np.int32:
     """Return the voxel of a sample given in cells; DOUBTFUL also if `off`, a distance from the middle of a cell, is too large."""
     i, j, k = np.floor(u), np.floor(v), np.floor(w)
     a, b, c = from_middle(u), from_middle(v), from_middle(w)

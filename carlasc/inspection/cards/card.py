@@ -18,7 +18,7 @@ from carlasc.inspection.texts import say
 from carlasc.running.options import Run
 from carlasc.storage import as_source
 from carlasc.storage.files import parse_json, write_output
-from carlasc.storage.packed.tables.reading import ParquetSource
+from carlasc.storage.parquet.parquet_source import ParquetSource
 from carlasc.storage.protocol import Source
 
 README, CROISSANT, PICTURES = "README.md", "croissant.json", "images"
@@ -163,7 +163,7 @@ def _describe(facts: Facts) -> str:
 
 def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:
     """Draw a grid and a scan; return (file, what it shows) of each picture, and notes on those that could not be drawn."""
-    from carlasc.viewing import Scene, render
+    from carlasc.viewing import Scene, StyleOptions, render
 
     drawn, notes = [], []
     with_content = {
@@ -183,7 +183,7 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
             scene = Scene(
                 sequence, frames=(frame, frame + 1), grid=None if what == "scan" else next(iter(sequence.grids))
             )
-            result = render(scene, target, what=what, size=_SIZE, overwrite=overwrite)
+            result = render(scene, target, what=what, style=StyleOptions(size=_SIZE), overwrite=overwrite)
         except (DependencyError, MissingDataError) as error:
             notes.append(f"no picture of a {what}: {error}")
             continue

@@ -16,7 +16,7 @@ from carlasc.inspection.overview import GridOverview, Overview, info
 from carlasc.inspection.statistics import Histogram, Statistics, stats
 from carlasc.running.options import Run
 from carlasc.storage import layout
-from carlasc.storage.packed.protocol import PackedSource
+from carlasc.storage.packed.stores import PackedSource
 from carlasc.storage.protocol import Sequence as StoredSequence
 from carlasc.storage.protocol import Source
 

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from carlasc.errors import ArgumentError
 from carlasc.storage import layout
 from carlasc.storage.folders.trees import RemoteTree, is_url
-from carlasc.storage.packed.tables.reading import FRAMES, ParquetSource, opened
+from carlasc.storage.parquet.parquet_source import FRAMES, ParquetSource, opened
 from carlasc.storage.protocol import Sequence, Source
 
 HUB_SPLITS = {"Train": "train", "Val": "validation", "Test": "test"}

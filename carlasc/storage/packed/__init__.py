@@ -1,1 +1,1 @@
-"""Packed stores: zarr and HDF5, which hold arrays (`arrays`), and Parquet, which holds tables (`tables`)."""
+"""What all packed stores share, and what zarr and HDF5 share: the place of a frame, its columns and its chunks."""

@@ -109,6 +109,7 @@ class PatientFile(io.RawIOBase):
         self._path, self._place = path, place
         self._position = self._size = 0
         self._error: OSError | None = None
+        self._descriptor = -1  # until it is open
         try:
             make_folder(path.parent)
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
@@ -190,7 +191,8 @@ class PatientFile(io.RawIOBase):
         if not self.closed:
             super().close()
             try:
-                os.close(self._descriptor)
+                if self._descriptor >= 0:  # Python also closes a file that could not be created
+                    os.close(self._descriptor)
             except OSError as error:  # a network file system may report here what it could not write
                 self._error = self._error or error
 

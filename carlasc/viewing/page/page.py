@@ -2,24 +2,166 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from carlasc.errors import ArgumentError
-from carlasc.storage.files import write_output
+from carlasc.errors import ArgumentError, ConflictError
+from carlasc.storage.durability import make_folder, sync_all
+from carlasc.storage.files import write_output, writing
+from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.page.assembly import compose
 from carlasc.viewing.page.coding import pack_arrays
 from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content
-from carlasc.viewing.page.folder import FRAMES, check_folder, writing_folder
 from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import ViewResult, check_target, first_frames
 
+SCRIPTS = (
+    "interface.js",
+    "decode.js",
+    "store.js",
+    "modes.js",
+    "voxels.js",
+    "points.js",
+    "path.js",
+    "panels.js",
+    "divider.js",
+    "plot.js",
+    "keys.js",
+    "viewer.js",
+)
+FRAMES = "frames"
+_MARK = b'<meta name="generator" content="carlasc">'
 PAGES = (".html", ".htm")
 """Endings of the names of pages in one file."""
+
+
+def compose(name: str, describe: Callable[[], Mapping[str, Any]], blocks: Iterator[bytes] | None) -> Iterator[bytes]:
+    """Yield a page piece by piece.
+
+    Args:
+        name: title of the page.
+        describe: returns the description of the scene. It is called after the last block was taken.
+        blocks: the frames, which become part of the page; None if a browser fetches each from the page's folder.
+    """
+    assets = files("carlasc.viewing.page").joinpath("assets")
+
+    def read(asset: str) -> str:
+        return assets.joinpath(asset).read_text("utf-8")
+
+    def frames() -> Iterator[str]:
+        for number, block in enumerate(blocks or ()):
+            text = base64.b64encode(block).decode()
+            yield f'<script type="application/octet-stream" id="frame{number}">{text}</script>\n'
+
+    def scene() -> Iterator[str]:
+        described = {**describe(), "embedded": blocks is not None}
+        yield json.dumps(described, separators=(",", ":")).replace("<", "\\u003c")
+
+    scripts = "\n".join(read(script) for script in SCRIPTS)
+    parts: dict[str, Callable[[], Iterator[str]]] = {
+        "TITLE": lambda: iter([html.escape(name)]),
+        "STYLE": lambda: iter([read("style.css")]),
+        "CONNECT": lambda: iter(["'none'" if blocks is not None else "'self'"]),
+        "FRAMES": frames,
+        "SCENE": scene,
+        "LICENCE": lambda: iter([html.escape(read("vendor/three.LICENSE")).replace("--", "- -")]),
+        "THREE": lambda: iter([read("vendor/three.min.js")]),
+        "SCRIPTS": lambda: iter([f'"use strict";\n{scripts}']),
+    }
+    head, *rest = read("template.html").split("{{")
+    yield head.encode()
+    for piece in rest:
+        part, text = piece.split("}}", 1)
+        for found in parts[part]():
+            yield found.encode()
+        yield text.encode()
+
+
+def check_folder(out: Path, overwrite: bool) -> None:
+    """Check that the folder of a page can be written: it does not exist, is empty, or is a page that may be replaced.
+
+    Raises:
+        ConflictError: something else exists there, or `overwrite` is not given.
+    """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    if not _is_page(out):
+        found = "a folder with other files" if out.is_dir() else "a file"
+        advice = "choose another name; one that ends in .html writes a page in one file"
+        raise ConflictError(out, expected="the folder of a page, or a new one", found=found, advice=advice)
+    if not overwrite:
+        raise ConflictError(
+            out, problem="the page exists", advice="choose another name, or replace it with `overwrite=True`"
+        )
+
+
+class NewFolder:
+    """A folder that is being written.
+
+    Attributes:
+        size_bytes: size of the files so far.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._written: list[Path] = []
+        self.size_bytes = 0
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file, with the folders that it needs."""
+        path = self._path / name
+        make_folder(path.parent)
+        path.write_bytes(data)
+        self._written.append(path)
+        self.size_bytes += len(data)
+
+    def sync(self) -> None:
+        """Wait until the files and their names are on the disk."""
+        sync_all(self._written)
+        sync_all({path.parent for path in self._written})
+
+
+@contextmanager
+def writing_folder(out: Path) -> Iterator[NewFolder]:
+    """Yield a folder that gets its name when the block ends, and that is removed if it fails.
+
+    What is in its place is removed only then; `check_folder` says whether it may be.
+
+    Raises:
+        StorageError: it cannot be written; nothing is left behind.
+    """
+    out = out.resolve()  # "." has no name
+    part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
+    try:
+        with writing(out):
+            remove(part)  # what a killed run left
+            make_folder(part)
+            folder = NewFolder(part)
+            yield folder
+            folder.sync()
+            if out.exists():
+                remove(old)
+                out.rename(old)
+            part.rename(out)
+            sync_all([out.parent])
+            remove(old)
+    finally:
+        remove(part)
+        if old.exists() and not out.exists():
+            old.rename(out)
+
+
+def _is_page(path: Path) -> bool:
+    index = path / "index.html"
+    return index.is_file() and _MARK in index.read_bytes()[:2000] and (path / FRAMES).is_dir()
 
 
 def write_page(

@@ -2,29 +2,164 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform
-from carlasc.core.grids import Grid
+from carlasc.core.geometry import Transform, transform_points
+from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
-from carlasc.viewing.recordings.trails import Trail, Trails
 from carlasc.viewing.rendering.drawings import motion_arrows
-from carlasc.viewing.scene import SceneReader
+from carlasc.viewing.rendering.meshes import SQUARE, split_arcs, surrounded
+from carlasc.viewing.scene import FrameContent, SceneReader
 
+LONGEST = 50
+"""Frames that a trail reaches back: five seconds at the rate of the data."""
+
+_LEAST_WAY_M = 1.0  # what moved less stands: boxes of parked cars move by decimetres
+_MOVING_M_S = 0.2
 MAX_POINTS = 30_000
 """Points of a frame, unless all are asked for: a frame is then smaller than half a megabyte."""
 
 _GOLDEN = (
     2654435769  # 2**32 over the golden ratio: multiples of it, modulo 2**32, are spread evenly, however many are taken
 )
+
+
+class Trail(NamedTuple):
+    """The way of one actor up to a frame.
+
+    Attributes:
+        actor: number of the track, or of the instance where there are no boxes.
+        label: class id.
+        points: (K, 3) float64 metres in the world, the frame of the first scan; the last is in the present frame.
+    """
+
+    actor: int
+    label: int
+    points: NDArray[np.float64]
+
+
+@dataclass
+class Trails:
+    """Follows the actors of a sequence from frame to frame. It remembers `LONGEST` frames, however long the sequence is."""
+
+    _ways: dict[int, deque[NDArray[np.float64]]] = field(default_factory=dict)
+    _missed: dict[int, int] = field(default_factory=dict)
+
+    def follow(self, content: FrameContent) -> tuple[Trail, ...]:
+        """Return the trails of the actors that a frame shows and that have moved; none without poses.
+
+        An actor is where its box is. In sequences without boxes, it is in the middle of the points of its instance, if these move.
+        """
+        if content.pose is None:
+            return ()
+        trails, seen = [], set()
+        for actor, label, center in _actors(content):
+            seen.add(actor)
+            way = self._ways.setdefault(actor, deque(maxlen=LONGEST))
+            way.append(transform_points(content.pose, center))
+            points = np.array(way)
+            if np.linalg.norm(points.max(0) - points.min(0)) >= _LEAST_WAY_M:
+                trails.append(Trail(actor, label, points))
+        self._missed = {actor: 0 if actor in seen else self._missed.get(actor, 0) + 1 for actor in self._ways}
+        for actor in [actor for actor, missed in self._missed.items() if missed >= LONGEST]:
+            del self._ways[actor]
+        return tuple(trails)
+
+
+def _actors(content: FrameContent) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+    """Yield the number, the class and the (3,) position of each actor, in the frame of the sensor."""
+    scan, boxes = content.scan, content.boxes
+    if boxes is not None:
+        yield from zip(boxes.tracks.tolist(), boxes.labels.tolist(), boxes.centers, strict=True)
+        return
+    if scan is None or scan.instances is None:
+        return
+    chosen = scan.instances > 0
+    if scan.flow is not None:
+        chosen &= np.linalg.norm(scan.flow, axis=1) > _MOVING_M_S
+    actors, first, group = np.unique(scan.instances[chosen], return_index=True, return_inverse=True)
+    points = scan.points[chosen].astype(np.float64)
+    count = np.bincount(group.reshape(-1), minlength=len(actors))
+    middles = np.stack([np.bincount(group.reshape(-1), points[:, a], len(actors)) for a in range(3)], axis=1)
+    labels = np.zeros(len(points), np.int64) if scan.labels is None else scan.labels[chosen]
+    yield from zip(actors.tolist(), labels[first].tolist(), middles / count[:, None], strict=True)
+
+
+class Triangles(NamedTuple):
+    """A surface.
+
+    Attributes:
+        corners: (V, 3) float32 metres, four for each flat face, in order around it.
+        normals: (V, 3) float32 unit vectors, outward.
+        indices: (T, 3) uint32 rows of `corners`, counter-clockwise seen from outside.
+    """
+
+    corners: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    indices: NDArray[np.uint32]
+
+
+def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
+    """Yield each class of a cylindrical grid with the surface of its voxels, without the faces that two voxels share.
+
+    The lowest faces of the lowest cells, which are seen from below the ground only, are left out.
+    """
+    spec, labels = split_arcs(grid.spec, grid.labels)
+    parts = [_faces(spec, labels, axis, side) for axis in range(3) for side in (0, 1)]
+    corners, normals, owners = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    for label in np.unique(owners).tolist():
+        chosen = owners == label
+        first = 4 * np.arange(np.count_nonzero(chosen), dtype=np.uint32)[:, None, None]
+        indices = (first + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
+        yield label, Triangles(corners[chosen].reshape(-1, 3), np.repeat(normals[chosen], 4, axis=0), indices)
+
+
+def _faces(
+    spec: GridSpec, labels: NDArray[np.unsignedinteger], axis: int, side: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.unsignedinteger]]:
+    """Return the (Q, 4, 3) corners, the (Q, 3) normals and the (Q,) classes of the exposed faces towards one side of one axis."""
+    solid = surrounded(spec, labels > 0)
+    behind = np.roll(solid, 1 - 2 * side, axis)[1:-1, 1:-1, 1:-1]
+    shown = np.where(behind, 0, labels)
+    if axis == 0 and side == 0 and spec.lower[0] == 0:
+        shown[0] = 0  # at radius 0 the wedge ends in a line
+    if (axis, side) == (2, 0):
+        shown[:, :, 0] = 0
+    along = 2 if axis == 0 else 0  # the edges of cells are straight along the radius and along z
+    before = np.roll(shown, 1, along)
+    after = np.roll(shown, -1, along)
+    ends: tuple[list[slice | int], list[slice | int]] = ([slice(None)] * 3, [slice(None)] * 3)
+    ends[0][along], ends[1][along] = 0, -1
+    before[tuple(ends[0])], after[tuple(ends[1])] = 0, 0
+
+    def in_lines(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the cells of a mask, line after line along the axis of the runs."""
+        moved = np.argwhere(np.moveaxis(mask, along, 2))
+        return np.insert(moved[:, :2], along, moved[:, 2], axis=1)
+
+    first, last = in_lines((shown > 0) & (shown != before)), in_lines((shown > 0) & (shown != after))
+    edges = [spec.edges(a) for a in range(3)]
+    across, up = (axis + 1) % 3, (axis + 2) % 3
+    corners: NDArray[np.floating] = np.empty((len(first), 4, 3))
+    for number, (one, two) in enumerate(SQUARE if side else SQUARE[::-1]):
+        offset = np.zeros(3, np.int64)
+        offset[[axis, across, up]] = side, one, two
+        lattice = np.where(offset == 1, last + 1, first)
+        lattice[:, axis] = first[:, axis] + side
+        corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
+    corners = spec.from_axes(corners)
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return corners.astype(np.float32), normals.astype(np.float32), labels[tuple(first.T)]
 
 
 @dataclass(frozen=True)

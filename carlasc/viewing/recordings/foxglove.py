@@ -27,8 +27,7 @@ from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.errors import import_extra
 from carlasc.viewing import colors as palette
-from carlasc.viewing.recordings.content import RecordedFrame, point_colors
-from carlasc.viewing.recordings.wedges import class_surfaces
+from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces, point_colors
 from carlasc.viewing.scene import GridPanel, SceneReader
 
 WORLD, EGO = "world", "ego"

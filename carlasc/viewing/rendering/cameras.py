@@ -8,11 +8,12 @@ the left of the picture in both, and no geometry is mirrored.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.choices import ViewName
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import ArgumentError
@@ -22,6 +23,9 @@ Floats = NDArray[np.float64]
 
 DEFAULT_ELEVATION_RAD = np.deg2rad(42.0)
 DEFAULT_FOV_RAD = np.deg2rad(32.0)
+
+View = Literal["perspective", "bev"]
+VIEWS: tuple[View, ...] = get_args(View)
 
 _NEAREST_M = 1.0
 
@@ -103,6 +107,35 @@ class Viewpoint:
         if self.position is not None:
             raise ArgumentError("viewpoint", expected="an azimuth for an orbit", found="a fixed position")
         return replace(self, azimuth_rad=self.azimuth_rad + angle_rad)
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """From where the pictures of a scene are taken. Without `still`, the camera follows the ego vehicle.
+
+    Attributes:
+        view: "perspective", "bev" (bird's-eye view) or "both", side by side.
+        viewpoint: where perspective views are taken from; the default is a point behind and above the ego vehicle.
+        orbit: whether the camera circles the scene once: while the frames follow each other, or around a single frame.
+        still: whether the camera stays in one place of the world while the vehicle drives; needs poses.
+
+    Raises:
+        ArgumentError: an unknown view.
+    """
+
+    view: ViewName = "perspective"
+    viewpoint: Viewpoint = Viewpoint()
+    orbit: bool = False
+    still: bool = False
+
+    def __post_init__(self) -> None:
+        if self.view not in (*VIEWS, "both"):
+            raise ArgumentError("view", expected=f"{', '.join(VIEWS)} or both", found=repr(self.view))
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views that are side by side."""
+        return VIEWS if self.view == "both" else (self.view,)
 
 
 @dataclass(frozen=True)

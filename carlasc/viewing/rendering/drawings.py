@@ -1,24 +1,28 @@
-"""What a picture is made of: a grid, a scan, scene flow or the errors of a prediction, as a mesh, points and a legend."""
+"""What a picture is made of: a grid in the colours of its classes or of its evidence, a scan, scene flow or the errors of a prediction."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
+from carlasc.core.evidence import VoxelFlag
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.errors import FormatError
-from carlasc.metrics.comparison import Outcome, compare_grids
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.metrics.comparison import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
-from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry
-from carlasc.viewing.remapping import without_invalid_points
+from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry, as_color, height_colors
+from carlasc.viewing.remapping import RemappedSequence, without_invalid_points
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh, arrows, box, footprint, grid_mesh, join, quads
-from carlasc.viewing.rendering.raycasting import cast, empty_frame
-from carlasc.viewing.rendering.splats import splat
+from carlasc.viewing.rendering.raycasting import cast, empty_canvas, splat
+from carlasc.viewing.scene import SceneReader
 
 Extent = NDArray[np.float64]
 """(N, 3) float64 points, metres, that a camera fitted to the drawing shows."""
@@ -26,6 +30,16 @@ Extent = NDArray[np.float64]
 _FLOOR = (240, 240, 243)
 _MOVING_M_S = 0.2  # slower points count as static
 _ARROW_CELL_M = 3.0
+GRID_COLORS: tuple[str, ...] = get_args(GridColor)
+_PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
+_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one
+_POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
+_ORIGINS = (
+    Entry("seen in this frame", (0, 114, 178), 0),
+    Entry("seen in other frames", (190, 196, 204), 1),
+    Entry("contested: traffic passes here at other times", (204, 121, 167), 2),
+    Entry("inferred: no scan saw it", (230, 110, 0), 3),
+)
 
 
 @dataclass(frozen=True)
@@ -50,12 +64,12 @@ class Drawing:
 
     def render(self, camera: Camera, width: int, height: int, *, axes: Axes = "left") -> NDArray[np.uint8]:
         """Return the picture, (height, width, 3) uint8, without legend or title; `axes` is the handedness of the data."""
-        frame = empty_frame(width, height)
+        canvas = empty_canvas(width, height)
         if self.mesh is not None:
-            cast(self.mesh, camera, frame, axes=axes)
+            cast(self.mesh, camera, canvas, axes=axes)
         if self.points is not None and self.point_colors is not None:
-            splat(self.points, self.point_colors, camera, frame)
-        return frame.resolve()
+            splat(self.points, self.point_colors, camera, canvas)
+        return canvas.resolve()
 
 
 def grid_extent(spec: GridSpec) -> Extent:
@@ -104,7 +118,7 @@ def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing
     colors = ClassColors(ERRORS)
     legend = [entry._replace(order=AFTER_CLASSES + entry.order) for entry in colors.entries(ERRORS.names)]
     empty = "no known voxel is occupied in either"
-    return voxel_drawing(truth.spec, colors.by_id[outcomes], outcomes != Outcome.NOT_COMPARED, legend, empty, ego)
+    return voxel_drawing(truth.spec, colors.by_id[outcomes], outcomes != VoxelOutcome.NOT_COMPARED, legend, empty, ego)
 
 
 def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
@@ -221,3 +235,80 @@ def ego_vehicle() -> QuadMesh:
     windows = box((-1.55, -0.88, -0.98), (1.55, 0.88, -0.5), palette.GLASS, taper=0.28)
     roof = box((-1.27, -0.6, -0.5), (1.27, 0.6, -0.42), palette.EGO)
     return join([body, windows, roof])
+
+
+def check_color(color: GridColor, reader: SceneReader) -> None:
+    """Check that the grid of each frame has what its colours are taken from.
+
+    Raises:
+        ArgumentError: an unknown colour, or no grid is shown.
+        MissingDataError: a frame lacks the field.
+    """
+    if color not in GRID_COLORS:
+        raise ArgumentError("color", expected=f"one of {', '.join(GRID_COLORS)}", found=repr(color))
+    if color == "class":
+        return
+    if "grid" not in reader.contents:
+        raise ArgumentError("color", expected="class where no grid is shown", found=repr(color))
+    data, frames = reader.data, reader.frames
+    field = f"{data.grid}/{_PARTS[color]}"
+    missing = sorted(set(frames) - data.frames_with(field))
+    if missing:
+        raise MissingDataError(
+            data.sequence.location,
+            expected=f"the field {field} in all frames that are shown",
+            found=f"none in {len(missing)} of {len(frames)} frames, such as frame {missing[0]}",
+            advice="" if color == "votes" else "make the grid again with `carlasc regrid --keep-evidence`",
+        )
+
+
+def evidence_drawing(data: RemappedSequence, frame: int, color: GridColor, *, ego: bool = True) -> Drawing:
+    """Return the occupied voxels of a grid, coloured by evidence.
+
+    The legend has all classes of values, so that it is the same in all frames.
+
+    Args:
+        data: the sequence and its grid.
+        frame: frame number.
+        color: any but "class".
+        ego: whether the ego vehicle is drawn.
+
+    Raises:
+        MissingDataError: the frame lacks the field.
+        FormatError: the grid does not have the format.
+    """
+    grid = data.read_grid(frame)
+    values = data.read_part(_PARTS[color], frame)
+    numbers, legend = _classify(values, color)
+    colors = np.array([entry.color for entry in legend], np.uint8)
+    return voxel_drawing(grid.spec, colors[numbers], grid.labels > 0, legend, "no voxel is occupied", ego)
+
+
+def evidence_legend(color: GridColor) -> list[Entry]:
+    """Return the legend of `evidence_drawing`."""
+    if color == "inferred":
+        return list(_ORIGINS)
+    if color == "confidence":
+        names = [f"up to {_SHARES[0]:.0%}"]
+        names += [f"{low * 100:.0f} to {high:.0%}" for low, high in pairwise(_SHARES)]
+        names.append(f"over {_SHARES[-1]:.0%}")
+        unit = "occupied: "
+    else:
+        names = ["1"] + [f"{2**power} to {2 ** (power + 1) - 1}" for power in range(1, _POWERS - 1)]
+        names.append(f"{2 ** (_POWERS - 1)} and more")
+        unit = "scans: " if color == "views" else "votes: "
+    colors = height_colors(np.linspace(0.0, 1.0, len(names)), 0, 1)
+    names[0] = unit + names[0]
+    return [Entry(name, as_color(rgb), number) for number, (name, rgb) in enumerate(zip(names, colors, strict=True))]
+
+
+def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64], list[Entry]]:
+    """Return which entry of the legend each voxel belongs to, and the legend."""
+    legend = evidence_legend(color)
+    if color == "inferred":
+        seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
+        return np.where(values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)), legend
+    if color == "confidence":
+        return np.digitize(values.astype(np.float64), _SHARES), legend
+    powers = np.floor(np.log2(np.maximum(values.astype(np.float64), 1)))
+    return np.minimum(powers, _POWERS - 1).astype(np.int64), legend

@@ -1,4 +1,4 @@
-"""Several panels in one picture: sources or frames beside each other, from the same camera, each with a caption."""
+"""The panels of a picture: what is shown of a frame, from where, and which frames of which scenes are beside each other."""
 
 from __future__ import annotations
 
@@ -9,15 +9,188 @@ from string import ascii_lowercase
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.viewing.colors import Entry
-from carlasc.viewing.rendering.cameras import Viewpoint
-from carlasc.viewing.rendering.frames import FrameRenderer
-from carlasc.viewing.rendering.pictures import draw_panels
-from carlasc.viewing.rendering.styles import Style
+from carlasc.storage import layout
+from carlasc.viewing.colors import Entry, merge_legends
+from carlasc.viewing.remapping import RemappedSequence
+from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
+from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
+from carlasc.viewing.rendering.drawings import (
+    Drawing,
+    Extent,
+    GridColor,
+    error_drawing,
+    evidence_drawing,
+    evidence_legend,
+    flow_drawing,
+    grid_drawing,
+    grid_extent,
+    scan_drawing,
+    scan_extent,
+)
+from carlasc.viewing.rendering.pictures import Panel, draw_panels
+from carlasc.viewing.rendering.styles import Sheet
+from carlasc.viewing.scene import SceneReader
 
 MOST_PANELS = 64
 _VIEW_NAMES = {"perspective": "from behind", "bev": "from above"}
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRenderer:
+    """Draws the frames of a scene.
+
+    Attributes:
+        reader: reads the scene; its `contents` are drawn side by side.
+        camera: from where each of the contents is seen. A camera that circles the scene has one distance, at which it shows the scene
+            from every side.
+        extent: what pictures of scans show, the same in all frames.
+        ego: whether the ego vehicle is drawn.
+        color: what the colours of the grid mean.
+        boxes: whether boxes around actors are drawn.
+        fixed_view: for a camera that does not follow the vehicle: extent of what it shows, and `world_T_view`, the frame of that
+            extent; or None.
+    """
+
+    reader: SceneReader
+    camera: CameraOptions
+    extent: Extent
+    ego: bool
+    color: GridColor
+    boxes: bool
+    fixed_view: tuple[Extent, Transform] | None
+
+    @classmethod
+    def of(
+        cls, reader: SceneReader, camera: CameraOptions, *, ego: bool, color: GridColor, boxes: bool
+    ) -> FrameRenderer:
+        """Return a renderer whose extent and fixed view are the same in all frames.
+
+        Args:
+            reader: reads the scene.
+            camera: from where each of the contents is seen.
+            ego: whether the ego vehicle is drawn.
+            color: what the colours of the grid mean.
+            boxes: whether boxes around actors are drawn.
+
+        Raises:
+            MissingDataError: the camera stands still, and the sequence has no poses.
+        """
+        extent = _scan_extent_in(reader)
+        return cls(reader, camera, extent, ego, color, boxes, _view_of_drive(reader, extent) if camera.still else None)
+
+    def panels(self, frame: int) -> list[Panel]:
+        """Return the panels of a frame: each of the scene's contents from each of the views."""
+        contents, panels = self.reader.contents, []
+        for content in contents:
+            drawing = self.draw(content, frame)
+            title = self.title(content) if len(contents) > 1 else ""
+            panels += [Panel(drawing, view, title, self._view_of(drawing, view, frame)) for view in self.camera.views]
+        return panels
+
+    def draw(self, content: str, frame: int) -> Drawing:
+        """Return the drawing of one of the scene's contents in a frame."""
+        drawing = self._draw(content, frame)
+        if not self.boxes:
+            return drawing
+        boxes = boxes_in(self.reader.data, frame)
+        lower, upper = drawing.extent.min(axis=0), drawing.extent.max(axis=0)
+        shown = ((boxes.centers >= lower) & (boxes.centers <= upper))[:, :2].all(axis=1)
+        return with_boxes(drawing, boxes.select(shown))
+
+    def _draw(self, content: str, frame: int) -> Drawing:
+        reader, colors = self.reader, self.reader.colors
+        if content == "scan":
+            return scan_drawing(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
+        if content == "flow":
+            return flow_drawing(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
+        if content == "errors":
+            return error_drawing(reader.data.read_grid(frame), self._grid_of("truth").read_grid(frame), ego=self.ego)
+        if content == "grid" and self.color != "class":
+            return evidence_drawing(reader.data, frame, self.color, ego=self.ego)
+        return grid_drawing(self._grid_of(content).read_grid(frame), colors, ego=self.ego)
+
+    def legend_of(self, frame: int) -> list[Entry]:
+        """Return the entries that the legend of a frame needs."""
+        colors, legends = self.reader.colors, []
+        for content in self.reader.contents:
+            if content == "grid" and self.color != "class":
+                legends.append(evidence_legend(self.color))
+            elif content in ("grid", "truth") and colors.palette != "height":  # without building the mesh
+                labels = self._grid_of(content).read_grid(frame).labels
+                legends.append(colors.entries(np.flatnonzero(np.bincount(labels.reshape(-1))).tolist()))
+            else:
+                legends.append(self._draw(content, frame).legend)
+        if self.boxes:
+            legends.append([BOX])
+        return merge_legends(legends)
+
+    def _grid_of(self, content: str) -> RemappedSequence:
+        truth = self.reader.truth
+        return self.reader.data if content == "grid" or truth is None else truth
+
+    def _view_of(self, drawing: Drawing, view: View, frame: int) -> tuple[Extent, Transform] | None:
+        """Return what the camera shows and `drawing_T_view`, or None if the camera is fitted to the drawing."""
+        orbits = self.camera.orbit and view == "perspective"
+        if self.fixed_view is None:
+            return (_swept_extent(drawing.extent), np.eye(4)) if orbits else None
+        extent, world_T_view = self.fixed_view
+        drawing_T_view = np.linalg.inv(_pose_of(self.reader, frame)) @ world_T_view
+        return (_swept_extent(extent) if orbits else extent), drawing_T_view
+
+    def title(self, content: str) -> str:
+        """Return the title of one of the scene's contents."""
+        titles = {"scan": "scan", "flow": "scene flow", "truth": "truth", "errors": "errors"}
+        data, truth = self.reader.data, self.reader.truth
+        return titles.get(content) or (str(data.spec) if truth is None else "prediction")
+
+
+def _scan_extent_in(reader: SceneReader) -> Extent:
+    """Return what pictures of scans show in all frames: the grid beside them, or most of the first scan."""
+    if {"grid", "errors"} & set(reader.contents):
+        return grid_extent(reader.data.spec)
+    if "truth" in reader.contents and reader.truth is not None:
+        return grid_extent(reader.truth.spec)
+    return scan_extent(reader.data.read_scan(reader.frames[0]))
+
+
+def _view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transform]:
+    """Return what a camera that does not follow the vehicle shows: a box around the extents of all frames.
+
+    Returns:
+        (8, 3) corners of the box in the frame of the middle pose, and `world_T_middle`.
+
+    Raises:
+        MissingDataError: the sequence has no poses.
+        FormatError: one of them is none.
+    """
+    world_T_middle = _pose_of(reader, reader.frames[len(reader.frames) // 2])
+    middle_T_world = np.linalg.inv(world_T_middle)
+    seen = [transform_points(middle_T_world @ _pose_of(reader, frame), extent) for frame in reader.frames]
+    points = np.concatenate(seen)
+    box = np.array([points.min(0), points.max(0)])
+    corners = np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    return corners, world_T_middle
+
+
+def _pose_of(reader: SceneReader, frame: int) -> Transform:
+    pose = reader.read_pose(frame)
+    if pose is None:
+        raise MissingDataError(
+            reader.path, expected=layout.POSES, found="none", advice="let the camera follow the vehicle"
+        )
+    return pose
+
+
+def _swept_extent(extent: Extent) -> Extent:
+    """Return the rims of the upright cylinder around an extent, which looks the same from every side."""
+    lower, upper = extent.min(0), extent.max(0)
+    middle = (lower + upper) / 2
+    radius = np.linalg.norm((extent - middle)[:, :2], axis=1).max()
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rim = middle[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in (lower[2], upper[2])])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +211,13 @@ class PictureRenderer:
     """Draws pictures of cells.
 
     Attributes:
-        style: size and type.
+        sheet: size and type.
         legend: entries of the legend, the same in all pictures; empty for no legend.
         captions: a text for each panel, which is put below it; empty for the titles of the contents.
         columns: number of panels in a row; None takes the number with which panels are largest.
     """
 
-    style: Style
+    sheet: Sheet
     legend: list[Entry] = field(default_factory=list)
     captions: tuple[str, ...] = ()
     columns: int | None = None
@@ -61,12 +234,12 @@ class PictureRenderer:
         return draw_panels(
             panels,
             viewpoint=viewpoint,
-            size=self.style.size,
+            size=self.sheet.size,
             legend=self.legend,
             axes=cells[0].renderer.reader.axes,
             captioned=bool(self.captions),
             columns=self.columns,
-            font_size=self.style.font_size,
+            font_size=self.sheet.font_size,
         )
 
 
@@ -130,7 +303,7 @@ def _parts_of(cells: Sequence[Cell]) -> list[tuple[str, ...]]:
         for cell in cells
         for reader in [cell.renderer.reader]
         for content in reader.contents
-        for view in cell.renderer.views
+        for view in cell.renderer.camera.views
     ]
 
 

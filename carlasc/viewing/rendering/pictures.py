@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ClassColors, Entry, PaletteName, merge_legends
-from carlasc.viewing.rendering.cameras import Viewpoint, birdseye_camera, perspective_camera
+from carlasc.viewing.rendering.cameras import VIEWS, View, Viewpoint, birdseye_camera, perspective_camera
 from carlasc.viewing.rendering.drawings import (
     Drawing,
     Extent,
@@ -28,8 +28,6 @@ from carlasc.viewing.rendering.drawings import (
 )
 from carlasc.viewing.rendering.pages import Page, draw_page, plan_page
 
-View = Literal["perspective", "bev"]
-VIEWS: tuple[str, ...] = get_args(View)
 DEFAULT_SIZE = (1280, 720)
 
 

@@ -1,7 +1,8 @@
-"""Pictures of meshes, with light from rays that Embree casts on the CPU: no screen and no GPU are needed.
+"""Pictures of meshes and points, with light from rays that Embree casts on the CPU: no screen and no GPU are needed.
 
 Light comes from a sun with soft shadows and from the sky: each face receives the share of the sky that a few rays from the face find
-free. Voxels have thin edges, which fade where a voxel is only a few pixels wide.
+free. Voxels have thin edges, which fade where a voxel is only a few pixels wide. Points
+are small balls: nearer ones hide farther ones, and points behind others are darker.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from carlasc.viewing.rendering.rasterizing import hits, visible_triangles
 
 BACKGROUND = 255
 SAMPLES = 2  # per pixel and direction
-
 _SKY_RAYS = 12
 _SKY_RANGE_M = 6.0  # farther faces do not hide the sky
 _TO_SUN = np.array([-0.42, -0.62, 1.0])  # the sun is behind the vehicle, on its left
@@ -29,10 +29,13 @@ _AMBIENT = 0.6
 _SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that a level face in the sun has exactly its own colour
 _EDGE_DARKNESS = 0.34
 _BAND = 1 << 19  # rays cast at a time, which bounds memory
+POINT_RADIUS_M = 0.07
+_LEAST_RADIUS = 1.3  # samples
+_MOST_RADIUS = 40.0
 
 
 @dataclass(frozen=True)
-class Frame:
+class Canvas:
     """The samples of a picture and their depth; `SAMPLES` times as wide and high as the picture.
 
     Attributes:
@@ -52,19 +55,19 @@ class Frame:
         return (total // SAMPLES**2).astype(np.uint8)
 
 
-def empty_frame(width: int, height: int) -> Frame:
-    """Return an empty frame for a picture of width x height pixels."""
+def empty_canvas(width: int, height: int) -> Canvas:
+    """Return an empty canvas for a picture of width x height pixels."""
     shape = (height * SAMPLES, width * SAMPLES)
-    return Frame(np.full((*shape, 3), BACKGROUND, np.uint8), np.full(shape, np.inf, np.float32))
+    return Canvas(np.full((*shape, 3), BACKGROUND, np.uint8), np.full(shape, np.inf, np.float32))
 
 
-def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, axes: Axes = "left") -> None:
-    """Draw a mesh into a frame, with light and shadows.
+def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left") -> None:
+    """Draw a mesh onto a canvas, with light and shadows.
 
     Args:
         mesh: what is drawn.
         camera: from where it is seen.
-        frame: is drawn into, where the mesh is nearer than what the frame already shows.
+        canvas: is drawn onto, where the mesh is nearer than what the canvas already shows.
         axes: handedness of the data: "left" or "right"; the sun is behind the vehicle on its left in both cases.
 
     Raises:
@@ -76,7 +79,7 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, axes: Axes = "left") -
     sky = _sky_visibility(scene, mesh)
     suns = _suns(axes)
     extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
-    height, width = frame.depth.shape
+    height, width = canvas.depth.shape
     seen = visible_triangles(mesh, camera, width, height)
     band = max(1, _BAND // width)
     for top in range(0, height, band):
@@ -107,8 +110,8 @@ def cast(mesh: QuadMesh, camera: Camera, frame: Frame, *, axes: Axes = "left") -
             shadowed,
             np.float32(camera.footprint(height // SAMPLES)),
             camera.orthographic,
-            frame.colors[rows].reshape(-1, 3),
-            frame.depth[rows].reshape(-1),
+            canvas.colors[rows].reshape(-1, 3),
+            canvas.depth[rows].reshape(-1),
         )
     del geometry
 
@@ -189,7 +192,7 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     out,
     out_depth,
 ):
-    """Compute the light of every sample that a ray hit, and write it where it is nearer than what the frame shows."""
+    """Compute the light of every sample that a ray hit, and write it where it is nearer than what the canvas shows."""
     for i in range(len(triangle)):
         if triangle[i] < 0 or depth[i] >= out_depth[i]:
             continue
@@ -227,3 +230,70 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
         for c in range(3):
             out[i, c] = np.uint8(min(np.float32(255.0), colors[q, c] * light + np.float32(0.5)))
         out_depth[i] = depth[i]
+
+
+def splat(
+    points: NDArray[np.floating],
+    colors: NDArray[np.uint8],
+    camera: Camera,
+    canvas: Canvas,
+    radius_m: float = POINT_RADIUS_M,
+) -> None:
+    """Draw points onto a canvas as shaded balls.
+
+    Args:
+        points: (N, 3) metres.
+        colors: (N, 3) uint8 RGB.
+        camera: from where they are seen.
+        canvas: is drawn onto; what it shows hides points that are farther.
+        radius_m: radius of a ball.
+    """
+    height, width = canvas.depth.shape
+    columns, rows, depths = camera.project(points, width, height)
+    pixel = camera.footprint(height) * (np.ones_like(depths) if camera.orthographic else np.maximum(depths, 1e-6))
+    radii = np.clip(radius_m / pixel, _LEAST_RADIUS, _MOST_RADIUS)
+    seen = (depths > 0.1) & (np.abs(columns - width / 2) < width) & (np.abs(rows - height / 2) < height)
+    drawn = np.zeros((height, width), np.bool_)
+    _draw_balls(
+        columns[seen], rows[seen], depths[seen].astype(np.float32), radii[seen], np.ascontiguousarray(colors[seen]),
+        canvas.colors, canvas.depth, drawn,
+    )  # fmt: skip
+    _darken_behind(canvas.colors, canvas.depth, drawn)
+
+
+@cached(error_model="python")
+def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    height, width = out_depth.shape
+    for i in range(len(columns)):
+        radius = radii[i]
+        for y in range(max(0, int(rows[i] - radius)), min(height, int(rows[i] + radius) + 1)):
+            for x in range(max(0, int(columns[i] - radius)), min(width, int(columns[i] + radius) + 1)):
+                dx, dy = x + 0.5 - columns[i], y + 0.5 - rows[i]
+                rim = (dx * dx + dy * dy) / (radius * radius)
+                if rim > 1 or depths[i] >= out_depth[y, x]:
+                    continue
+                light = 0.78 + 0.22 * np.sqrt(1 - rim)
+                for c in range(3):
+                    out[y, x, c] = np.uint8(colors[i, c] * light)
+                out_depth[y, x] = depths[i]
+                drawn[y, x] = True
+
+
+@cached(error_model="python")
+def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """Eye-dome lighting: the farther a point is behind its neighbours in the picture, the darker it is."""
+    height, width = depth.shape
+    reach = 3
+    for y in range(reach, height - reach):
+        for x in range(reach, width - reach):
+            if not drawn[y, x]:
+                continue
+            behind = np.float32(0.0)
+            for dy in (-reach, 0, reach):
+                for dx in (-reach, 0, reach):
+                    behind += min(
+                        np.float32(1.5), max(np.float32(0.0), depth[y, x] - depth[y + dy, x + dx] - np.float32(0.15))
+                    )
+            light = np.exp(-0.12 * behind)
+            for c in range(3):
+                out[y, x, c] = np.uint8(out[y, x, c] * light)

@@ -3,33 +3,87 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
+from carlasc.core.choices import StyleName as StyleName  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError
 
-StyleName = Literal["screen", "paper"]
-STYLES: tuple[str, ...] = get_args(StyleName)
+SMALLEST, LARGEST = (64, 64), 16384  # pixels of a picture
 
+_SCREEN_SIZE = (1280, 720)
+_PAPER_SIZE, _PAPER_DPI, _PAPER_FONT_PT = "8.8cm x 5cm", 300.0, 8.0  # a column of two; the type of a caption
 _INCHES = {"cm": 1 / 2.54, "mm": 1 / 25.4, "in": 1.0}
 _POINTS_PER_INCH = 72
 _LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
 
 
 @dataclass(frozen=True)
-class Style:
-    """How a picture is laid out and stored.
+class StyleOptions:
+    """How a picture looks.
 
     Attributes:
-        name: "screen" or "paper".
+        name: "screen"; or "paper": PNG with 300 pixels per inch, type of 8 points, and the legend in a file of its own,
+            `<name>.legend.png`.
+        size: (width, height) of the picture in pixels; or a text such as "1280x720" (pixels), "8.8cm x 5cm", "88mm x 50mm" or
+            "3.5in x 2in". None takes 1280 x 720 pixels, or 8.8 x 5 cm on paper.
+        dpi: pixels per inch, which a PNG says in its metadata. None takes 300 on paper and for a size with a unit.
+        captions: for a list of scenes: a text for each panel, after its letter. Empty names what differs between the panels.
+        columns: for a list of scenes: number of panels in a row. None takes the frames of one scene, or what fits best.
+        legend: whether the picture has a legend.
+        ego: whether a plain car is drawn at the sensor.
+
+    Raises:
+        ArgumentError: an unknown style, a size that is none or that no picture can have, an impossible `dpi` or number of columns.
+    """
+
+    name: StyleName = "screen"
+    size: tuple[int, int] | str | None = None
+    dpi: float | None = None
+    captions: Sequence[str] = ()
+    columns: int | None = None
+    legend: bool = True
+    ego: bool = True
+
+    def __post_init__(self) -> None:
+        if self.name not in get_args(StyleName):
+            raise ArgumentError("style", expected=" or ".join(get_args(StyleName)), found=repr(self.name))
+        if self.dpi is not None and not 30 <= self.dpi <= 2400:
+            raise ArgumentError("dpi", expected="30 to 2400 pixels per inch", found=f"{self.dpi:g}")
+        if self.columns is not None and self.columns < 1:
+            raise ArgumentError("columns", expected="1 or more", found=str(self.columns))
+        check_size(self.sheet.size)
+
+    @property
+    def sheet(self) -> Sheet:
+        """What a picture in this style is drawn on."""
+        paper, dpi = self.name == "paper", self.dpi
+        size = (_PAPER_SIZE if paper else _SCREEN_SIZE) if self.size is None else self.size
+        if isinstance(size, str):
+            lengths, with_unit = _read_lengths(size)
+            if dpi is None and (with_unit or paper):
+                dpi = _PAPER_DPI
+            width, height = (round(length * (dpi or 1.0)) if with_unit else round(length) for length in lengths)
+            size = (width, height)
+        if not paper:
+            return Sheet(size, dpi)
+        dpi = _PAPER_DPI if dpi is None else dpi
+        return Sheet(size, dpi, round(_PAPER_FONT_PT / _POINTS_PER_INCH * dpi), legend_apart=True)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a picture is drawn on.
+
+    Attributes:
         size: (width, height), pixels.
         dpi: pixels per inch, which a PNG says in its metadata; None says nothing.
         font_size: pixels; None takes one by the size of the picture.
         legend_apart: whether the legend is a file of its own, next to the picture.
     """
 
-    name: StyleName
     size: tuple[int, int]
     dpi: float | None = None
     font_size: int | None = None
@@ -40,43 +94,14 @@ class Style:
         return out.with_name(f"{out.stem}.legend{out.suffix}")
 
 
-_SCREEN = Style("screen", (1280, 720))
-_PAPER_DPI, _PAPER_SIZE, _PAPER_FONT_PT = (
-    300.0,
-    "8.8cm x 5cm",
-    8.0,
-)  # a column of a page with two columns; a caption's type
-
-
-def style_of(name: StyleName, size: tuple[int, int] | str | None, dpi: float | None) -> Style:
-    """Return the style that a picture is drawn in.
-
-    Args:
-        name: "screen" or "paper". On paper, type is 8 points high, and the legend is a file of its own.
-        size: (width, height) in pixels; or a text such as "1280x720" (pixels), "8.8cm x 5cm", "88mm x 50mm" or "3.5in x 2in". None takes
-            1280 x 720 pixels on a screen and 8.8 x 5 cm on paper.
-        dpi: pixels per inch. None takes 300 on paper and for a size with a unit, and says nothing otherwise.
-
-    Raises:
-        ArgumentError: an unknown style, a size that is none, or an impossible `dpi`.
-    """
-    if name not in STYLES:
-        raise ArgumentError("style", expected=" or ".join(STYLES), found=repr(name))
-    if dpi is not None and not 30 <= dpi <= 2400:
-        raise ArgumentError("dpi", expected="30 to 2400 pixels per inch", found=f"{dpi:g}")
-    paper = name == "paper"
-    if size is None:
-        size = _PAPER_SIZE if paper else _SCREEN.size
-    if isinstance(size, str):
-        lengths, with_unit = _read_lengths(size)
-        if dpi is None and (with_unit or paper):
-            dpi = _PAPER_DPI
-        width, height = (round(length * (dpi or 1.0)) if with_unit else round(length) for length in lengths)
-        size = (width, height)
-    if not paper:
-        return Style("screen", size, dpi)
-    dpi = _PAPER_DPI if dpi is None else dpi
-    return Style("paper", size, dpi, round(_PAPER_FONT_PT / _POINTS_PER_INCH * dpi), legend_apart=True)
+def check_size(size: tuple[int, int]) -> None:
+    """Raise ArgumentError if (width, height) in pixels is not a size that a picture can have."""
+    if len(size) != 2 or not all(low <= value <= LARGEST for low, value in zip(SMALLEST, size, strict=True)):
+        raise ArgumentError(
+            "size",
+            expected=f"{SMALLEST[0]}x{SMALLEST[1]} to {LARGEST}x{LARGEST} pixels",
+            found="x".join(map(str, size)),
+        )
 
 
 def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI1
 from carlasc.errors import MissingDataError
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
-from carlasc_converters.exporters.grids import choose_grid, number_folders, read_points, scan_occupancy
+from carlasc_converters.exporters.grid_exporter import choose_grid, number_folders, read_points, scan_occupancy
 from carlasc_converters.exporters.occlusion import occluded_voxels
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 
@@ -48,17 +49,18 @@ _CALIBRATION = "".join(
 
 
 class KittiExporter(FrameExporter):
-    """Writes velodyne/, labels/, voxels/ or predictions/, poses.txt, calib.txt and times.txt.
-
-    Args:
-        grid: name of the grid that goes to voxels/ or predictions/; None takes the one of the smallest voxels.
-        predictions: whether grids are the output of a network. They then go to predictions/, where SemanticKITTI's evaluator reads
-            them, and nothing else is written.
-    """
+    """Writes velodyne/, labels/, voxels/ or predictions/, poses.txt, calib.txt and times.txt."""
 
     title = "SemanticKITTI: sequences/NN/velodyne, labels, voxels or predictions"
 
-    def __init__(self, grid: str | None = None, *, predictions: bool = False) -> None:
+    def __init__(
+        self,
+        grid: Annotated[str | None, "Grid that is exported. Default: the one of the smallest voxels."] = None,
+        *,
+        predictions: Annotated[
+            bool, "Grids are the output of a network. They go to predictions/, and nothing else is written."
+        ] = False,
+    ) -> None:
         self.grid, self.predictions = grid, predictions
 
     @property

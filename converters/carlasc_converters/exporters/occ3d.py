@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from carlasc.core.geometry import quaternions_of, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc_converters.exporters.grids import GridExporter, sensor_height
+from carlasc_converters.exporters.grid_exporter import GridExporter, GridName, Predictions, sensor_height
 
 _ANNOTATIONS = "annotations.json"
 _SPLITS = {"Train": "train_split", "Val": "val_split", "Test": "test_split"}
@@ -40,13 +40,7 @@ def frame_token(name: str, frame: int) -> str:
 
 
 class Occ3dExporter(GridExporter):
-    """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle, with the origin on the ground.
-
-    Args:
-        grid: as for every exporter of grids.
-        predictions: as for every exporter of grids.
-        height_m: height of the sensor above the ground, metres. None takes that of carlasc.json, else 1.8, as in CarlaSC.
-    """
+    """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle, with the origin on the ground."""
 
     title = "Occ3D-nuScenes: gts/SCENE/TOKEN/labels.npz and annotations.json"
     target = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
@@ -54,7 +48,15 @@ class Occ3dExporter(GridExporter):
     free = 17
     slug = "occ3d"
 
-    def __init__(self, grid: str | None = None, *, predictions: bool = False, height_m: float | None = None) -> None:
+    def __init__(
+        self,
+        grid: GridName = None,
+        *,
+        predictions: Predictions = False,
+        height_m: Annotated[
+            float | None, "Height of the sensor above the ground, metres. Default: that of carlasc.json, else 1.8."
+        ] = None,
+    ) -> None:
         super().__init__(grid, predictions=predictions)
         self.height_m = height_m
 

@@ -11,7 +11,7 @@ from carlasc import storage
 from carlasc.converting import Files, TargetFrame
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.grids import GridSpec
-from carlasc_converters.exporters.grids import GridExporter
+from carlasc_converters.exporters.grid_exporter import GridExporter
 from carlasc_converters.exporters.occ3d import frame_token, scene_token
 
 

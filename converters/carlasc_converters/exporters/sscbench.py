@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 
@@ -12,7 +13,14 @@ from carlasc.core.benchmarks import IGNORED, SSCBENCH_TO_RAW, TO_SSCBENCH
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError
-from carlasc_converters.exporters.grids import GridExporter, number_folders, read_points, scan_occupancy
+from carlasc_converters.exporters.grid_exporter import (
+    GridExporter,
+    GridName,
+    Predictions,
+    number_folders,
+    read_points,
+    scan_occupancy,
+)
 from carlasc_converters.kitti_voxels import pack_bits
 
 # The files hold raw ids of SemanticKITTI, which therefore stay; the set has no outliers.
@@ -27,13 +35,7 @@ _RAW = {
 
 
 class SscBenchExporter(GridExporter):
-    """Writes grids as SSCBench-KITTI-360 has them: 256 x 256 x 32 voxels of 0.2 m before the LiDAR, of every 5th frame.
-
-    Args:
-        grid: as for every exporter of grids.
-        predictions: as for every exporter of grids; only labels are written then.
-        every: frames whose number is a multiple of this are written.
-    """
+    """Writes grids as SSCBench-KITTI-360 has them: 256 x 256 x 32 voxels of 0.2 m before the LiDAR, of every 5th frame."""
 
     title = "SSCBench-KITTI-360: data_2d_raw/DRIVE/voxels/NNNNNN.label, .invalid and .bin"
     target = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
@@ -42,7 +44,13 @@ class SscBenchExporter(GridExporter):
     free = 0
     slug = "sscbench"
 
-    def __init__(self, grid: str | None = None, *, predictions: bool = False, every: int = 5) -> None:
+    def __init__(
+        self,
+        grid: GridName = None,
+        *,
+        predictions: Predictions = False,
+        every: Annotated[int, "Frames whose number is a multiple of this are written."] = 5,
+    ) -> None:
         super().__init__(grid, predictions=predictions)
         if every < 1:
             raise ArgumentError("every", expected="1 or more", found=str(every))

@@ -17,7 +17,7 @@ from helpers.servers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 from carlasc.captures import Capture, Lidar, ServerError, record
 from carlasc.captures.carla.sensors import ActorNumbers
 from carlasc.captures.carla.server import DETECTION, Server, decode_sweep
-from carlasc.captures.lidar import sensor_offsets
+from carlasc.captures.settings import sensor_offsets
 from carlasc.cli import app
 from carlasc.core.geometry import transform_points
 from carlasc.core.tables import CARLA

@@ -2,20 +2,20 @@ from __future__ import annotations
 
 import pytest
 
-from carlasc.captures import Drive, Lidar
+from carlasc.captures import Lidar, TownDrive
 
 
 @pytest.fixture(scope="session")
-def drive() -> Drive:
+def drive() -> TownDrive:
     """A drive in heavy traffic with a coarse LiDAR, as noisy as the real one."""
     return _drive()
 
 
 @pytest.fixture(scope="session")
-def twin() -> Drive:
+def twin() -> TownDrive:
     """The same drive, made once more and asked for one thing only: what another process would see."""
     return _drive()
 
 
-def _drive() -> Drive:
-    return Drive(seed=3, traffic="heavy", lidar=Lidar(channels=32, points=16_000))
+def _drive() -> TownDrive:
+    return TownDrive(seed=3, traffic="heavy", lidar=Lidar(channels=32, points=16_000))

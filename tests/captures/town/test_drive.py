@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from carlasc.captures.town.actors import EGO_ID
-from carlasc.captures.town.drive import Drive, Snapshot, scan_snapshot
-from carlasc.captures.town.meshes import MeshBuilder
-from carlasc.captures.town.rays import RayScene
+from carlasc.captures.town.drive import Snapshot, TownDrive, scan_snapshot
+from carlasc.captures.town.meshes import MeshBuilder, RayScene
 from carlasc.captures.town.simulation import TOWN_VERSION
 from carlasc.core.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
@@ -61,7 +60,7 @@ pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")
 pytest.importorskip("trimesh", reason="the simulator needs carlasc[simulate]")
 
 
-def with_only_a_box(drive: Drive, frame: int, box_at: tuple[float, float, float]) -> Snapshot:
+def with_only_a_box(drive: TownDrive, frame: int, box_at: tuple[float, float, float]) -> Snapshot:
     """Return a snapshot that holds only a cube of Wall, 1 m wide, at a position in the ego vehicle's frame."""
     real = drive.snapshot(frame)
     builder = MeshBuilder()
@@ -72,7 +71,7 @@ def with_only_a_box(drive: Drive, frame: int, box_at: tuple[float, float, float]
     return Snapshot(frame, real.world_T_ego, real.actors, mesh, instances, scene)
 
 
-def test_the_road_is_at_minus_1_8_m_within_noise(drive: Drive) -> None:
+def test_the_road_is_at_minus_1_8_m_within_noise(drive: TownDrive) -> None:
     for frame in (0, 90, 180):
         scan = drive.scan(frame)
         assert scan.labels is not None
@@ -84,7 +83,7 @@ def test_the_road_is_at_minus_1_8_m_within_noise(drive: Drive) -> None:
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
-def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(drive: Drive, yaw_rad: float) -> None:
+def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(drive: TownDrive, yaw_rad: float) -> None:
     for at, axis, sign in (((0.0, 8.0, 1.0), 1, 1), ((0.0, -8.0, 1.0), 1, -1), ((8.0, 0.0, 1.0), 0, 1)):
         snapshot = with_only_a_box(drive, 0, at)
         pose = snapshot.world_T_ego @ translation((-0.5, 0.0, 1.8)) @ rotation_z(yaw_rad)
@@ -96,7 +95,7 @@ def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(drive: Drive
         assert upright[:, 2].min() > 0.9
 
 
-def test_yaw_turns_x_towards_y_and_vehicles_keep_right(drive: Drive) -> None:
+def test_yaw_turns_x_towards_y_and_vehicles_keep_right(drive: TownDrive) -> None:
     """The frame is left-handed: a turn to the right increases the yaw, and the lane is to the right of the centre line."""
     pose = drive.ego_pose(0)
     streets = drive.town.streets
@@ -109,7 +108,7 @@ def test_yaw_turns_x_towards_y_and_vehicles_keep_right(drive: Drive) -> None:
     assert seen[1] == pytest.approx(-1.75, abs=0.05)  # the centre line is on the left: y < 0
 
 
-def test_labels_are_ids_of_the_table_and_nothing_is_unlabelled(drive: Drive) -> None:
+def test_labels_are_ids_of_the_table_and_nothing_is_unlabelled(drive: TownDrive) -> None:
     for sensor in range(5):
         labels = drive.record(40, sensor).scan.labels
         assert labels is not None
@@ -117,7 +116,7 @@ def test_labels_are_ids_of_the_table_and_nothing_is_unlabelled(drive: Drive) -> 
         assert set(np.unique(labels).tolist()) <= set(CARLA.names) - {0}
 
 
-def test_many_classes_appear_on_a_short_drive(drive: Drive) -> None:
+def test_many_classes_appear_on_a_short_drive(drive: TownDrive) -> None:
     found: set[int] = set()
     for frame in (0, 60, 120):
         for sensor in range(8):
@@ -127,7 +126,7 @@ def test_many_classes_appear_on_a_short_drive(drive: Drive) -> None:
     assert len(found) >= 15
 
 
-def test_noise_is_uniform_and_at_most_two_centimetres_an_axis(drive: Drive) -> None:
+def test_noise_is_uniform_and_at_most_two_centimetres_an_axis(drive: TownDrive) -> None:
     quiet = copy(drive)
     quiet.lidar = replace(drive.lidar, noise_m=0.0)
     clean, noisy = quiet.scan(10), drive.scan(10)
@@ -137,11 +136,11 @@ def test_noise_is_uniform_and_at_most_two_centimetres_an_axis(drive: Drive) -> N
     assert error.std(axis=0) == pytest.approx([0.02 / np.sqrt(3)] * 3, rel=0.05)
 
 
-def test_no_point_is_beyond_the_range(drive: Drive) -> None:
+def test_no_point_is_beyond_the_range(drive: TownDrive) -> None:
     assert np.linalg.norm(drive.scan(0).points, axis=1).max() <= drive.lidar.range_m + 0.05
 
 
-def test_the_ego_vehicle_is_not_recorded_but_occludes(drive: Drive) -> None:
+def test_the_ego_vehicle_is_not_recorded_but_occludes(drive: TownDrive) -> None:
     for sensor in range(20):
         recording = drive.record(30, sensor)
         assert recording.scan.instances is not None
@@ -152,7 +151,7 @@ def test_the_ego_vehicle_is_not_recorded_but_occludes(drive: Drive) -> None:
     assert not below.any()  # its own roof and bonnet
 
 
-def test_points_of_an_actor_are_on_its_mesh(drive: Drive) -> None:
+def test_points_of_an_actor_are_on_its_mesh(drive: TownDrive) -> None:
     frame = 75
     actors = {actor.id: actor for actor in drive.actors(frame)}
     checked = 0
@@ -169,7 +168,7 @@ def test_points_of_an_actor_are_on_its_mesh(drive: Drive) -> None:
     assert checked > 500
 
 
-def test_velocities_are_over_ground_in_the_sensors_frame_for_each_actor_that_was_hit(drive: Drive) -> None:
+def test_velocities_are_over_ground_in_the_sensors_frame_for_each_actor_that_was_hit(drive: TownDrive) -> None:
     recording = drive.record(100, 3)
     assert recording.scan.instances is not None
     hit = np.unique(recording.scan.instances[recording.scan.instances != 0])
@@ -180,7 +179,7 @@ def test_velocities_are_over_ground_in_the_sensors_frame_for_each_actor_that_was
     assert drive.scan(100, 3).flow is not None
 
 
-def test_sensors_have_the_offsets_of_the_data_set(drive: Drive) -> None:
+def test_sensors_have_the_offsets_of_the_data_set(drive: TownDrive) -> None:
     offsets = drive.sensor_offsets(40)
     np.testing.assert_array_equal(offsets[0], (-0.5, 0.0, 1.8))
     assert (np.abs(offsets[1:, :2]) <= 20).all()
@@ -192,13 +191,13 @@ def test_sensors_have_the_offsets_of_the_data_set(drive: Drive) -> None:
             np.testing.assert_allclose(invert(drive.ego_pose(frame)) @ pose, translation(offset), atol=1e-9)
 
 
-def test_every_seed_has_its_own_sensors(drive: Drive) -> None:
+def test_every_seed_has_its_own_sensors(drive: TownDrive) -> None:
     other = copy(drive)
     other.seed = drive.seed + 1
     assert not np.isin(other.sensor_offsets(5)[1:], drive.sensor_offsets(5)[1:]).any()
 
 
-def test_reference_sensors_are_others_and_in_free_space(drive: Drive) -> None:
+def test_reference_sensors_are_others_and_in_free_space(drive: TownDrive) -> None:
     reference = drive.reference_observations(50, sensors=20)
     assert len(reference) == 20
     own = drive.sensor_poses(50, 40)[:, :3, 3]
@@ -215,7 +214,7 @@ def test_reference_sensors_are_others_and_in_free_space(drive: Drive) -> None:
     )
 
 
-def test_the_inside_of_a_building_is_not_free(drive: Drive) -> None:
+def test_the_inside_of_a_building_is_not_free(drive: TownDrive) -> None:
     footprint, height = drive.town.buildings[0]
     assert not drive.is_free(0, np.append(footprint.centre, height / 2))
     assert drive.is_free(0, np.append(footprint.centre, height + 30.0))
@@ -226,10 +225,10 @@ def test_the_inside_of_a_building_is_not_free(drive: Drive) -> None:
 )
 def test_an_unknown_drive_is_refused(arguments: dict[str, object], word: str) -> None:
     with pytest.raises(ArgumentError, match=word):
-        Drive(**arguments)  # type: ignore[arg-type]
+        TownDrive(**arguments)  # type: ignore[arg-type]
 
 
-def test_a_frame_before_the_start_and_no_sensor_are_refused(drive: Drive) -> None:
+def test_a_frame_before_the_start_and_no_sensor_are_refused(drive: TownDrive) -> None:
     with pytest.raises(ArgumentError, match="frame"):
         drive.record(-1)
     with pytest.raises(ArgumentError, match="sensor"):
@@ -240,7 +239,7 @@ def test_a_frame_before_the_start_and_no_sensor_are_refused(drive: Drive) -> Non
         drive.reference_observations(0, sensors=0)
 
 
-def test_every_sensor_and_frame_has_its_own_noise(drive: Drive) -> None:
+def test_every_sensor_and_frame_has_its_own_noise(drive: TownDrive) -> None:
     quiet = copy(drive)
     quiet.lidar = replace(drive.lidar, noise_m=0.0)
     noise = []
@@ -255,7 +254,7 @@ def test_every_sensor_and_frame_has_its_own_noise(drive: Drive) -> None:
             assert abs(np.corrcoef([one[ray] for ray in common], [other[ray] for ray in common])[0, 1]) < 0.2
 
 
-def test_sensors_far_from_the_vehicle_see_everything_within_their_range(drive: Drive) -> None:
+def test_sensors_far_from_the_vehicle_see_everything_within_their_range(drive: TownDrive) -> None:
     """A larger snapshot of the town gives the same scans."""
     wide = copy(drive)
     wide.lidar = replace(drive.lidar, range_m=120.0)
@@ -271,7 +270,7 @@ def test_sensors_far_from_the_vehicle_see_everything_within_their_range(drive: D
         np.testing.assert_array_equal(one.instances, other.instances)
 
 
-def test_a_snapshot_holds_actors_that_reach_into_it(drive: Drive) -> None:
+def test_a_snapshot_holds_actors_that_reach_into_it(drive: TownDrive) -> None:
     actors, ego = drive.actors(13), drive.ego_pose(13)
     distances = {
         actor.id: float(np.linalg.norm((actor.world_T_actor - ego)[:2, 3])) - 3.0
@@ -284,7 +283,7 @@ def test_a_snapshot_holds_actors_that_reach_into_it(drive: Drive) -> None:
     assert id in near.snapshot(13).instances
 
 
-def test_no_place_in_or_beside_an_actor_is_free(drive: Drive) -> None:
+def test_no_place_in_or_beside_an_actor_is_free(drive: TownDrive) -> None:
     ego = drive.actors(0)[0]
     low, high = ego.mesh.vertices.min(axis=0), ego.mesh.vertices.max(axis=0)
     for local, free in (
@@ -296,14 +295,14 @@ def test_no_place_in_or_beside_an_actor_is_free(drive: Drive) -> None:
         assert drive.is_free(0, transform_points(ego.world_T_actor, np.array(local))) is free
 
 
-def test_a_place_close_above_a_roof_is_not_free(drive: Drive) -> None:
+def test_a_place_close_above_a_roof_is_not_free(drive: TownDrive) -> None:
     footprint, height = drive.town.buildings[0]
     assert not drive.is_free(0, np.append(footprint.centre, height + 3.0))
     beside = footprint.centre + (footprint.size[0] / 2 + 0.5) * footprint.axes[0]
     assert not drive.is_free(0, np.append(beside, 2.0))
 
 
-def test_reference_sensors_are_at_all_heights(drive: Drive) -> None:
+def test_reference_sensors_are_at_all_heights(drive: TownDrive) -> None:
     ego = invert(drive.ego_pose(50))
     places = [transform_points(ego, r.world_T_sensor[:3, 3]) for r in drive.reference_observations(50, sensors=20)]
     heights = np.array(places)[:, 2]
@@ -313,7 +312,7 @@ def test_reference_sensors_are_at_all_heights(drive: Drive) -> None:
     assert ((others >= 1.0) & (others <= 5.0)).all()
 
 
-def test_a_seed_keeps_its_town_and_its_traffic(drive: Drive) -> None:
+def test_a_seed_keeps_its_town_and_its_traffic(drive: TownDrive) -> None:
     """Where this fails, the same seed makes another town: raise TOWN_VERSION, so that old and new frames are not mixed."""
     assert TOWN_VERSION == 1
     mesh = drive.town.mesh

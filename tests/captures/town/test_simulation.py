@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from carlasc import Run
-from carlasc.captures import Capture, Drive, Lidar, simulate
+from carlasc.captures import Capture, Lidar, TownDrive, simulate
 from carlasc.core.tables import CARLA
 from carlasc.demo import demonstrate
 from carlasc.errors import ArgumentError, ConflictError, DependencyError
@@ -42,7 +42,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_capture_holds_what_the_drive_records(recorded: Path) -> None:
     capture = Capture(recorded)
-    drive = Drive(SMALL["seed"], SMALL["traffic"], LIDAR)
+    drive = TownDrive(SMALL["seed"], SMALL["traffic"], LIDAR)
     assert capture.sensors == (0, 1)
     assert capture.frames.tolist() == [0, 1, 2]
     for sensor in capture.sensors:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.captures import Drive
-from carlasc.captures.town.plots import Land, Rectangle
+from carlasc.captures import TownDrive
+from carlasc.captures.town.plan import Land, Rectangle
 from carlasc.captures.town.town import build_town
 from carlasc.core.tables import CARLA
 
@@ -12,24 +12,24 @@ pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")
 pytest.importorskip("trimesh", reason="the simulator needs carlasc[simulate]")
 
 
-def test_the_same_seed_builds_the_same_town(drive: Drive, twin: Drive) -> None:
+def test_the_same_seed_builds_the_same_town(drive: TownDrive, twin: TownDrive) -> None:
     again = twin.town
     np.testing.assert_array_equal(again.mesh.vertices, drive.town.mesh.vertices)
     np.testing.assert_array_equal(again.mesh.faces, drive.town.mesh.faces)
     np.testing.assert_array_equal(again.mesh.labels, drive.town.mesh.labels)
 
 
-def test_another_seed_builds_another_town(drive: Drive) -> None:
+def test_another_seed_builds_another_town(drive: TownDrive) -> None:
     other = build_town(np.random.default_rng(1234))
     assert other.mesh.vertices.shape != drive.town.mesh.vertices.shape
 
 
-def test_the_static_town_has_all_static_classes(drive: Drive) -> None:
+def test_the_static_town_has_all_static_classes(drive: TownDrive) -> None:
     names = {CARLA.names[int(label)] for label in np.unique(drive.town.mesh.labels)}
     assert names == set(CARLA.names.values()) - {"Free", "Sky", "Vehicle", "Pedestrian"}
 
 
-def test_the_mesh_is_valid(drive: Drive) -> None:
+def test_the_mesh_is_valid(drive: TownDrive) -> None:
     mesh = drive.town.mesh
     assert np.isfinite(mesh.vertices).all()
     assert mesh.faces.min() >= 0
@@ -37,7 +37,7 @@ def test_the_mesh_is_valid(drive: Drive) -> None:
     assert mesh.labels.shape == (len(mesh.faces),)
 
 
-def test_road_is_level_markings_lie_just_above_and_sidewalks_are_raised(drive: Drive) -> None:
+def test_road_is_level_markings_lie_just_above_and_sidewalks_are_raised(drive: TownDrive) -> None:
     mesh = drive.town.mesh
     heights = {
         name: mesh.vertices[np.unique(mesh.faces[mesh.labels == CARLA.id_of(name)]), 2]
@@ -50,7 +50,7 @@ def test_road_is_level_markings_lie_just_above_and_sidewalks_are_raised(drive: D
     assert heights["Sidewalk"].max() == pytest.approx(0.15)
 
 
-def test_no_building_is_on_a_lane(drive: Drive) -> None:
+def test_no_building_is_on_a_lane(drive: TownDrive) -> None:
     lanes = np.concatenate([lane.path for lane in drive.town.streets.lanes])
     for footprint, _ in drive.town.buildings:
         assert not footprint.contains(lanes, margin_m=1.5).any()

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.captures import Capture, CaptureWriter, Recording
+from carlasc.captures import Capture, CaptureWriter, SensorRecording
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.scans import Scan
 
 
-def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> Recording:
+def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> SensorRecording:
     """Return a recording of random points around the sensor, some of them on moving actors, at a random pose without roll and pitch."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform((-20, -20, -2), (20, 20, 1), (points, 3)).astype(np.float32)
@@ -19,7 +19,7 @@ def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> Recordi
     labels = np.where(instances > 0, 10, rng.integers(0, 23, points)).astype(np.uint32)
     velocities = np.column_stack([np.arange(1, actors + 1), rng.normal(size=(actors, 3))])
     pose = translation(rng.uniform(-5, 5, 3)) @ rotation_z(rng.uniform(-np.pi, np.pi))
-    return Recording(Scan(xyz, labels, None, instances), pose, velocities)
+    return SensorRecording(Scan(xyz, labels, None, instances), pose, velocities)
 
 
 def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 100, points: int = 300) -> Capture:

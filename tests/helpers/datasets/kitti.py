@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures import Drive, Lidar
+from carlasc.captures import Lidar, TownDrive
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import REMAPS
 
@@ -46,7 +46,7 @@ class KittiTruth:
 
 def write_kitti(
     root: Path,
-    drive: Drive,
+    drive: TownDrive,
     frames: range,
     sequence: str = "00",
     *,
@@ -136,7 +136,7 @@ def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes:
         np.packbits(mask).tofile(folder / "voxels" / f"{frame:06d}.{name}")
 
 
-def _movers(drive: Drive, frames: range) -> set[int]:
+def _movers(drive: TownDrive, frames: range) -> set[int]:
     """Return the actors that move at some time of the drive: they have a moving class in all frames."""
     return {
         actor.id for frame in frames for actor in drive.actors(frame) if float(np.square(actor.velocity).sum()) > 0.1**2

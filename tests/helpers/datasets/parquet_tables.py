@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from carlasc.storage.packed.tables.footers import footer_checksums
+from carlasc.storage.parquet.parquet_source import footer_checksums
 
 
 def seal_tables(folder: Path) -> None:

@@ -5,14 +5,13 @@ A terminal does the same when somebody presses Ctrl-C: every process of the grou
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from carlasc.cli import main
+from carlasc.cli import flags, main
 
 
 @contextmanager
@@ -27,6 +26,5 @@ def interrupting_bar(description: str) -> Iterator[Callable[[int, int], None]]:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     number, frames = signal.Signals[sys.argv.pop(1)], int(sys.argv.pop(1))
-    command = importlib.import_module(f"carlasc.cli.{sys.argv[1]}")
-    command.progress_bar = interrupting_bar  # type: ignore[attr-defined]
+    flags.progress_bar = interrupting_bar  # type: ignore[assignment]
     main()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation
 
 
 def plain_votes(

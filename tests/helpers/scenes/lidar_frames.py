@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import translation
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation
 
 GROUND_Z = -1.8  # below the ego sensor
 

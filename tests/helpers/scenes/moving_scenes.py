@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from carlasc.captures.lidar import Lidar
+from carlasc.captures.settings import Lidar
 from carlasc.core.geometry import rotation_z, transform_points
 from carlasc.motion.evidence import Sighting
 

@@ -79,23 +79,24 @@ def _grow(root: Json) -> None:
     """Make the points' chunks claim 10^12 elements, in all places that say it."""
     _node(root, f"{WHOLE}/scans/points")["attributes"]["chunk"] = 1 << 30
     points = _node(root, POINTS)
-    points["shape"][1] = 1 << 50
-    points["chunk_grid"]["configuration"]["chunk_shape"][1] = 1 << 40
-    points["codecs"][0]["configuration"]["chunk_shape"][1] = 1 << 30
+    points["shape"][2] = 1 << 40
+    points["chunk_grid"]["configuration"]["chunk_shape"][2] = 1 << 40
+    points["codecs"][0]["configuration"]["chunk_shape"][2] = 1 << 30
 
 
 def _zarr(base: Path) -> Iterator[Case]:
     inner, outer = ("codecs", 0, "configuration", "chunk_shape"), ("chunk_grid", "configuration", "chunk_shape")
     changes: dict[str, Callable[[Json], object]] = {
-        "a shape of 10^15 elements": _set(POINTS, "shape", value=[3, 10**15]),
-        "a shape of 10^30 elements": _set(POINTS, "shape", value=[3, 10**30]),
+        "a shape of 10^15 frames": _set(POINTS, "shape", value=[10**15, 3, 1 << 18]),
+        "a shape of 10^15 elements": _set(POINTS, "shape", value=[16, 3, 10**15]),
+        "a shape of 10^30 elements": _set(POINTS, "shape", value=[10**30, 3, 1 << 18]),
         "a shape of text": _set(POINTS, "shape", value="abc"),
-        "a shape of fractions": _set(POINTS, "shape", value=[3, 1.5]),
+        "a shape of fractions": _set(POINTS, "shape", value=[16, 3, 1.5]),
         "no axes": _set(POINTS, "shape", value=[]),
-        "shards of 10^15 chunks": _set(POINTS, *outer, value=[3, 10**15]),
+        "shards of 10^15 chunks": _set(POINTS, *outer, value=[10**15, 3, 1 << 18]),
         "chunks of 10^12 elements": _grow,
-        "chunks of no elements": _set(POINTS, *inner, value=[3, 0]),
-        "negative chunks": _set(POINTS, *inner, value=[3, -5]),
+        "chunks of no elements": _set(POINTS, *inner, value=[1, 3, 0]),
+        "negative chunks": _set(POINTS, *inner, value=[1, 3, -5]),
         "elements that are objects": _set(POINTS, "data_type", value="object"),
         "elements of a megabyte": _set(POINTS, "data_type", value="U1000000"),
         "codecs of another type": _set(POINTS, "codecs", value=7),
@@ -130,8 +131,10 @@ def _zarr(base: Path) -> Iterator[Case]:
         changes[f"a text file {name!r}"] = _set(WHOLE, "attributes", "documents", value=[name])
     for what, change in changes.items():
         unread = what in (
-            "a shape of 10^15 elements",
+            "a shape of 10^15 frames",
             "frames in 10^12 elements",
+            "a block of 10^18 frames",
+            "a block that is text",
         )  # no byte more is read than the frames have
         yield Case(
             f"zarr with {what}",
@@ -148,7 +151,7 @@ def _zarr(base: Path) -> Iterator[Case]:
     }.items():
         write = lambda path, content=content: path.write_bytes(content)  # noqa: E731
         yield Case(f"zarr.json with {what}", edit(base, "zarr.json", write, "x.zarr"), "info x.zarr", "x.zarr")
-    shard = f"{POINTS}/c/0/0"
+    shard = f"{POINTS}/c/0/0/0"
     for what, spoil in {
         "offsets beyond the file": lambda table: table.__setitem__(
             (..., 0), np.where(table[:, 0] < 2**63, 2**62, table[:, 0])
@@ -263,7 +266,7 @@ def _hdf5(base: Path) -> Iterator[Case]:
 
     import h5py
 
-    document, frames, offsets = f"{WHOLE}/documents/poses.txt", f"{WHOLE}/scans/labels/frames", f"{LABELS}_offsets"
+    document, frames, counts = f"{WHOLE}/documents/poses.txt", f"{WHOLE}/frames", f"{WHOLE}/counts"
     secret = lambda file, node: file.__setitem__(node, h5py.ExternalLink("other.h5", "/secret"))  # noqa: E731
 
     def external(file: Any, node: str) -> None:
@@ -289,6 +292,10 @@ def _hdf5(base: Path) -> Iterator[Case]:
     def loop(file: Any, node: str) -> None:
         file[node] = h5py.SoftLink(f"/{node}")
 
+    def counted(file: Any, folder: Path) -> None:
+        huge = np.full(file[counts].shape, 2**62)
+        replaced(counts, lambda file, node: file.create_dataset(node, data=huge))(file, folder)
+
     changes: dict[str, Callable[[Any, Path], object]] = {
         "a text file that is a link to another file": replaced(document, secret),
         "a text file in raw storage outside": replaced(document, external),
@@ -303,8 +310,8 @@ def _hdf5(base: Path) -> Iterator[Case]:
         "frames that are a table": replaced(frames, lambda file, node: file.create_dataset(node, data=np.zeros((3, 3), "<i8"))),
         "frames that fall": replaced(frames, lambda file, node: file.create_dataset(node, data=np.array([3, 2, 1, 0]))),
         "frames through a filter that is not installed": replaced(frames, late((4,), chunks=(4,), compression=32004, compression_opts=(1,), allow_unknown_filter=True)),
-        "offsets of 2^62": replaced(offsets, lambda file, node: file.create_dataset(node, data=np.full((4, 2), 2**62))),
-        "a group in the place of offsets": replaced(offsets, lambda file, node: file.create_group(node)),
+        "counts of 2^62": counted,
+        "a group in the place of counts": replaced(counts, lambda file, node: file.create_group(node)),
         "labels of 10^12 elements in one chunk": replaced(LABELS, late((10**12,), "u1", chunks=(10**6,), maxshape=(None,))),
         "attributes nested deeply": lambda file, _: file[WHOLE].attrs.create("fields:json", DEEP.decode()[:60_000]),
         "sequences nested deeply": lambda file, _: file.attrs.create("sequences:json", DEEP_OBJECT.decode()[:60_000]),

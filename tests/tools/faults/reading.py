@@ -98,7 +98,8 @@ def show(root: Path, attempt: Attempt) -> None:
 def draw(root: Path, attempt: Attempt) -> None:
     """Draw a picture of the first frame."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
-        attempt(lambda: carlasc.render(root, Path(out) / "a.png", size=(96, 64), still=True))
+        camera, style = carlasc.CameraOptions(still=True), carlasc.StyleOptions(size=(96, 64))
+        attempt(lambda: carlasc.render(root, Path(out) / "a.png", camera=camera, style=style))
 
 
 def pack_again(root: Path, attempt: Attempt) -> None:
@@ -118,7 +119,7 @@ def export_again(root: Path, attempt: Attempt) -> None:
     """Export a data set to each of the formats."""
     for name in exporter_names():
         with tempfile.TemporaryDirectory(dir=root.parent) as out:
-            attempt(lambda name=name, out=out: carlasc.export(name, root, out, workers=1))
+            attempt(lambda name=name, out=out: carlasc.export(name, root, out, run=Run(workers=1)))
 
 
 def regrid_captures(root: Path, attempt: Attempt) -> None:
@@ -163,7 +164,7 @@ def conversion_of(converter: str) -> Callable[[Path, Attempt], None]:
 
     def read(root: Path, attempt: Attempt) -> None:
         with tempfile.TemporaryDirectory(dir=root.parent) as out:
-            attempt(lambda: convert(converter, root, out, grids="none", workers=1))
+            attempt(lambda: convert(converter, root, out, grids=None, run=Run(workers=1)))
 
     return read
 
@@ -235,7 +236,7 @@ def regrid_again(root: Path, attempt: Attempt) -> None:
 
 def tracks_in(root: Path, attempt: Attempt) -> None:
     """Read the tracks of actors that regrid keeps, which a run that goes on takes for damaged rather than stop."""
-    from carlasc.groundtruth.from_scans.actors import Actors
+    from carlasc.motion.tracks import MovingActors
 
     for file in sorted(root.rglob("*.npz")):
-        attempt(Actors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))
+        attempt(MovingActors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))

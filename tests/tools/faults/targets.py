@@ -37,7 +37,6 @@ TARGETS = (
     Target("folder", writing.write_folder, reading.read_source, weight=20),
     Target("zip", writing.write_zip, reading.read_stored),
     Target("zarr", writing.write_packed(".zarr"), reading.read_stored, ("numcodecs", "pcodec")),
-    Target("zarr-1", writing.write_version_1, reading.read_stored, ("numcodecs", "pcodec"), 4),
     Target("hdf5", writing.write_packed(".h5"), reading.read_stored, ("h5py", "hdf5plugin"), 4),
     Target("parquet", writing.write_packed(".parquet"), reading.read_stored, ("pyarrow",)),
     Target("capture", writing.write_capture_files, reading.read_captures),

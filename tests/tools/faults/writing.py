@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from carlasc.core.tables import CARLA
 from carlasc.storage import FolderSink, layout
 from carlasc.testing.data import GRIDS, SCANS, SIZE, WHOLE, evidence, grid, lines, params, scan
 
-DATA = Path(__file__).parents[2] / "data"
 EXAMPLES = Path(__file__).parents[3] / "examples"
 REGRID_SPEC = carlasc.GridSpec("cartesian", (8, 8, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 
@@ -112,13 +110,6 @@ def write_packed(ending: str) -> Callable[[Path], None]:
         shutil.rmtree(files)
 
     return write
-
-
-def write_version_1(root: Path) -> None:
-    """Write the zarr store of version 1 that the tests keep."""
-    with tarfile.open(DATA / "before/zarr-1.tar.xz") as archive:
-        archive.extractall(root, filter="data")
-    shutil.rmtree(root / "published")
 
 
 def write_capture_files(root: Path) -> None:

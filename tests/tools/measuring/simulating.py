@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from carlasc import Run
-from carlasc.captures.town.drive import Drive
+from carlasc.captures.town.drive import TownDrive
 from carlasc.captures.town.simulation import simulate
 from measuring.figures import Figure
 from measuring.sizes import Size, by_turns
@@ -18,10 +18,10 @@ _FRAMES = 4
 
 def measure_simulation(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
     """Yield the times of a town, of a scan, and of a frame with pictures and files."""
-    Drive(seed=1, traffic="heavy").record(0)
-    times = by_turns({"town": lambda: Drive(seed=0, traffic="heavy").town}, size.slow_repeats)
+    TownDrive(seed=1, traffic="heavy").record(0)
+    times = by_turns({"town": lambda: TownDrive(seed=0, traffic="heavy").town}, size.slow_repeats)
     yield "simulation.town", Figure(times["town"], "s", "building a town with heavy traffic: processor time")
-    drive = Drive(seed=0, traffic="heavy")
+    drive = TownDrive(seed=0, traffic="heavy")
     drive.record(240)  # collects the triangles of the frame
     times = by_turns({"scan": lambda: drive.record(240, 1)}, size.repeats)
     yield (

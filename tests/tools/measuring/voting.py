@@ -36,7 +36,7 @@ from pathlib import Path
 import numpy as np
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.voting.ballot import count_votes
-from carlasc.groundtruth.voting.observations import Observation
+from carlasc.groundtruth.voting.ballot import Observation
 
 held = np.load(sys.argv[1])
 scans = [Observation(*(held[f"{name}{n}"] for name in ("points", "labels", "pose"))) for n in range(len(held) // 3)]

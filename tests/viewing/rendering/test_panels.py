@@ -7,13 +7,18 @@ from helpers.scenes.road_blocks import write_blocks
 from carlasc import Run
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.viewing import ClassColors, Scene, render
+from carlasc.viewing import CameraOptions, ClassColors, Scene, StyleOptions, render
 from carlasc.viewing.rendering import pictures
 from carlasc.viewing.rendering.pages import plan_page
 
 pytest.importorskip("embreex")
 
-OPTIONS = {"view": "bev", "ego": False, "legend": False}
+ABOVE = CameraOptions(view="bev")
+
+
+def bare(**options):
+    """Nothing beside the voxels: no vehicle and no legend."""
+    return StyleOptions(ego=False, legend=False, **options)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +46,7 @@ def halves(shown):
 
 def test_two_sources_are_drawn_from_the_same_camera(blocks, moved, tmp_path, captions):
     scenes = [Scene(source, frames=(0, 1)) for source in (blocks, moved)]
-    result = render(scenes, tmp_path / "a.png", size=(600, 330), **OPTIONS)
+    result = render(scenes, tmp_path / "a.png", camera=ABOVE, style=bare(size=(600, 330)))
     left, right = halves(picture(result.out))
     still = [middle_of(blue_pixels(part)) for part in (left, right)]
     np.testing.assert_allclose(still[0], still[1], atol=0.01)
@@ -58,13 +63,15 @@ def test_grids_of_another_size_are_drawn_at_the_same_scale(blocks, tmp_path):
     full = GridSpec.published()
     half = full.with_bounds((-12.8, -12.8, -2.0), (12.8, 12.8, 1.0)).with_size((64, 64, 8))
     small = write_blocks(tmp_path / "Train" / "Small" / "cartesian", spec=half)
-    result = render([blocks, small], tmp_path / "a.png", size=(600, 330), **OPTIONS)
+    result = render([blocks, small], tmp_path / "a.png", camera=ABOVE, style=bare(size=(600, 330)))
     left, right = halves(picture(result.out))
     np.testing.assert_allclose(middle_of(blue_pixels(left)), middle_of(blue_pixels(right)), atol=1.5)
 
 
 def test_frames_of_one_source_become_panels_in_reading_order(blocks, tmp_path, captions):
-    result = render([Scene(blocks, frames=(0, 3))], tmp_path / "a.png", size=(900, 330), columns=3, **OPTIONS)
+    result = render(
+        [Scene(blocks, frames=(0, 3))], tmp_path / "a.png", camera=ABOVE, style=bare(size=(900, 330), columns=3)
+    )
     assert result.frames == (0, 1, 2) and result.pictures == 1
     rows = [middle_of(red_pixels(part))[1] for part in np.array_split(picture(result.out), 3, axis=1)]
     assert rows[0] > rows[1] > rows[2]  # the block moves ahead
@@ -73,7 +80,7 @@ def test_frames_of_one_source_become_panels_in_reading_order(blocks, tmp_path, c
 
 def test_several_frames_of_several_sources_have_a_row_for_each_source(blocks, moved, tmp_path, captions):
     scenes = [Scene(source, frames=(0, 3), every=2) for source in (blocks, moved)]
-    result = render(scenes, tmp_path / "a.png", size=(600, 660), **OPTIONS)
+    result = render(scenes, tmp_path / "a.png", camera=ABOVE, style=bare(size=(600, 660)))
     parts = [half for row in np.array_split(picture(result.out), 2, axis=0) for half in halves(row)]
     rows = [middle_of(red_pixels(part))[1] for part in parts]
     scale = (rows[0] - rows[1]) / 2
@@ -82,7 +89,7 @@ def test_several_frames_of_several_sources_have_a_row_for_each_source(blocks, mo
 
 
 def test_a_film_shows_the_sources_beside_each_other(blocks, moved, tmp_path, captions):
-    result = render([blocks, moved], tmp_path / "a.mp4", size=(600, 330), run=Run(workers=1), **OPTIONS)
+    result = render([blocks, moved], tmp_path / "a.mp4", camera=ABOVE, style=bare(size=(600, 330)), run=Run(workers=1))
     _, frames = read_mp4(result.out)
     assert (result.frames, len(frames)) == ((0, 1, 2), 3)
     for frame in frames:
@@ -92,13 +99,19 @@ def test_a_film_shows_the_sources_beside_each_other(blocks, moved, tmp_path, cap
 
 
 def test_own_captions_follow_the_letters(blocks, moved, tmp_path, captions):
-    render([blocks, moved], tmp_path / "a.png", size=(400, 230), captions=["before", ""], **OPTIONS)
+    render([blocks, moved], tmp_path / "a.png", camera=ABOVE, style=bare(size=(400, 230), captions=["before", ""]))
     assert captions == [["(a) before", "(b)"]]
 
 
 def test_contents_and_views_are_panels_too(blocks, tmp_path, captions):
-    options = OPTIONS | {"view": "both"}
-    render([Scene(blocks, frames=(0, 1))], tmp_path / "a.png", what="grid,scan", size=(400, 330), **options)
+    camera = CameraOptions(view="both")
+    render(
+        [Scene(blocks, frames=(0, 1))],
+        tmp_path / "a.png",
+        what="grid,scan",
+        camera=camera,
+        style=bare(size=(400, 330)),
+    )
     names = ["(a) grid, from behind", "(b) grid, from above", "(c) scan, from behind", "(d) scan, from above"]
     assert captions == [names]
 
@@ -106,10 +119,11 @@ def test_contents_and_views_are_panels_too(blocks, tmp_path, captions):
 def test_impossible_panels_are_refused(blocks, moved, tmp_path):
     right = write_blocks(tmp_path / "data" / "s" / "cartesian", metadata={"axes": "right"})
     late = Scene(moved, frames=(2, 3))
+    with pytest.raises(ArgumentError, match="columns"):
+        StyleOptions(columns=0)
     cases = [
         ([], {}, ArgumentError, "source: expected at least one"),
         ([blocks, moved], {"captions": ["one"]}, ArgumentError, "captions: expected one for each of the 2 panels"),
-        ([blocks, moved], {"columns": 0}, ArgumentError, "columns"),
         ([blocks, right], {}, ArgumentError, "the same axes"),
         (blocks, {"captions": ["one"]}, ArgumentError, "captions: expected several"),
         ([Scene(blocks, frames=(0, 2)), late], {"out": "a.mp4"}, MissingDataError, "frames that all sources have"),
@@ -117,7 +131,7 @@ def test_impossible_panels_are_refused(blocks, moved, tmp_path):
     for source, options, error, message in cases:
         out = tmp_path / options.pop("out", "a.png")
         with pytest.raises(error, match=message):
-            render(source, out, size=(200, 120), **options)
+            render(source, out, style=StyleOptions(size=(200, 120), **options))
         assert not out.exists()
 
 

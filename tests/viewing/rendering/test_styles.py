@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 from helpers.readers.pictures import Image
-from helpers.viewing import draw
 
 from carlasc.errors import ArgumentError, ConflictError
-from carlasc.viewing.rendering.styles import style_of
-from carlasc.viewing.rendering.texts import draw_legend, entry_width, font_of, wrap_text
+from carlasc.viewing import Scene, StyleOptions, render
+from carlasc.viewing.rendering.pages import draw_legend, entry_width, font_of, wrap_text
 
 pytest.importorskip("embreex")
 
@@ -26,8 +25,8 @@ pytest.importorskip("embreex")
     ],
 )
 def test_sizes_are_pixels_or_lengths_at_a_number_of_pixels_per_inch(name, size, dpi, pixels, written):
-    style = style_of(name, size, dpi)
-    assert (style.size, style.dpi) == (pixels, written)
+    sheet = StyleOptions(name, size, dpi).sheet
+    assert (sheet.size, sheet.dpi) == (pixels, written)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +34,7 @@ def test_sizes_are_pixels_or_lengths_at_a_number_of_pixels_per_inch(name, size, 
 )
 def test_a_size_that_is_none_is_refused(size):
     with pytest.raises(ArgumentError, match="size: expected WIDTHxHEIGHT"):
-        style_of("screen", size, None)
+        StyleOptions(size=size)
 
 
 @pytest.mark.parametrize(
@@ -43,23 +42,27 @@ def test_a_size_that_is_none_is_refused(size):
 )
 def test_an_unknown_style_and_impossible_resolutions_are_refused(name, dpi, where):
     with pytest.raises(ArgumentError, match=f"^{where}: "):
-        style_of(name, None, dpi)
+        StyleOptions(name, dpi=dpi)
 
 
 def test_type_on_paper_is_eight_points_high_at_any_resolution():
-    assert [style_of("paper", None, dpi).font_size for dpi in (300, 600)] == [33, 67]
-    assert style_of("screen", None, None).font_size is None
+    assert [StyleOptions("paper", dpi=dpi).sheet.font_size for dpi in (300, 600)] == [33, 67]
+    assert StyleOptions().sheet.font_size is None
 
 
 def test_a_picture_on_paper_says_its_resolution_and_has_its_legend_in_a_file_of_its_own(blocks, tmp_path):
-    result = draw(blocks, tmp_path / "scene.png", frames=(0, 1), style="paper", size="5cmx3cm")
+    result = render(
+        Scene(blocks, frames=(0, 1)), tmp_path / "scene.png", style=StyleOptions(name="paper", size="5cmx3cm")
+    )
     assert result.legend == tmp_path / "scene.legend.png"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.legend.png", "scene.png"]
     with Image.open(result.out) as picture, Image.open(result.legend) as legend:
         for image in (picture, legend):
             assert image.info["dpi"] == pytest.approx((300, 300), abs=0.01)
         assert picture.size == (591, 354)
-        without = draw(blocks, tmp_path / "b.png", frames=(0, 1), size=(591, 354), legend=False).out
+        without = render(
+            Scene(blocks, frames=(0, 1)), tmp_path / "b.png", style=StyleOptions(size=(591, 354), legend=False)
+        ).out
         assert np.array_equal(np.asarray(picture), np.asarray(Image.open(without)))
         shown = np.asarray(legend)
         for color in ([220, 20, 60], [0, 0, 142], [128, 64, 128]):  # pedestrian, vehicle, road
@@ -67,28 +70,34 @@ def test_a_picture_on_paper_says_its_resolution_and_has_its_legend_in_a_file_of_
 
 
 def test_without_a_legend_no_file_of_one_is_written(blocks, tmp_path):
-    result = draw(blocks, tmp_path / "scene.png", frames=(0, 1), style="paper", size=(200, 120), legend=False)
+    result = render(
+        Scene(blocks, frames=(0, 1)),
+        tmp_path / "scene.png",
+        style=StyleOptions(name="paper", size=(200, 120), legend=False),
+    )
     assert result.legend is None and list(tmp_path.iterdir()) == [result.out]
 
 
 def test_a_picture_for_a_screen_says_no_resolution(blocks, tmp_path):
-    with Image.open(draw(blocks, tmp_path / "a.png", frames=(0, 1), size=(160, 90)).out) as picture:
+    with Image.open(
+        render(Scene(blocks, frames=(0, 1)), tmp_path / "a.png", style=StyleOptions(size=(160, 90))).out
+    ) as picture:
         assert "dpi" not in picture.info
 
 
 def test_a_legend_that_exists_is_replaced_only_when_asked(blocks, tmp_path):
     (tmp_path / "a.legend.png").write_bytes(b"mine")
-    options = {"frames": (0, 1), "style": "paper", "size": (200, 120)}
+    options = {"style": StyleOptions(name="paper", size=(200, 120))}
     with pytest.raises(ConflictError, match="legend"):
-        draw(blocks, tmp_path / "a.png", **options)
+        render(Scene(blocks, frames=(0, 1)), tmp_path / "a.png", **options)
     assert [path.name for path in tmp_path.iterdir()] == ["a.legend.png"]
-    draw(blocks, tmp_path / "a.png", overwrite=True, **options)
+    render(Scene(blocks, frames=(0, 1)), tmp_path / "a.png", overwrite=True, **options)
     assert (tmp_path / "a.legend.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_film_has_no_style_of_paper(blocks, tmp_path):
     with pytest.raises(ArgumentError, match="style: expected screen for a film"):
-        draw(blocks, tmp_path / "a.mp4", style="paper")
+        render(blocks, tmp_path / "a.mp4", style=StyleOptions(name="paper"))
     assert list(tmp_path.iterdir()) == []
 
 

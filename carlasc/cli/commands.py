@@ -1,0 +1,133 @@
+"""What all commands have in common as commands: plain help under headings, and errors of one line with an honest exit code."""
+
+from __future__ import annotations
+
+import copy
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from carlasc.cli.common import FAILED, INTERRUPTED, WRONG_USAGE, BatchError, echo, fail
+from carlasc.cli.flags import declared_name
+from carlasc.errors import ArgumentError, CarlascError
+
+_INTERRUPTED = "interrupted: files written so far are complete; run the same command again to continue"
+_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
+_OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
+_UsageError: Any = typer.BadParameter.__mro__[1]  # typer exports it under no name of its own
+
+
+class Command(TyperCommand):
+    """A command whose help is plain text, and whose errors are one line on stderr and an exit code."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read the arguments."""
+        with _errors_in_one_line(self):
+            return super().make_context(info_name, args, parent, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command. Exit codes: 1 if the work failed, 2 for a wrong argument, 130 if it was interrupted."""
+        with _errors_in_one_line(self):
+            return super().invoke(ctx)
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, and the options under their headings."""
+        write_options(self.get_params(ctx), ctx, formatter)
+
+
+class CommandGroup(TyperGroup):
+    """The commands; a name that is none of them is one line on stderr."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read what stands before the command; without anything, print the help."""
+        with _errors_in_one_line(self):
+            return super().make_context(info_name, args or ["--help"], parent, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        with _errors_in_one_line(self):
+            return super().invoke(ctx)
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the options and the commands."""
+        write_options(self.get_params(ctx), ctx, formatter)
+        rows = [(name, self.summary(name)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+    def summary(self, name: str) -> str:
+        """Return what a command does, in a sentence or two: the first paragraph of its help."""
+        return " ".join((self.commands[name].help or "").partition("\n\n")[0].split())
+
+
+def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:
+    """Write parameters under their headings: arguments first, then the options of the command, then those of its groups."""
+    sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+    for parameter in parameters:
+        is_argument = parameter.param_type_name == "argument"
+        heading = getattr(parameter, "rich_help_panel", None) or ("Arguments" if is_argument else "Options")
+        if (record := parameter.get_help_record(ctx)) is not None:
+            sections.setdefault(heading, []).append(record)
+    for heading, records in sections.items():
+        if records:
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+@contextmanager
+def _errors_in_one_line(command: Any) -> Iterator[None]:
+    """Turn errors of the library and of the arguments into one line on stderr and an exit code."""
+    options = {declared_name(one.name): _typed(one) for one in getattr(command, "params", ()) if one.name}
+    try:
+        yield
+    except _UsageError as error:
+        path = f"carlasc {command.name}" if error.ctx is None else error.ctx.command_path
+        text = " ".join(error.format_message().split()).rstrip(".")
+        fail(f"{text[:1].lower()}{text[1:]}: see `{path} --help`", WRONG_USAGE)
+    except CarlascError as error:
+        shown = copy.copy(error)
+        if isinstance(error, ArgumentError):
+            shown.where = options.get(error.where, error.where)
+        fail(_replace_arguments(str(shown), options), WRONG_USAGE if isinstance(error, ArgumentError) else FAILED)
+    except BatchError as error:
+        for message in error.messages:
+            echo(f"carlasc: {_replace_arguments(message, options)}", err=True)
+        fail(str(error))
+    except KeyboardInterrupt:
+        fail(_INTERRUPTED, INTERRUPTED)
+    except (SystemError, ValueError) as error:
+        # Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
+        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise
+        fail(_INTERRUPTED, INTERRUPTED)
+    except BrokenPipeError:  # `carlasc info | head`
+        sys.stderr.close()
+        raise typer.Exit(FAILED) from None
+    except OSError as error:  # of a file that the library reads or writes in passing
+        fail(f"{error.filename or 'the file system'}: {error.strerror or error}")
+
+
+def _typed(parameter: Any) -> str:
+    """Return what a user types for a parameter: `--frames`, or `SOURCE`."""
+    longest: str = max(parameter.opts, key=len)
+    return longest if longest.startswith("-") else (parameter.metavar or longest).upper()
+
+
+def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
+    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite` ``, where there is such an option."""
+
+    def replace(match: re.Match[str]) -> str:
+        name, value = match[1], match[2]
+        if name not in options:
+            return match[0]
+        if value in ("True", None):
+            return f"`{options[name]}`"
+        value = _OPTIONS.sub(r"\1", value).strip('"')
+        return f"`{options[name]} {value}`"
+
+    return _ARGUMENT.sub(replace, text)

@@ -1,0 +1,209 @@
+"""Groups of options: what commands share is declared once, as a class whose fields are options and which makes the library's objects."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import MISSING, dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args, get_type_hints
+
+import typer
+
+from carlasc.cli.common import progress_bar
+
+if TYPE_CHECKING:
+    from carlasc.converting import OptionDeclaration
+    from carlasc.running import Engine, Run
+
+_DECLARED = "declared_"  # the parameter of a declared option is called so, that it meets none of the command's own
+
+
+@dataclass(frozen=True)
+class Flags:
+    """A group of options: each field is an option, or another group. Annotations are read when the command is used, not before.
+
+    Attributes:
+        heading: what the options stand under in `--help`; empty for no heading of their own.
+    """
+
+    heading: ClassVar[str] = ""
+
+    @property
+    def is_given(self) -> bool:
+        """Whether an option of the group has another value than its default."""
+        values = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return any(value.is_given if isinstance(value, Flags) else value != field.default for field, value in values)
+
+
+@dataclass(frozen=True)
+class DeclaredOptions(Flags):
+    """The options that a converter or an exporter declares, as text by name, as far as they are given."""
+
+    values: Mapping[str, Any]
+
+
+def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration] = ()) -> Callable[..., None]:
+    """Return the function of a command as typer takes it: the options of its groups are parameters of the function itself.
+
+    Args:
+        function: the function of a command, whose parameters are annotated with options or groups of options.
+        declared: options that stand for a parameter of type `DeclaredOptions`.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    parameters: list[inspect.Parameter] = []
+    groups: dict[str, type[Flags]] = {}
+    for name, parameter in inspect.signature(function).parameters.items():
+        if not _is_group(hints[name]):
+            parameters.append(parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY))
+            continue
+        groups[name] = hints[name]
+        parameters += map(_declared, declared) if hints[name] is DeclaredOptions else _parameters(hints[name])
+
+    def command(**given: Any) -> None:
+        function(**{name: _make(group, given) for name, group in groups.items()}, **given)
+
+    command.__name__, command.__doc__ = function.__name__, function.__doc__
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+def declared_name(parameter: str) -> str:
+    """Return the name of the option that a parameter stands for."""
+    return parameter.removeprefix(_DECLARED)
+
+
+def _is_group(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, Flags)
+
+
+def _parameters(group: type[Flags]) -> Iterator[inspect.Parameter]:
+    """Yield the options of a group, each under the heading of the group."""
+    hints = get_type_hints(group, include_extras=True)
+    for field in dataclasses.fields(group):
+        hint = hints[field.name]
+        if _is_group(hint):
+            yield from _parameters(hint)
+            continue
+        kind: Any
+        kind, info = get_args(hint)
+        info = copy.copy(info)
+        info.rich_help_panel = group.heading or None
+        default = inspect.Parameter.empty if field.default is MISSING else field.default
+        annotation = Annotated[kind, info]
+        yield inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _make(group: type[Flags], given: dict[str, Any]) -> Flags:
+    """Take the values of a group's options out of those that are given."""
+    if group is DeclaredOptions:
+        names = [name for name in given if name.startswith(_DECLARED)]
+        values = {declared_name(name): given.pop(name) for name in names}
+        return DeclaredOptions({name: value for name, value in values.items() if value is not None})
+    hints = get_type_hints(group)
+    return group(**{
+        field.name: _make(hints[field.name], given) if _is_group(hints[field.name]) else given.pop(field.name)
+        for field in dataclasses.fields(group)
+    })  # fmt: skip
+
+
+def _declared(option: OptionDeclaration) -> inspect.Parameter:
+    """Return the parameter of a declared option. Without a value it is None, and the library takes the default."""
+    dashed = option.name.replace("_", "-")
+    is_switch = option.type is bool
+    shown = option.default is not None and option.default is not False
+    info = typer.Option(
+        f"--{dashed}/--no-{dashed}" if is_switch else f"--{dashed}",
+        help=f"{option.help}{f'  [default: {_shown(option.default)}]' if shown else ''}".strip(),
+        rich_help_panel="Options of this data set",
+        show_default=False,
+    )
+    kind: Any = Literal[option.choices] if option.choices else option.type
+    annotation = Annotated[kind | None, info]
+    name = f"{_DECLARED}{option.name}"
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _shown(default: object) -> str:
+    return {True: "yes", False: "no"}.get(default, str(default)) if isinstance(default, bool) else str(default)
+
+
+@dataclass(frozen=True)
+class WorkFlags(Flags):
+    """How work is spread."""
+
+    heading: ClassVar[str] = "How the work is spread"
+
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that work side by side; if not given, one per core.", min=1)
+    ] = None
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHERE",
+            help="Work on a Dask cluster: local or local:N (processes here), tcp://HOST:PORT (a scheduler), slurm (with --workers jobs),"
+            " or the dotted path of a class that starts one.",
+        ),
+    ] = None
+
+    @contextmanager
+    def spread(
+        self, title: str, unit: str = "frames", *, usual: int | None = None, shown: bool = True
+    ) -> Iterator[Run]:
+        """Yield how a run is spread, while a progress bar is shown.
+
+        Args:
+            title: what is being done.
+            unit: what is counted.
+            usual: number of processes if none is given; None for one per core.
+            shown: whether there is a progress bar.
+        """
+        from carlasc.running.options import Run
+
+        part = self._part()
+        bar = progress_bar(title, unit) if shown else nullcontext()
+        with bar as progress, self._engine() as executor:
+            yield Run(self.workers or usual, executor, progress=progress, **part)
+
+    def _part(self) -> dict[str, Any]:
+        return {}
+
+    @contextmanager
+    def _engine(self) -> Iterator[Engine | None]:
+        if self.cluster is None:
+            yield None
+        else:
+            from carlasc.running import open_cluster
+
+            with open_cluster(self.cluster, workers=self.workers) as opened:
+                yield opened
+
+
+@dataclass(frozen=True)
+class OneWorkerFlags(WorkFlags):
+    """How work is spread that one process usually does."""
+
+    workers: Annotated[int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)] = (
+        None
+    )
+
+
+@dataclass(frozen=True)
+class RunFlags(WorkFlags):
+    """How work is spread, also over several commands."""
+
+    part: Annotated[
+        str | None,
+        typer.Option(
+            metavar="I/N",
+            help="Do only the I-th of N parts; other commands do the others, on any machine that reaches the output.",
+        ),
+    ] = None
+
+    def _part(self) -> dict[str, Any]:
+        from carlasc.running.parts import Part
+
+        return {} if self.part is None else {"part": Part.parse(self.part)}

@@ -1,0 +1,232 @@
+"""The options of what makes grids, which `regrid`, `convert`, `simulate` and `validate` share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import typer
+
+import carlasc
+from carlasc.cli.common import parse_numbers
+from carlasc.cli.flags import Flags
+from carlasc.core.choices import Complete, Coordinates, Dynamic, VoteRule
+from carlasc.errors import ArgumentError
+
+Preset = Literal["coarse", "fine", "cylindrical"]
+"""The grids of the published data set."""
+
+
+@dataclass(frozen=True)
+class GridFlags(Flags):
+    """The geometry of a grid."""
+
+    heading: ClassVar[str] = "Grid: one of --res, --size and --preset"
+
+    res: Annotated[
+        str | None,
+        typer.Option(help="Size of a voxel: one value in metres, or one value per axis: x,y,z or radius,degrees,z."),
+    ] = None
+    size: Annotated[str | None, typer.Option(help="Number of voxels per axis, X,Y,Z, within exactly the bounds.")] = (
+        None
+    )
+    preset: Annotated[Preset | None, typer.Option(help="A grid of the published data set.")] = None
+    coordinates: Annotated[Coordinates | None, typer.Option(help="Coordinates of the grid; default: cartesian.")] = None
+    bounds: Annotated[
+        str | None,
+        typer.Option(
+            help="x0,x1,y0,y1,z0,z1 in metres (cylindrical: radius in metres, azimuth in degrees, z in metres); default: the published bounds."
+        ),
+    ] = None
+
+    def spec_or_published(self) -> carlasc.GridSpec:
+        """Return the grid that the options describe, or the published one of the coordinates if they name none."""
+        if self.res is None and self.size is None and self.preset is None and self.bounds is None:
+            return carlasc.GridSpec.published(self.coordinates or "cartesian")
+        return self.spec()
+
+    def spec(self) -> carlasc.GridSpec:
+        """Return the grid that the options describe. Azimuths are degrees here and radians everywhere else.
+
+        Raises:
+            ArgumentError: not exactly one of --res, --size and --preset, or values that are not valid for a grid.
+        """
+        three = (("--res", self.res), ("--size", self.size), ("--preset", self.preset))
+        given = [option for option, value in three if value is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none of them"
+            raise ArgumentError(
+                "grid", expected="one of --res, --size and --preset", found=found, advice="try --res 0.2"
+            )
+        if self.preset == "cylindrical" and self.coordinates == "cartesian":
+            raise ArgumentError("coordinates", expected="cylindrical with --preset cylindrical", found="cartesian")
+        if self.preset is not None and self.bounds is not None:
+            raise ArgumentError(
+                "bounds", expected="none with --preset, which has its own bounds", found=repr(self.bounds)
+            )
+        cylindrical = "cylindrical" in (self.preset, self.coordinates)
+        spec = carlasc.GridSpec.published("cylindrical" if cylindrical else "cartesian")
+        if self.bounds is not None:
+            values = list(parse_numbers(self.bounds, float, (6,), "--bounds"))
+            if cylindrical:
+                values[2:4] = [math.radians(value) for value in values[2:4]]
+            spec = spec.with_bounds(values[0::2], values[1::2])
+        if self.size is not None:
+            return spec.with_size(parse_numbers(self.size, int, (3,), "--size"))
+        if self.res is not None:
+            steps = list(parse_numbers(self.res, float, (1, 3), "--res"))
+            if cylindrical and len(steps) == 3:
+                steps[1] = math.radians(steps[1])
+            return spec.with_resolution(steps)
+        if self.preset == "fine":
+            return spec.with_size(carlasc.GridSpec.published("cartesian_fine").size)
+        return spec
+
+
+@dataclass(frozen=True)
+class VoteFlags(Flags):
+    """How votes are counted, and what is kept of them."""
+
+    heading: ClassVar[str] = "Votes"
+
+    rule: Annotated[
+        VoteRule | None,
+        typer.Option(
+            "--voting",
+            help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures);"
+            " sample: every sample counts, as in the paper; ray: a voxel is occupied where enough of the rays that enter it end in it (default for scans).",
+        ),
+    ] = None
+    free_step_m: Annotated[float, typer.Option(help="Distance between two free samples on a ray, in metres.")] = 1.5
+    keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False
+    keep_evidence: Annotated[
+        bool,
+        typer.Option(
+            "--keep-evidence",
+            help="Also write how certain each voxel is: probabilities, flags and number of scans (for scans only).",
+        ),
+    ] = False
+    min_confidence: Annotated[
+        float,
+        typer.Option(
+            help="Voxels that are neither free nor occupied with at least this probability become unknown (for scans only)."
+        ),
+    ] = 0.0
+
+    def voting(self) -> carlasc.Voting:
+        """Return how votes are counted."""
+        return carlasc.Voting(self.rule, self.free_step_m, self.keep, self.keep_evidence, self.min_confidence)
+
+
+@dataclass(frozen=True)
+class PoseFlags(Flags):
+    """Where poses come from."""
+
+    heading: ClassVar[str] = "Poses"
+
+    poses: Annotated[
+        carlasc.motion.PoseSource,
+        typer.Option(
+            help="file: those of the data. kiss-icp: estimated from the scans. auto: the file if it exists, else estimated."
+        ),
+    ] = "auto"
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force",
+            help="Accept poses that jump between frames, under which scans do not overlap, or whose calibration is missing.",
+        ),
+    ] = False
+
+    def options(self) -> carlasc.motion.PoseOptions:
+        """Return where poses come from."""
+        return carlasc.motion.PoseOptions(self.poses, self.force)
+
+
+@dataclass(frozen=True)
+class WindowFlags(Flags):
+    """Which scans are merged, and what happens to what moves."""
+
+    heading: ClassVar[str] = "Scans merged over time"
+
+    window: Annotated[
+        str | None,
+        typer.Option(help="First and last scan to merge, relative to each frame, in frames; default: -30:30."),
+    ] = None
+    dynamic: Annotated[
+        Dynamic | None,
+        typer.Option(
+            help="What happens to moving points. align: complete each actor from all scans (default); current: use those of the frame"
+            " itself; drop: use none; tube: leave them where they were seen, as in SemanticKITTI."
+        ),
+    ] = None
+    motion: Annotated[
+        carlasc.motion.MotionSource | None,
+        typer.Option(
+            help="What tells which points move. boxes, instances, flow: the field of that name; evidence: free space that other scans saw"
+            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses (default)."
+        ),
+    ] = None
+
+    def from_scans(self, poses: carlasc.motion.PoseOptions) -> carlasc.FromScans:
+        """Return how scans are merged, with the defaults of `FromScans` for what is not given."""
+        given = {name: value for name, value in self._given().items() if value is not None}
+        return carlasc.FromScans(**given, poses=poses)
+
+    def _given(self) -> dict[str, Any]:
+        motion = None if self.motion is None else carlasc.motion.MotionOptions(self.motion)
+        window = None if self.window is None else _parse_window(self.window)
+        return {"window": window, "dynamic": self.dynamic, "motion": motion}
+
+
+@dataclass(frozen=True)
+class ScanFlags(WindowFlags):
+    """How scans are merged."""
+
+    window_m: Annotated[float | None, typer.Option(help="Merge only scans within this driven distance, in metres.")] = (
+        None
+    )
+    stride: Annotated[
+        int | None, typer.Option(help="Merge every N-th scan of the window; default: 1.", metavar="N")
+    ] = None
+    complete: Annotated[
+        Complete | None,
+        typer.Option(
+            help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown; mirror: a side is taken from the"
+            " other side (default); body: and what is still missing from the usual shape of vehicles."
+        ),
+    ] = None
+    no_own_path: Annotated[
+        bool,
+        typer.Option(
+            "--no-own-path", help="What the recording vehicle itself drove through is not taken for free space."
+        ),
+    ] = False
+    min_range_m: Annotated[float | None, typer.Option(help="Leave out nearer points, in metres.")] = None
+    max_range_m: Annotated[float | None, typer.Option(help="Leave out farther points, in metres.")] = None
+
+    def _given(self) -> dict[str, Any]:
+        others = {
+            name: getattr(self, name) for name in ("window_m", "stride", "complete", "min_range_m", "max_range_m")
+        }
+        return super()._given() | others | {"own_path": False if self.no_own_path else None}
+
+
+def _parse_window(text: str) -> tuple[int, int]:
+    first, _, last = text.partition(":")
+    try:
+        return int(first), int(last)
+    except ValueError:
+        raise ArgumentError(
+            "window", expected="A:B, in frames relative to the current one, such as -30:30", found=repr(text)
+        ) from None
+
+
+@dataclass(frozen=True)
+class GroundTruthFlags(Flags):
+    """What makes grids: the same options in `regrid` and in `convert`."""
+
+    grid: GridFlags
+    votes: VoteFlags
+    scans: ScanFlags

@@ -1,0 +1,116 @@
+"""How the sequences of a conversion are written: what the caller says of it, and what that means for the ids and the axes of a data set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.protocol import Converter
+from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
+from carlasc.core.classes import ClassTable, Remap
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.storage.metadata import Axes
+
+_IDS = np.iinfo(np.uint16).max + 1
+_UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
+_MAX_LISTED = 8
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """How a conversion writes sequences.
+
+    Attributes:
+        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids.
+        axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
+        flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
+            the actor's points, if they are numbered; "none" writes no flow.
+        allow_unknown: treat class ids that the table does not have as unlabelled.
+
+    Raises:
+        ArgumentError: unknown axes, or an unknown source of flow.
+    """
+
+    classes: str = "carla"
+    axes: Axes = "left"
+    flow: FlowSource = "auto"
+    allow_unknown: bool = False
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("axes", get_args(Axes)), ("flow", get_args(FlowSource))):
+            if getattr(self, name) not in allowed:
+                raise ArgumentError(name, expected=f"one of {', '.join(allowed)}", found=repr(getattr(self, name)))
+
+    def of(self, converter: type[Converter]) -> AxesAndClasses:
+        """Return the axes and the classes in which the data of a converter are written.
+
+        Raises:
+            ArgumentError: `classes` is neither "carla" nor the name of the converter's class table.
+        """
+        allowed = ("carla", converter.classes.name)
+        if self.classes not in allowed:
+            raise ArgumentError("classes", expected=f"one of {', '.join(allowed)}", found=repr(self.classes))
+        remap = converter.to_carla if self.classes == "carla" else None
+        return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
+
+
+@dataclass(frozen=True)
+class AxesAndClasses:
+    """The axes and the classes in which frames of a data set are written.
+
+    Attributes:
+        source: class table of the ids that are read.
+        remap: maps them to other ids; None keeps them.
+        mirrored: whether y is mirrored, from right-handed axes to CarlaSC's left-handed ones.
+        allow_unknown: whether ids that the table does not have become unlabelled.
+    """
+
+    source: ClassTable
+    remap: Remap | None
+    mirrored: bool
+    allow_unknown: bool = False
+
+    @property
+    def classes(self) -> ClassTable:
+        """Table of the ids that are written."""
+        return self.source if self.remap is None else self.remap.target
+
+    def map_labels(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.uint32]:
+        """Return the ids that are written for the ids that were read.
+
+        Raises:
+            FormatError: an id is unknown; names it, and how often it occurs. `where` names the labels.
+        """
+        ids = self.source.names if self.remap is None else self.remap.mapping
+        lookup = _lookup_table(tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values()))
+        mapped = lookup[labels if labels.dtype.itemsize <= 2 else np.minimum(labels, _IDS - 1)]
+        if mapped.size and int(mapped.max()) == _UNKNOWN:
+            unknown = mapped == _UNKNOWN
+            if not self.allow_unknown:
+                raise FormatError(
+                    where,
+                    expected=f"class ids of {self.source.name}",
+                    found=_list_ids(labels[unknown]),
+                    advice="treat them as unlabelled with `allow_unknown=True`",
+                )
+            mapped[unknown] = 0
+        return mapped
+
+
+@lru_cache(maxsize=8)
+def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Return the target of every 16-bit id, `_UNKNOWN` where it has none."""
+    lookup = np.full(_IDS, _UNKNOWN, np.uint32)
+    lookup[list(ids)] = targets
+    return lookup
+
+
+def _list_ids(labels: NDArray[np.unsignedinteger]) -> str:
+    ids, counts = np.unique(labels, return_counts=True)
+    named = [f"{i} ({n} times)" for i, n in zip(ids.tolist(), counts.tolist(), strict=True)]
+    more = f" and {len(named) - _MAX_LISTED} more" if len(named) > _MAX_LISTED else ""
+    return ", ".join(named[:_MAX_LISTED]) + more

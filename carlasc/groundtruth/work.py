@@ -1,0 +1,395 @@
+"""The work of a run: the frames of all its sequences are made in parallel, and each sequence whose frames all exist gets a report.
+
+A `FrameTask` pickles into a worker, where a frame is made, or one that exists is measured.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Generator, Iterator, Set
+from collections.abc import Sequence as Series
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.evidence import is_confident
+from carlasc.core.grids import Grid
+from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
+from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, RunProgress, SequenceInput
+from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
+from carlasc.groundtruth.reporting.report import Report
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
+from carlasc.storage import layout
+from carlasc.storage.resuming import check_scan
+from carlasc.storage.sinks import SequenceWriter
+
+Outputs = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The result of a task.
+
+    Attributes:
+        task: the task.
+        outputs: what it made, by field, until it is written.
+        error: why it failed; None if it did not.
+        facts: what the report needs to know of the frame.
+    """
+
+    task: FrameTask
+    outputs: Outputs = field(default_factory=dict)
+    error: str | None = None
+    facts: FrameFacts | None = None
+
+
+@dataclass(frozen=True)
+class FrameTask(ABC):
+    """One piece of the work of a run. It holds paths and settings.
+
+    Attributes:
+        number: frame number in the output.
+        frame: the frame, if the run knows it.
+        plan: what the run makes.
+        classes: class table of the grid.
+        sampled: whether the frame is also made without a tenth of the scans.
+    """
+
+    number: int
+    frame: FrameInput | None
+    plan: GridPlan
+    classes: ClassTable
+    sampled: bool
+
+    @abstractmethod
+    def run(self) -> FrameResult:
+        """Do the work, in a worker."""
+
+
+@dataclass(frozen=True)
+class MakeFrame(FrameTask):
+    """Makes one frame."""
+
+    frame: FrameInput
+
+    def run(self) -> FrameResult:
+        """Make the frame. What it made is returned, and not written yet."""
+        plan, number = self.plan, self.number
+        try:
+            thinned = self.frame.thinned(plan) if self.sampled else None  # first, while there are no outputs to keep
+            outputs, grid = _outputs_of(self.frame.make(plan), plan, number)
+            changes = None if thinned is None else Changes.between(grid, thinned)
+            facts = FrameFacts.of(number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals())
+        except MemoryError as error:
+            raise CarlascError(
+                str(plan.spec), problem="out of memory", advice="use a coarser grid, or fewer processes (`workers`)"
+            ) from error
+        except (CarlascError, OSError) as error:
+            return FrameResult(self, error=str(error))
+        return FrameResult(self, outputs, facts=facts)
+
+
+@dataclass(frozen=True)
+class MeasureFrame(FrameTask):
+    """Measures one frame that exists already, for the report.
+
+    Attributes:
+        writer: where the frame is.
+    """
+
+    writer: SequenceWriter
+
+    def run(self) -> FrameResult:
+        """Read the frame. One that cannot be read is left out of the report."""
+        plan = self.plan
+        names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
+        try:
+            found = {name: self.writer.read(name, self.number) for name in names if self.writer.has(name, self.number)}
+            arrays = {name: array for name, array in found.items() if array is not None}
+            if not {f"{plan.grid}/labels", f"{plan.grid}/counts"} <= arrays.keys():
+                return FrameResult(self)
+            labels, counts = (arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size) for part in ("labels", "counts"))
+            thinned = self.frame.thinned(plan) if self.sampled and self.frame is not None else None
+            changes = None if thinned is None else Changes.between(Grid(plan.spec, labels, counts), thinned)
+            residuals = None if self.frame is None else self.frame.residuals()
+            facts = FrameFacts.of(self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals)
+        except (CarlascError, OSError, ValueError):
+            return FrameResult(self)
+        return FrameResult(self, facts=facts)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Tasks that a worker does one after another: to make the frames that are stored together, or to measure a frame.
+
+    Attributes:
+        writer: where the frames are written.
+        tasks: the tasks.
+    """
+
+    writer: SequenceWriter
+    tasks: tuple[FrameTask, ...]
+
+
+def run_batch(batch: Batch) -> list[FrameResult]:
+    """Do the work of a batch, and write what it made if the writer can be used in workers.
+
+    Raises:
+        ConflictError: a scan exists already, and differs from that of this run.
+        StorageError: nothing can be written, so every other batch would fail in the same way.
+    """
+    done: list[FrameResult] = []
+    for task in batch.tasks:
+        result = task.run()
+        done.append(result)
+    if not batch.writer.concurrent:
+        return done
+    try:
+        write_frames(batch.writer, done)
+    except (ConflictError, StorageError):
+        raise  # every other batch would raise the same
+    except (CarlascError, OSError) as error:
+        done = [replace(result, error=result.error or str(error), facts=None) for result in done]
+    return [replace(result, outputs={}) for result in done]
+
+
+def fail_batch(batch: Batch, message: str) -> list[FrameResult]:
+    """Return the result of a batch that no worker could finish."""
+    return [FrameResult(task, error=message) for task in batch.tasks]
+
+
+def write_frames(writer: SequenceWriter, results: Series[FrameResult]) -> None:
+    """Write the frames that were made. Scan fields that exist already must be equal to this run's.
+
+    Raises:
+        ConflictError: they differ.
+    """
+    frames: dict[int, Outputs] = {}
+    for done in results:
+        if isinstance(done.task, MakeFrame) and done.outputs:
+            number = done.task.number
+            frames[number] = {
+                name: array
+                for name, array in done.outputs.items()
+                if name not in layout.SCAN_FIELDS
+                or not (writer.has(name, number) and check_scan(writer, name, number, array))
+            }
+    if frames:
+        writer.write_frames(frames)
+
+
+def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, Grid]:
+    """Return everything that is written for a frame, the grid last, and the grid.
+
+    Raises:
+        MissingDataError: the frame does not say how certain each voxel is, and the plan asks for it.
+    """
+    labels, counts, evidence = data.grid.labels, data.grid.counts, data.evidence
+    if plan.needs_evidence and evidence is None:
+        raise MissingDataError(f"frame {frame}", expected="how certain each voxel is", found="nothing")
+    if plan.voting.min_confidence and counts is not None and evidence is not None:
+        confident = is_confident(evidence.occupied, plan.voting.min_confidence)
+        labels, counts = labels * confident, counts * confident
+    outputs: Outputs = {**data.fields, f"{plan.grid}/labels": labels}
+    if counts is not None:
+        outputs[f"{plan.grid}/counts"] = counts
+    if plan.voting.keep and data.votes is not None:
+        outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
+    if plan.voting.keep_evidence and evidence is not None:
+        outputs |= {f"{plan.grid}/{part}": getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
+    return outputs, Grid(plan.spec, labels, counts)
+
+
+@dataclass(frozen=True)
+class FrameFailure:
+    """A frame that could not be made.
+
+    Attributes:
+        sequence: location of its sequence in the source.
+        frame: its number in the source.
+        message: what went wrong, in one line.
+    """
+
+    sequence: str
+    frame: int
+    message: str
+
+
+@dataclass(frozen=True)
+class SequenceJob:
+    """What a run does with one sequence: what is made, where it goes, and the documents to write first."""
+
+    path: str
+    inputs: SequenceInput
+    plan: GridPlan
+    writer: SequenceWriter
+    documents: dict[str, bytes]
+    params: dict[str, Any]
+    replaces: bool
+
+    @cached_property
+    def numbers(self) -> frozenset[int]:
+        """The numbers of the frames in the output."""
+        return frozenset(frame.number for frame in self.inputs.frames)
+
+    def block_of(self, number: int) -> int:
+        """Return the block of a frame: the frames of a block are stored together."""
+        return number // self.writer.block
+
+    def announce(self) -> None:
+        """Say what is going to be written, to a store that needs to know."""
+        frames: dict[str, list[int]] = {name: sorted(self.numbers) for name in self.plan.fields()}
+        for frame in self.inputs.frames:
+            for name in frame.fields():
+                frames.setdefault(name, []).append(frame.number)
+        points = self.inputs.most_points() if self.writer.block > 1 else None
+        self.writer.expect(frames, {"points": points} if points else None)
+
+    def missing(self) -> set[int]:
+        """Return the frames that lack a file now; other commands may write at the same time."""
+        self.writer.refresh()
+        has, grid = self.writer.has, self.plan.fields()
+        frames = self.inputs.frames
+        return {
+            frame.number for frame in frames if not all(has(name, frame.number) for name in (*frame.fields(), *grid))
+        }
+
+    def report(self) -> Report | None:
+        """Return the report that an earlier run with the same settings left; None if there is none."""
+        name = layout.report_file(self.plan.grid)
+        data = self.writer.read_document(name)
+        try:
+            report = None if data is None else Report.from_json(data, name)
+        except FormatError:
+            return None
+        return report if report is not None and report.settings == self.params else None
+
+    @property
+    def is_reported(self) -> bool:
+        """Whether the report exists and has every frame."""
+        report = self.report()
+        return report is not None and set(report.frames) >= self.numbers
+
+    @property
+    def reported(self) -> frozenset[int]:
+        """The frames that the report is about: those of this run, and those of the report that exists."""
+        report = self.report()
+        return self.numbers if report is None else self.numbers | set(report.frames)
+
+    def make(self, missing: Set[int]) -> list[FrameTask]:
+        """Return a task for each of some missing frames."""
+        sampled, classes = set(sample_frames(sorted(self.reported))), self.inputs.metadata.classes
+        frames = [frame for frame in self.inputs.frames if frame.number in missing]
+        return [MakeFrame(frame.number, frame, self.plan, classes, frame.number in sampled) for frame in frames]
+
+    def measure(self, made: Set[int]) -> list[FrameTask]:
+        """Return a task for each frame that the report needs and this run did not make."""
+        sampled, inputs, classes = set(sample_frames(sorted(self.reported))), self.inputs, self.inputs.metadata.classes
+        return [
+            MeasureFrame(number, inputs.frame(number), self.plan, classes, number in sampled, self.writer)
+            for number in sorted(self.reported - made)
+        ]
+
+    def write_report(self, results: Series[FrameResult]) -> None:
+        """Write the report, if anything was made or measured."""
+        facts = [done.facts for done in results if done.facts is not None]
+        grid, writer = self.plan.grid, self.writer
+        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(grid))
+        found = {name: writer.read_document(name) for name in names}
+        documents = {name: data for name, data in found.items() if data is not None}
+        if facts:
+            classes, actors = self.inputs.metadata.classes, self.inputs.summaries()
+            report = Report.make(grid, facts, self.params, classes, documents, actors=actors)
+            writer.write_document(layout.report_file(grid), report.to_json())
+
+
+@dataclass
+class Work:
+    """The work of a run, or of a part of it.
+
+    Attributes:
+        jobs: the sequences.
+        plan: what is made.
+        spread: how the work is spread. Of a part of it, frames that are stored together are dealt out together.
+        failures: frames that could not be made.
+        wanted: number of frames to make.
+        skipped: number of frames of this part that exist already.
+        has_written: whether a frame or a report was written.
+    """
+
+    jobs: Series[SequenceJob]
+    plan: GridPlan
+    spread: Run
+    failures: list[FrameFailure] = field(default_factory=list)
+    wanted: int = 0
+    skipped: int = 0
+    has_written: bool = False
+
+    def run(self) -> list[FrameFailure]:
+        """Make what is missing, and return the frames that could not be made.
+
+        Sequences follow each other without a pause: while the last frames of one are made, the next one is prepared and begun.
+        """
+        dealt = self._deal()
+        ours = [job.missing() & numbers for job, numbers in zip(self.jobs, dealt, strict=True)]
+        self.wanted = sum(map(len, ours))
+        self.skipped = sum(map(len, dealt)) - self.wanted
+        passes = sum(job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing)
+        steps = RunProgress(self.spread.progress, self.skipped, self.skipped + self.wanted + passes)
+        under_way: deque[SequenceJob] = deque()  # the job of each batch, in order
+
+        def batches() -> Iterator[Batch]:
+            for job, missing in zip(self.jobs, ours, strict=True):
+                if missing:
+                    job.inputs.prepare(job.writer, self.spread, steps)
+                for batch in _batches(job, job.make(missing)):
+                    under_way.append(job)
+                    yield batch
+
+        made: dict[int, list[FrameResult]] = {id(job): [] for job in self.jobs}
+        with closing(self._results(batches())) as results:
+            for job, missing in zip(self.jobs, ours, strict=True):
+                while len(made[id(job)]) < len(missing):
+                    done = next(results)
+                    write_frames(under_way.popleft().writer, done)  # what the writer cannot write in workers
+                    made[id(job)] += [replace(result, outputs={}) for result in done]
+                    steps(len(done))
+                self._finish(job, made.pop(id(job)), steps)
+        return self.failures
+
+    def _deal(self) -> list[set[int]]:
+        """Return the frames of each sequence that belong to the part."""
+        blocks = sorted({(n, job.block_of(number)) for n, job in enumerate(self.jobs) for number in job.numbers})
+        dealt = set(self.spread.part.take(blocks))
+        return [{i for i in job.numbers if (n, job.block_of(i)) in dealt} for n, job in enumerate(self.jobs)]
+
+    def _results(self, batches: Iterator[Batch]) -> Generator[list[FrameResult], None, None]:
+        return run_all(run_batch, batches, self.spread, lost=fail_batch)
+
+    def _finish(self, job: SequenceJob, made: list[FrameResult], steps: RunProgress) -> None:
+        """Note what failed, and write the report; where other parts make frames of the sequence, the last of them writes it."""
+        self.has_written |= bool(made)
+        for done in made:
+            if isinstance(done.task, MakeFrame) and done.error is not None:
+                self.failures.append(FrameFailure(job.inputs.location, done.task.frame.source_frame, done.error))
+        if (not made and job.is_reported) or (self.spread.part.count > 1 and job.missing()):
+            return
+        if not made:
+            job.inputs.prepare(job.writer, self.spread, RunProgress(None, 0, 0))
+        self.has_written = True
+        tried = {done.task.number for done in made}
+        with closing(self._results(_batches(job, job.measure(tried)))) as results:
+            job.write_report([*made, *(done for batch in results for done in batch)])
+
+
+def _batches(job: SequenceJob, tasks: Series[FrameTask]) -> Iterator[Batch]:
+    """Yield tasks in batches: those of frames that are stored together in one."""
+    for _, group in groupby(tasks, key=lambda task: job.block_of(task.number)):
+        yield Batch(job.writer, tuple(group))

@@ -1,0 +1,110 @@
+"""Small linear problems, solved with the same bits on every processor: LAPACK, behind `np.linalg`, rounds differently on different ones."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.compiling import cached
+
+_SWEEPS = 12  # of Jacobi's method, which takes about five
+
+
+@cached(error_model="python")
+def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (K, D) parameters x for which `design @ x` is nearest to the values, by orthogonalising the columns one after the other.
+
+    Args:
+        design: (N, K), N >= 1. The parameter of a column that depends on those before it is 0.
+        values: (N, D).
+    """
+    count, columns, wide = design.shape[0], design.shape[1], values.shape[1]
+    basis, upper, fit = design.copy(), np.zeros((columns, columns)), np.zeros((columns, wide))
+    left = values.copy()
+    for k in range(columns):
+        whole = 0.0
+        for i in range(count):
+            whole += basis[i, k] * basis[i, k]
+        for _ in range(2):  # the second time removes what rounding left
+            for j in range(k):
+                along = 0.0
+                for i in range(count):
+                    along += basis[i, j] * basis[i, k]
+                upper[j, k] += along
+                for i in range(count):
+                    basis[i, k] -= along * basis[i, j]
+        length = 0.0
+        for i in range(count):
+            length += basis[i, k] * basis[i, k]
+        if length <= 1e-26 * whole:
+            for i in range(count):
+                basis[i, k] = 0.0
+            continue
+        upper[k, k] = np.sqrt(length)
+        for i in range(count):
+            basis[i, k] /= upper[k, k]
+        for d in range(wide):
+            along = 0.0
+            for i in range(count):
+                along += basis[i, k] * left[i, d]
+            fit[k, d] = along
+            for i in range(count):
+                left[i, d] -= along * basis[i, k]
+    for d in range(wide):
+        for k in range(columns - 1, -1, -1):
+            rest = fit[k, d]
+            for j in range(k + 1, columns):
+                rest -= upper[k, j] * fit[j, d]
+            fit[k, d] = rest / upper[k, k] if upper[k, k] > 0 else 0.0
+    return fit
+
+
+@cached(error_model="python")
+def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the eigenvalues of symmetric matrices, increasing, and their eigenvectors, by Jacobi's method.
+
+    Args:
+        covariances: (N, 3, 3).
+
+    Returns:
+        (N, 3) eigenvalues and (N, 3, 3) unit eigenvectors in columns. Which of its two signs a vector has is fixed, but not by a rule.
+    """
+    values, vectors = np.empty((len(covariances), 3)), np.empty((len(covariances), 3, 3))
+    for n in range(len(covariances)):
+        a, v = covariances[n].copy(), np.eye(3)
+        for _ in range(_SWEEPS):
+            size = abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])
+            if abs(a[0, 1]) + abs(a[0, 2]) + abs(a[1, 2]) <= 1e-18 * size:
+                break
+            for p in range(2):
+                for q in range(p + 1, 3):
+                    if a[p, q] == 0.0:
+                        continue
+                    ratio = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
+                    tangent = (1.0 if ratio >= 0 else -1.0) / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
+                    cos = 1.0 / np.sqrt(tangent * tangent + 1.0)
+                    sin = tangent * cos
+                    for k in range(3):
+                        a[k, p], a[k, q] = cos * a[k, p] - sin * a[k, q], sin * a[k, p] + cos * a[k, q]
+                    for k in range(3):
+                        a[p, k], a[q, k] = cos * a[p, k] - sin * a[q, k], sin * a[p, k] + cos * a[q, k]
+                    for k in range(3):
+                        v[k, p], v[k, q] = cos * v[k, p] - sin * v[k, q], sin * v[k, p] + cos * v[k, q]
+        order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
+        for k in range(3):
+            values[n, k] = a[order[k], order[k]]
+            for i in range(3):
+                vectors[n, i, k] = v[i, order[k]]
+    return values, vectors
+
+
+def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have no mean direction."""
+    rotation = matrix
+    for _ in range(30):  # Newton's method for the polar decomposition: four or five times where rotations are alike
+        rows = np.cross(rotation[[1, 2, 0]], rotation[[2, 0, 1]])
+        volume = float((rotation[0] * rows[0]).sum())
+        if volume < 1e-12:
+            return np.eye(3)
+        rotation = (rotation + rows / volume) / 2
+    return rotation

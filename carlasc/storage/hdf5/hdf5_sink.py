@@ -1,0 +1,300 @@
+"""Writing packed stores in HDF5, by appending: one writer, frames in rising order."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError, import_extra
+from carlasc.storage import layout
+from carlasc.storage.durability import sync_tree
+from carlasc.storage.hdf5.hdf5_source import CRC
+from carlasc.storage.packed.array_layout import (
+    DOCUMENT,
+    SEQUENCE,
+    FieldLayout,
+    FrameTable,
+    count_elements,
+    document_node,
+    field_node,
+    number_arrays,
+    typical_size,
+)
+from carlasc.storage.packed.chunks import crc32c, in_threads
+from carlasc.storage.packed.columns import Column
+from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
+from carlasc.storage.packed.stores import (
+    STORE,
+    VERSION,
+    FieldWriter,
+    PackedSink,
+    PackedWriter,
+    PackOptions,
+    node_of,
+)
+
+_AHEAD = 16  # chunks that are encoded in parallel
+
+
+class HDF5Sink(PackedSink):
+    """Writes a packed HDF5 file, which gets its name when the sink is finished, and not before."""
+
+    def __init__(
+        self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
+    ) -> None:
+        """Start a file; what an interrupted run left is removed.
+
+        Raises:
+            ArgumentError: `small` is given, for which HDF5 has no filter.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
+            DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
+        """
+        options = options or PackOptions()
+        if options.small:
+            raise ArgumentError(
+                "small",
+                expected="a .zarr store",
+                found=f"{path}: HDF5 has no PCodec filter",
+                advice="leave `small` out",
+            )
+        self.path = Path(path)
+        self.location = str(path)
+        self.options = options
+        self.overwrite = overwrite
+        refuse_existing(self.path, overwrite)
+        self._file = HDF5Output(unfinished(self.path), self.path)
+        self._sequences: dict[str, str] = {}
+
+    def finished(self, path: str) -> bool:
+        """Whether this run has written the sequence whole: what an interrupted run left is not continued."""
+        return path in self._sequences
+
+    def sequence(self, path: str) -> HDF5Writer:
+        """Start a sequence."""
+        group = node_of(path, self.location)
+        self._sequences.pop(path, None)
+        self._file.remove(group)
+        return HDF5Writer(self._file, path, group, self.options, self._sequences)
+
+    def finish(self, *, incomplete: bool = False) -> None:
+        """Finish the store and give it its name."""
+        root = {"type": STORE, "version": VERSION, "complete": True, "sequences": self._sequences}
+        root |= {"lossy_mm": self.options.lossy_mm} if self.options.lossy_mm else {}
+        self._file.close(root)
+        sync_tree(self._file.path)
+        put_in_place(self._file.path, self.path, self.overwrite)
+
+
+class HDF5Writer(PackedWriter):
+    """Writes one sequence of a packed HDF5 file."""
+
+    def __init__(
+        self, output: HDF5Output, path: str, group: str, options: PackOptions, finished: dict[str, str]
+    ) -> None:
+        super().__init__(f"{output.location}/{group}", path)
+        self._output = output
+        self._group = group
+        self._options = options
+        self._finished = finished
+        self._rows: dict[str, int] = {}
+        self._fields: dict[str, HDF5FieldWriter] = {}
+
+    def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
+        """Note how large a typical frame is: chunks are made for it."""
+        self._rows.update(rows or {})
+
+    def _start_field(self, field: str) -> FieldWriter:
+        entry = layout.field_named(field)
+
+        def plan(arrays: list[NDArray[Any]]) -> FieldLayout:
+            return FieldLayout.plan(field, self._options, typical_size(entry, arrays, self._rows, self.read_document))
+
+        self._fields[field] = HDF5FieldWriter(self._output, f"{self._group}/{field_node(field)}", field, plan)
+        return self._fields[field]
+
+    def close(self) -> None:
+        """Write what is held back and mark the sequence as whole."""
+        for field in self._fields.values():
+            field.close()
+        for name, data in self.contents.items():
+            attributes = {"type": DOCUMENT, "version": VERSION, "dtype": "uint8", "unit": "bytes", "name": name}
+            self._output.write_small(f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes)
+        layouts = {name: field.layout for name, field in self._fields.items()}
+        frames, counts, columns = count_elements(layouts, {name: one.table for name, one in self._fields.items()})
+        about = {"version": VERSION, "dtype": "int64"}
+        self._output.write_small(f"{self._group}/frames", frames, about | {"type": "carlasc.frames", "unit": "frame"})
+        about |= {"type": "carlasc.counts", "unit": "element", "columns": columns}
+        self._output.write_small(f"{self._group}/counts", counts, about)
+        for name, numbers, attributes in number_arrays(self.read_document):
+            self._output.write_small(f"{self._group}/{name}", numbers, attributes)
+        self._output.write_group(self._group, {"type": SEQUENCE, "version": VERSION, **self.about()})
+        self._finished[self.path] = self._group
+
+
+class HDF5FieldWriter(FieldWriter):
+    """Writes the columns of a field.
+
+    Attributes:
+        table: the frames written so far.
+        layout: where its frames are; known from the first frame on that is not empty.
+    """
+
+    layout: FieldLayout
+
+    def __init__(
+        self, output: HDF5Output, node: str, field: str, plan: Callable[[list[NDArray[Any]]], FieldLayout]
+    ) -> None:
+        super().__init__(field)
+        self.table: FrameTable = {}
+        self._output = output
+        self._node = node
+        self._plan = plan
+        self._planned = False
+        self._columns: dict[str, HDF5ColumnWriter] = {}
+
+    def write(self, frame: int, array: NDArray[Any]) -> None:
+        """Divide one frame into chunks, which are written with those of other frames."""
+        if not self._planned and array.size:
+            self.layout, self._planned = self._plan([array]), True
+        counts, parts = self.layout.divide(array, limited=False) if self._planned else ({}, {})
+        for name, chunks in parts.items():
+            if name not in self._columns:
+                self._columns[name] = HDF5ColumnWriter(self._output, f"{self._node}/{name}", self.layout, name)
+            self._columns[name].append(frame, chunks)
+        self.table[frame] = counts
+
+    def close(self) -> None:
+        """Write what is held back, and the group of the field."""
+        if not self._planned:
+            self.layout = self._plan([])
+        for column in self._columns.values():
+            column.close(max(self.table) + 1)
+        self._output.write_group(self._node, dict(self.layout.attributes))
+
+
+class HDF5ColumnWriter:
+    """Writes the chunks of a column, which are encoded several at a time."""
+
+    def __init__(self, output: HDF5Output, node: str, field_layout: FieldLayout, name: str) -> None:
+        column = field_layout.columns[name]
+        self._output = output
+        self._node = node
+        self._encoding = column.encoding
+        self._held: list[tuple[int, int, NDArray[Any]]] = []  # frame, number in the frame, chunk
+        self._checksums: list[int] = []
+        self._dataset = output.create(node, field_layout, column)
+
+    def append(self, frame: int, chunks: list[NDArray[Any]]) -> None:
+        """Add a frame's chunks."""
+        self._held += [(frame, number, chunk) for number, chunk in enumerate(chunks)]
+        if len(self._held) >= _AHEAD:
+            self._flush()
+
+    def close(self, frames: int) -> None:
+        """Write what is held back, and the checksums of all chunks; the data set gets room for so many frames."""
+        self._flush()
+        self._dataset.resize(frames, axis=0)
+        about = {"type": "carlasc.checksums", "version": VERSION, "dtype": "uint32"}
+        about["unit"] = "crc32c of a chunk's stored bytes"
+        self._output.write_small(self._node + CRC, np.array(self._checksums, np.uint32), about)
+
+    def _flush(self) -> None:
+        if not self._held:
+            return
+        encoded = in_threads(lambda one: self._encoding.encode(one[2], "hdf5"), self._held)
+        step, shape = self._dataset.chunks[-1], self._dataset.shape
+        needed = (max(number for _, number, _ in self._held) + 1) * step
+        self._dataset.resize((self._held[-1][0] + 1, *shape[1:-1], max(shape[-1], needed)))
+        for (frame, number, _), data in zip(self._held, encoded, strict=True):
+            offset = (frame, *[0] * (len(shape) - 2), number * step)
+            self._dataset.id.write_direct_chunk(offset, data)
+            self._checksums.append(crc32c(data, "hdf5"))
+        self._held = []
+        self._output.check()
+
+
+class HDF5Output:
+    """Writes an HDF5 file with h5py; chunks are encoded here, in parallel, as the Blosc filter would encode them."""
+
+    def __init__(self, path: Path, place: Path) -> None:
+        h5py = import_extra("h5py", "hdf5")
+        self._filters = import_extra("hdf5plugin", "hdf5")
+        for module in ("numcodecs", "google_crc32c"):
+            import_extra(module, "hdf5")
+        self.location = str(path)
+        self.path = path
+        self._output = PatientFile(path, place)
+        self._file = h5py.File(self._output, "w", libver=("v110", "v110"), track_order=False)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the error of a write that failed."""
+        self._output.check()
+
+    def write_group(self, node: str, attributes: dict[str, Any]) -> None:
+        """Create a group."""
+        _write_attributes(self._file.require_group(node), attributes)
+        self.check()
+
+    def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
+        """Write a data set of one chunk."""
+        self.remove(node)
+        compact = (
+            {"chunks": array.shape, "shuffle": True, "compression": "gzip", "fletcher32": True} if array.size else {}
+        )
+        dataset = self._file.create_dataset(node, data=array, **compact)
+        _write_attributes(dataset, attributes)
+        self.check()
+
+    def create(self, node: str, field_layout: FieldLayout, column: Column) -> Any:
+        """Create the data set of a column, of no frames yet."""
+        shape, encoding = field_layout.frame_shape(column), column.encoding
+        most = shape if field_layout.is_grid else (*shape[:-1], None)  # a frame of more than it has room for is rare
+        blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
+        dataset = self._file.create_dataset(
+            node, (0, *shape), column.dtype, chunks=field_layout.chunk_shape(column), maxshape=(None, *most), **blosc
+        )
+        _write_attributes(dataset, field_layout.column_attributes(column))
+        self.check()
+        return dataset
+
+    def remove(self, node: str) -> None:
+        """Remove a node; the file uses its space again."""
+        for name in (node, node + CRC):
+            if name in self._file:
+                del self._file[name]
+
+    def close(self, attributes: dict[str, Any]) -> None:
+        """Write the root's attributes and close the file."""
+        _write_attributes(self._file, attributes)
+        self._file.close()
+        self._output.close()
+        self.check()
+
+
+def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
+    """Replace a node's attributes: text and numbers are written as they are, other values as JSON under `<name>:json`.
+
+    Text has a fixed length. HDF5 would keep text of variable length in its global heaps, the only part of a file's structure that has no
+    checksum: with a few zeros there, HDF5 2.0 searches for ever.
+    """
+    for name in list(node.attrs):
+        del node.attrs[name]
+    for name, value in attributes.items():
+        if isinstance(value, int | float):
+            node.attrs[name] = value
+        elif isinstance(value, str):
+            node.attrs.create(name, _fixed_text(value))
+        else:
+            node.attrs.create(f"{name}:json", _fixed_text(json.dumps(value)))
+
+
+def _fixed_text(text: str) -> NDArray[Any]:
+    h5py, data = import_extra("h5py", "hdf5"), text.encode()
+    return np.array(data, h5py.string_dtype("utf-8", max(1, len(data))))

@@ -1,0 +1,260 @@
+"""Reading packed stores in HDF5: groups and chunked data sets, compressed by the Blosc filter.
+
+Any HDF5 reader with hdf5plugin opens them. Here, h5py looks up the places of the chunks in the file, once per data set; the chunks
+themselves are read and decoded directly.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, import_extra, reading
+from carlasc.storage.arrays import check_ratio
+from carlasc.storage.files import parse_json_value
+from carlasc.storage.folders.trees import RemoteTree, Tree
+from carlasc.storage.packed.array_source import ArraySource, ArrayStore
+from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
+
+_BLOSC = 32001  # the filter's registered number
+_GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # those of the filters that HDF5 brings
+_SMALL_FILTERS = {_GZIP, _SHUFFLE, _FLETCHER32}
+_UNTRUSTED = "carlasc did not write this: do not use this store"
+CRC = "_crc32c"  # suffix of the data set with the checksums of another one's chunks
+
+
+class HDF5Source(ArraySource):
+    """A packed HDF5 file."""
+
+    def __init__(self, tree: Tree, path: str) -> None:
+        """Read the attributes of the file's root.
+
+        Raises:
+            DependencyError: h5py or the codecs are not installed.
+            FormatError: it is another HDF5 file, unfinished, or of another version.
+        """
+        for module in ("h5py", "numcodecs", "google_crc32c"):
+            import_extra(module, "hdf5")
+        super().__init__(HDF5Store(tree, path))
+
+
+class HDF5Store(ArrayStore):
+    """The nodes of an HDF5 file, which is opened for each call and closed again."""
+
+    def __init__(self, tree: Tree, path: str) -> None:
+        self.tree = tree
+        self.path = path
+        self.location = tree.where(path)
+        self.local = not isinstance(tree, RemoteTree)
+
+    def attributes(self, node: str) -> dict[str, Any] | None:
+        """Return a node's attributes."""
+        with self._open() as file:
+            found = find_node(file, node, self.location)
+            return None if found is None else _read_attributes(found, f"{self.location}/{node}")
+
+    def read_small(self, node: str) -> NDArray[Any]:
+        """Return a whole data set."""
+        with self._open() as file:
+            return self._read_small(file, node)
+
+    def _read_small(self, file: Any, node: str) -> NDArray[Any]:
+        dataset = self._dataset(file, node)
+        check_small(dataset, f"{self.location}: {dataset.name}")
+        return np.asarray(dataset[...])
+
+    def read_document(self, node: str) -> bytes:
+        """Return the bytes of a text file, which is a data set of bytes."""
+        return self.read_small(node).tobytes()
+
+    def array(self, node: str) -> StoredArray:
+        """Return a data set whose chunks can be read."""
+        with self._open() as file:
+            return HDF5Array.from_dataset(
+                self.tree, self.path, self._dataset(file, node), self._read_small(file, node + CRC)
+            )
+
+    def stored_bytes(self, node: str) -> int:
+        """Return the bytes of the data sets below a node; for the root, those of the file."""
+        if not node:
+            return Path(self.location).stat().st_size
+        h5py = import_extra("h5py", "hdf5")
+        total = 0
+
+        def add(_: str, item: Any) -> None:
+            nonlocal total
+            total += item.id.get_storage_size() if isinstance(item, h5py.Dataset) else 0
+
+        with self._open() as file:
+            if (found := find_node(file, node, self.location)) is not None:
+                found.visititems(add)
+        return total
+
+    def _dataset(self, file: Any, node: str) -> Any:
+        found = find_node(file, node, self.location)
+        if not isinstance(found, import_extra("h5py", "hdf5").Dataset):
+            raise FormatError(
+                self.location, expected=f"the data set {node}", found="none", advice="the store is damaged"
+            )
+        return found
+
+    @contextmanager
+    def _open(self) -> Iterator[Any]:
+        h5py = import_extra("h5py", "hdf5")
+        with reading(self.location, "an HDF5 file", "is it truncated or corrupted?"):
+            if isinstance(self.tree, RemoteTree):
+                with self.tree.open(self.path) as remote, h5py.File(remote, "r") as file:
+                    yield file
+            else:
+                with h5py.File(self.location, "r", locking=False) as file:
+                    yield file
+
+
+class HDF5Array(StoredArray):
+    """A chunked data set with the Blosc filter, and the place and the checksum of each chunk that exists."""
+
+    extra = "hdf5"
+    _path: str
+    _places: dict[int, tuple[int, int]]
+    _checksums: dict[int, int]
+
+    @classmethod
+    def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]) -> HDF5Array:
+        """Look up the places of a data set's chunks.
+
+        Args:
+            tree: the tree of files that holds the HDF5 file.
+            path: the file.
+            dataset: the open data set.
+            checksums: (n,) those of its chunks, in the order of their places in the data set.
+
+        Raises:
+            FormatError: it is not chunked, has other filters, or another number of chunks.
+        """
+        where, shape, chunk = f"{tree.where(path)}: {dataset.name}", dataset.shape, dataset.chunks
+        if chunk is None or _filters(dataset) != [_BLOSC] or dataset.dtype.kind not in "uif" or checksums.ndim != 1:
+            raise FormatError(
+                where,
+                expected="a chunked data set with the Blosc filter",
+                found="another",
+                advice="the store is damaged",
+            )
+        array = cls(tree, dataset.name, dataset.dtype, shape, chunk, Encoding())
+        rooms = [-(-n // step) for n, step in zip(shape, chunk, strict=True)]
+        places: dict[int, tuple[int, int]] = {}
+
+        def note(info: Any) -> None:
+            number = 0
+            for first, step, room in zip(info.chunk_offset, chunk, rooms, strict=True):
+                number = number * room + first // step
+            places[number] = info.byte_offset, info.byte_offset + info.size
+
+        dataset.id.chunk_iter(note)
+        if len(places) != len(checksums):
+            raise FormatError(
+                where,
+                expected=f"{len(checksums)} chunks",
+                found=str(len(places)),
+                advice="the store is damaged",
+            )
+        array._path, array._places = path, places
+        array._checksums = dict(zip(sorted(places), checksums.tolist(), strict=True))
+        return array
+
+    def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
+        """Return the places of chunks."""
+        for number in numbers:
+            if number not in self._places:
+                raise FormatError(
+                    self.tree.where(self._path),
+                    expected=f"chunk {number} of {self.name}",
+                    found="none",
+                    advice="the store is damaged",
+                )
+        return [(self._path, *self._places[number]) for number in numbers]
+
+    def files(self, numbers: Sequence[int]) -> list[str]:
+        """Return the one file."""
+        return [self._path]
+
+    def verify(self, data: memoryview, number: int) -> memoryview:
+        """Compare a chunk with the data set of checksums."""
+        if crc32c(data, "hdf5") != self._checksums[number]:
+            raise FormatError(
+                f"chunk {number} of {self.name}",
+                problem="the checksum does not match",
+                advice="the store is corrupted: fetch or pack it again",
+            )
+        return data
+
+
+def find_node(file: Any, node: str, where: str) -> Any:
+    """Return a group or a data set of a file, None if it does not exist. Only links to what is in the file itself are followed.
+
+    HDF5 can also put the path of another file into a link, or into a data set: anybody may have made the store, and what it shows must not
+    be another file of this machine.
+
+    Raises:
+        FormatError: a link on the way leads to another file.
+    """
+    h5py = import_extra("h5py", "hdf5")
+    found = file
+    for name in filter(None, node.split("/")):
+        link = found.get(name, getlink=True) if isinstance(found, h5py.Group) else None
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            kind = "a link to another file" if isinstance(link, h5py.ExternalLink) else "a symbolic link"
+            raise FormatError(f"{where}: {node}", expected="what the file itself holds", found=kind, advice=_UNTRUSTED)
+        found = found[name]
+    if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
+        raise FormatError(
+            f"{where}: {node}", expected="values in the file itself", found="those of other files", advice=_UNTRUSTED
+        )
+    return found
+
+
+def check_small(dataset: Any, what: str) -> None:
+    """Check that a data set which is read whole is not larger in memory than what it takes in the file allows.
+
+    Raises:
+        FormatError: it is, or it has other values or filters than those that carlasc writes.
+    """
+    size, stored, filters = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), _filters(dataset)
+    if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
+        raise FormatError(what, expected="numbers, packed by gzip or not at all", found="others", advice=_UNTRUSTED)
+    check_ratio(size, stored, what)
+    if dataset.chunks is None or not size:
+        if size > stored:  # HDF5 would fill the rest with zeros
+            raise FormatError(what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged")
+        return
+    if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
+        raise FormatError(what, expected="one chunk", found="several", advice="the store is damaged")
+    if _GZIP in filters:  # HDF5 unpacks all that a chunk holds, however much it is
+        packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
+        unpacked = zlib.decompressobj().decompress(packed, size + 1)
+        if len(unpacked) != size:
+            raise FormatError(what, expected=f"{size} bytes", found="others", advice=_UNTRUSTED)
+
+
+def _filters(dataset: Any) -> list[int]:
+    plist = dataset.id.get_create_plist()
+    return [plist.get_filter(number)[0] for number in range(plist.get_nfilters())]
+
+
+def _read_attributes(node: Any, where: str) -> dict[str, Any]:
+    found = {}
+    for name, stored in node.attrs.items():
+        value = stored.item() if hasattr(stored, "item") else stored
+        value = value.decode() if isinstance(value, bytes) else value
+        if name.endswith(":json"):
+            found[name.removesuffix(":json")] = parse_json_value(value, f"{where}: {name}")
+        else:
+            found[name] = value
+    return found

@@ -1,0 +1,225 @@
+"""Reading the frames of a field in a store of arrays: which chunks a frame has, and what their values are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.arrays import check_size
+from carlasc.storage.packed.array_layout import FieldLayout
+from carlasc.storage.packed.chunks import StoredArray, parallel, scratch
+from carlasc.storage.packed.columns import WIDE, Column, PointsPacking
+
+
+class ArrayField:
+    """A field of a sequence: its frames, and the columns that they are in."""
+
+    def __init__(
+        self,
+        where: str,
+        field_layout: FieldLayout,
+        frames: NDArray[np.int64],
+        counts: Mapping[str, NDArray[np.int64]],
+        array_of: Callable[[str], StoredArray],
+        *,
+        local: bool,
+    ) -> None:
+        """Take what is known of the field.
+
+        Args:
+            where: its name in errors.
+            field_layout: where its frames are.
+            frames: (n,) numbers of frames, in rising order.
+            counts: (n,) elements of each in each column; -1 in frames that the field does not have.
+            array_of: returns the array of a column. Called when a frame is read, for the columns that some frame needs.
+            local: whether its bytes are on this machine.
+        """
+        exists = np.zeros(len(frames), np.bool_)
+        for column in counts.values():
+            exists |= column >= 0
+        self.where = where
+        self.layout = field_layout
+        self.packing = field_layout.packing
+        self.frames = frames[exists]
+        self.local = local
+        self._counts = {name: column[exists] for name, column in counts.items() if (column > 0).any()}
+        self._array_of = array_of
+        self._positions = {frame: position for position, frame in enumerate(self.frames.tolist())}
+
+    @cached_property
+    def columns(self) -> dict[str, StoredColumn]:
+        """The columns that are stored."""
+        found = {}
+        for name, counts in self._counts.items():
+            column, array = self.layout.columns[name], self._array_of(name)
+            self.layout.check(array, column, int(self.frames[-1]), int(counts.max()), f"{self.where}/{name}")
+            firsts = self.frames * array.slots
+            found[name] = StoredColumn(column, array, firsts, np.maximum(counts, 0), self.layout.is_grid)
+        return found
+
+    def read(self, frames: list[int]) -> list[NDArray[Any]]:
+        """Read frames: from a remote store all their chunks are fetched at once; frames are decoded in parallel."""
+        positions = [self._position(frame) for frame in frames]
+        tasks = {name: self._parts(column, frames) for name, column in self.columns.items()}
+        main = self.columns.get(self.packing.columns[0].name)
+        outputs = self.packing.allocate([main.counts[position] if main else 0 for position in positions])
+
+        def assemble(k: int) -> NDArray[Any]:
+            with self._naming([frames[k]]):
+                parts = {}
+                for column in self.packing.columns:
+                    name = self._stored_in(column, positions[k])
+                    parts[column.name] = _empty(column) if name is None else self.columns[name].decode(tasks[name][k])
+                return self.packing.join(parts, outputs[k])
+
+        return parallel(assemble, range(len(frames)))
+
+    def read_planes(self, frames: list[int], spare: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        """Read the points of frames as (N, 3), each coordinate contiguous, into the memory of `spare` where it fits."""
+        packing, column = cast(PointsPacking, self.packing), self.columns.get("xyz")
+        if column is None:
+            return [np.empty((0, 3), np.float32) for _ in frames]
+        tasks = self._parts(column, frames)
+        outputs = [column.memory_for(task, spare) for task in tasks]
+
+        def decode(k: int) -> NDArray[np.float32]:
+            with self._naming([frames[k]]):
+                return packing.to_metres(column.decode(tasks[k], outputs[k])).T
+
+        return parallel(decode, range(len(frames)))
+
+    def published_bytes(self) -> int:
+        """Return the bytes of the field's published files, from the numbers of elements."""
+        return self.packing.published_bytes({name: sum(column.counts) for name, column in self.columns.items()})
+
+    def files_of(self, frames: list[int]) -> list[str]:
+        """Return the files that hold some frames, each once."""
+        positions = [self._position(frame) for frame in frames]
+        files = [
+            column.array.files([number for task in column.parts(positions) for number in task.chunks])
+            for column in self.columns.values()
+        ]
+        return list(dict.fromkeys(file for found in files for file in found))
+
+    def _stored_in(self, column: Column, position: int) -> str | None:
+        """Return the name of the stored column that has a frame's elements: the column or its wide one."""
+        stored = [name for name in (column.name, f"{column.name}{WIDE}") if name in self.columns]
+        return next((name for name in stored if self.columns[name].counts[position]), stored[0] if stored else None)
+
+    def _parts(self, column: StoredColumn, frames: list[int]) -> list[FramePart]:
+        """Return the parts of a column to read, already fetched if the store is remote."""
+        positions = [self._position(frame) for frame in frames]
+        with self._naming(frames):
+            tasks = column.parts(positions)
+            if not self.local:
+                column.fetch(tasks)
+        return tasks
+
+    @contextmanager
+    def _naming(self, frames: list[int]) -> Iterator[None]:
+        """Add the field and the frames to the place of an error; columns that do not fit each other are one too."""
+        where = f"{self.where}: field {self.packing.entry.name}, frame {', '.join(map(str, frames))}"
+        with reading(where, "the columns of a frame", "the store is damaged"):
+            try:
+                yield
+            except FormatError as error:
+                raise error.within(where) from error
+
+    def _position(self, frame: int) -> int:
+        if frame not in self._positions:
+            raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
+        return self._positions[frame]
+
+
+@dataclass
+class FramePart:
+    """A frame's part of a column.
+
+    Attributes:
+        chunks: numbers of the chunks that hold it.
+        count: elements of the frame.
+        fetched: the bytes of the chunks, if they were fetched before.
+    """
+
+    chunks: range
+    count: int
+    fetched: list[memoryview] | None = None
+
+
+class StoredColumn:
+    """One array of a field, and which of its chunks each frame has.
+
+    Attributes:
+        column: what is in it.
+        array: its chunks.
+        firsts: number of the first chunk of each frame.
+        counts: number of elements of each frame; for a grid, any number above 0 says that it is there.
+    """
+
+    def __init__(
+        self, column: Column, array: StoredArray, firsts: NDArray[np.int64], counts: NDArray[np.int64], is_grid: bool
+    ) -> None:
+        self.column = column
+        self.array = array
+        self.is_grid = is_grid
+        self.firsts: list[int] = firsts.tolist()
+        self.counts: list[int] = counts.tolist()
+
+    def parts(self, positions: list[int]) -> list[FramePart]:
+        """Return the parts that hold some frames."""
+        step, found = self.array.step, []
+        for position in positions:
+            first, count = self.firsts[position], self.counts[position]
+            chunks = min(count, 1) if self.is_grid else -(-count // step)
+            if not self.is_grid:
+                check_size((self.column.rows or 1, chunks, step), self.array.dtype, f"a frame of {self.array.name}")
+            found.append(FramePart(range(first, first + chunks), count))
+        return found
+
+    def fetch(self, tasks: list[FramePart]) -> None:
+        """Fetch the chunks of all tasks at once."""
+        data = iter(self.array.fetch([number for task in tasks for number in task.chunks]))
+        for task in tasks:
+            task.fetched = [next(data) for _ in task.chunks]
+
+    def memory_for(self, task: FramePart, spare: list[NDArray[Any]]) -> NDArray[Any]:
+        """Return memory to decode a frame into: that of a spare array of the same shape, or new memory, which is slower to write to."""
+        shape = (self.column.rows or 1, len(task.chunks) * self.array.step)
+        while spare:
+            memory = spare.pop().base
+            if isinstance(memory, np.ndarray) and memory.shape == shape and memory.dtype == self.array.dtype:
+                return memory
+        return np.empty(shape, self.array.dtype)
+
+    def decode(self, task: FramePart, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Decode a frame's chunks, into `out` if it is given."""
+        parts = task.fetched if task.fetched is not None else self.array.fetch(task.chunks)
+        if self.is_grid:
+            return self._decode_chunk(parts[0], task.chunks[0], np.empty(self.array.chunk, self.array.dtype))[0]
+        step, rows = self.array.step, self.column.rows or 1
+        shape, dtype = (rows, len(parts) * step), self.array.dtype
+        if out is None:
+            out = scratch(shape, dtype) if self.column.scratch else np.empty(shape, dtype)
+        if len(parts) == 1:  # nearly always
+            self._decode_chunk(parts[0], task.chunks[0], out.reshape(self.array.chunk))
+        else:
+            chunk = np.empty(self.array.chunk, dtype)
+            for place, (number, part) in enumerate(zip(task.chunks, parts, strict=True)):
+                out[:, place * step : (place + 1) * step] = self._decode_chunk(part, number, chunk)
+        values = out[:, : task.count]
+        return values if self.column.rows else values[0]
+
+    def _decode_chunk(self, part: memoryview, number: int, out: NDArray[Any]) -> NDArray[Any]:
+        self.array.decode(part, number, out)
+        return out
+
+
+def _empty(column: Column) -> NDArray[Any]:
+    return np.empty((column.rows, 0) if column.rows else 0, column.dtype)

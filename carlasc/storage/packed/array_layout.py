@@ -1,0 +1,300 @@
+"""Where the frames of a field are in a store of arrays, zarr or HDF5. See `docs/storage.md#arrays`.
+
+A frame has a place that depends on its number alone: frame i of a column is entry i of its array. So any block of frames can be
+written without knowing the others, and found without a table of places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError
+from carlasc.storage import layout
+from carlasc.storage.files import parse_json
+from carlasc.storage.packed.chunks import StoredArray
+from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
+from carlasc.storage.packed.stores import VERSION, PackOptions
+
+SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlasc.column", "carlasc.document"
+_SLOTS = 16  # a frame has room for this many typical frames
+_PCODEC = "pcodec"  # value of the attribute `codec` of points that are packed smaller
+_HEADROOM = 1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
+_CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
+_PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
+FrameTable = dict[int, dict[str, int]]
+"""Frames of a field: the number of elements of each in each column that it needs."""
+
+
+class FieldLayout:
+    """Where the frames of a field are, from the attributes of its group.
+
+    Attributes:
+        packing: how an array becomes columns.
+        attributes: those of the field's group in the store.
+        columns: the columns by name, with the wide ones.
+        is_grid: whether the field has one value per voxel.
+    """
+
+    def __init__(self, packing: Packing, attributes: Mapping[str, Any]) -> None:
+        self.packing = packing
+        self.attributes = attributes
+        self.columns = {column.name: column for family in packing.columns for column in family.both}
+        self.is_grid = packing.kind == "grid"
+
+    @classmethod
+    def read(cls, where: str, field: str, attributes: Mapping[str, Any] | None) -> FieldLayout:
+        """Return the layout of a field that exists.
+
+        Args:
+            where: the field's group, for errors.
+            field: its name.
+            attributes: those of the group; None if there is no such group.
+
+        Raises:
+            FormatError: the attributes are not those of this field.
+        """
+        if attributes is None or attributes.get("type") != FIELD:
+            raise FormatError(
+                where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
+            )
+        scale = attributes.get("scale_m")
+        if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
+            raise FormatError(
+                where, expected="a step of coordinates above 0, up to 1 m", found=repr(scale),
+                advice="the store is damaged",
+            )  # fmt: skip
+        options = PackOptions(small=attributes.get("codec") == _PCODEC)
+        packing = packing_of(layout.field_named(field), options, attributes)
+        if attributes.get("kind") != packing.kind:
+            raise FormatError(where, expected=f"a field of kind {packing.kind}", found=repr(attributes.get("kind")))
+        size = attributes.get("shape" if packing.kind == "grid" else "chunk")
+        numbers = size if isinstance(size, list) else [size]
+        if not all(type(number) is int and 0 < number < 2**31 for number in numbers) or (
+            len(numbers) != 3 if packing.kind == "grid" else isinstance(size, list)
+        ):
+            raise FormatError(where, expected="the size of its chunks", found=repr(size), advice="the store is damaged")
+        return cls(packing, attributes)
+
+    @classmethod
+    def plan(cls, field: str, options: PackOptions, typical: tuple[int, ...]) -> FieldLayout:
+        """Return the layout of a new field.
+
+        Args:
+            field: its name.
+            options: those of the store.
+            typical: the shape of a grid, or (number of elements of a typical frame,).
+        """
+        entry = layout.field_named(field)
+        packing = packing_of(entry, options)
+        if packing.kind == "grid":
+            size: dict[str, Any] = {"shape": list(typical)}
+        else:
+            size = {"chunk": max(_round_up(int(typical[0] * _HEADROOM)), LEAST)}
+        about = {"type": FIELD, "version": VERSION, "field": entry.name, "kind": packing.kind}
+        about |= {"dtype": np.dtype(entry.dtype).name if entry.dtype else "table", "unit": entry.unit}
+        codec = {"codec": _PCODEC} if any(column.encoding.codec == _PCODEC for column in packing.columns) else {}
+        return cls(packing, about | size | codec | dict(packing.attributes))
+
+    def frame_shape(self, column: Column) -> tuple[int, ...]:
+        """Return the shape of one entry of a column's array: (X, Y, Z) of a grid, else ([rows,] elements that a frame has room for)."""
+        if self.is_grid:
+            return tuple(self.attributes["shape"])
+        typical, step = self._typical(column), self._step(column)
+        return (*((column.rows,) if column.rows else ()), -(-_SLOTS * typical // step) * step)
+
+    def chunk_shape(self, column: Column) -> tuple[int, ...]:
+        """Return the shape of a chunk of a column's array, which is of one frame."""
+        shape = self.frame_shape(column)
+        return (1, *shape) if self.is_grid else (1, *shape[:-1], self._step(column))
+
+    def column_attributes(self, column: Column) -> dict[str, Any]:
+        """Return the attributes of a column's array."""
+        return {"type": COLUMN, "version": VERSION, "dtype": np.dtype(column.dtype).name, "unit": column.unit}
+
+    def _step(self, column: Column) -> int:
+        return column.step or self._typical(column)
+
+    def _typical(self, column: Column) -> int:
+        return FEW if column.least == FEW else int(self.attributes["chunk"])
+
+    def check(self, array: StoredArray, column: Column, last: int, most: int, where: str) -> None:
+        """Check that a stored array is that of a column, and has room for what the store says of it.
+
+        Args:
+            array: the stored array.
+            column: the column that it should be.
+            last: largest number of a frame.
+            most: largest number of elements of a frame.
+            where: what to call the array in errors.
+
+        Raises:
+            FormatError: it is another array, or too small.
+        """
+        rest = tuple(self.attributes["shape"]) if self.is_grid else (column.rows,) if column.rows else ()
+        rest += () if self.is_grid else (array.step,)
+        fits = array.dtype == np.dtype(column.dtype) and array.chunk == (1, *rest)
+        fits = fits and last < array.shape[0] < 2**63 // max(1, array.slots)
+        fits = fits and array.shape[1:] == (rest if self.is_grid else (*rest[:-1], array.shape[-1]))
+        if not fits or not (self.is_grid or most <= array.shape[-1]):
+            raise FormatError(
+                where,
+                expected=f"{column.dtype} with room for frame {last}",
+                found=f"{array.dtype.str} of shape {array.shape} in chunks {array.chunk}",
+                advice="the store is damaged",
+            )
+
+    def divide(
+        self, array: NDArray[Any], *, limited: bool = True
+    ) -> tuple[dict[str, int], dict[str, list[NDArray[Any]]]]:
+        """Divide a frame into chunks.
+
+        Args:
+            array: the frame's array.
+            limited: whether a frame may not have more elements than the store has room for; if not, its last column grows.
+
+        Returns:
+            The number of elements in each column that the frame needs, and the column's chunks.
+
+        Raises:
+            FormatError: the array does not fit the field.
+        """
+        self.packing.entry.check(array, "its array")
+        if self.is_grid and list(array.shape) != self.attributes["shape"]:
+            raise FormatError(
+                "its array", expected=f"shape {tuple(self.attributes['shape'])}, as in earlier frames",
+                found=str(array.shape),
+            )  # fmt: skip
+        counts, chunks = {}, {}
+        parts = self.packing.split(array)
+        for family in self.packing.columns:
+            values = parts.get(family.name)
+            if values is None or not values.size:
+                continue
+            column = self._column_for(family, values, limited)
+            counts[column.name] = values.size if self.is_grid else values.shape[-1]
+            chunks[column.name] = list(self._chunks(column, values))
+        return counts, chunks
+
+    def _column_for(self, family: Column, values: NDArray[Any], limited: bool) -> Column:
+        """Return the column that takes the values of a frame: the first with a type and a size that hold them."""
+        *narrower, widest = family.both
+        for column in (*(one for one in narrower if np.can_cast(values.dtype, one.dtype)), widest):
+            if self.is_grid or values.shape[-1] <= self.frame_shape(column)[-1]:
+                return column
+        if not limited:
+            return widest
+        raise FormatError(
+            "its array",
+            expected=f"at most {self.frame_shape(widest)[-1]} elements ({_SLOTS} times a typical frame)",
+            found=str(values.shape[-1]),
+            advice="leave the frame out, or pack to an .h5 store",
+        )
+
+    def _chunks(self, column: Column, values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+        if self.is_grid:
+            yield values[None].astype(column.dtype, copy=False)
+            return
+        step = self._step(column)
+        for first in range(0, values.shape[-1], step):
+            part = values[..., first : first + step]
+            chunk = np.zeros((1, *values.shape[:-1], step), column.dtype)
+            chunk[0, ..., : part.shape[-1]] = part
+            yield chunk
+
+
+def typical_size(
+    entry: layout.Field,
+    arrays: list[NDArray[Any]],
+    rows: Mapping[str, int],
+    read_document: Callable[[str], bytes | None],
+) -> tuple[int, ...]:
+    """Return what decides the chunks of a new field, for `FieldLayout.plan`.
+
+    Args:
+        entry: the field.
+        arrays: its first frames.
+        rows: the number of elements of a typical frame by field, as a run has announced them.
+        read_document: returns a text file of the sequence, None if there is none.
+
+    Returns:
+        The shape of a grid, or (number of elements of a typical frame,): as announced, else the most of the first frames.
+    """
+    if entry.per == "voxel":
+        return arrays[0].shape
+    announced = rows.get("points") if entry.per == "point" else None
+    announced = rows.get(entry.name) if announced is None else announced
+    if announced is None and entry.per == "vote":
+        announced = _cells(entry.folder, read_document) // _CELLS_PER_VOTE
+    if announced is None:
+        announced = max(map(len, arrays), default=0)
+        announced = 1 << (max(announced, _PICTURE) - 1).bit_length() if entry.kind == "picture" else announced
+    return (announced,)
+
+
+def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
+    """Return the number of voxels of a grid, 0 if nothing says it."""
+    data = read_document(layout.params_file(grid))
+    try:
+        return 0 if data is None else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
+    except FormatError:
+        return 0
+
+
+def count_elements(
+    layouts: Mapping[str, FieldLayout], tables: Mapping[str, FrameTable]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
+    """Return the arrays `frames` and `counts` of a sequence, by which it is read.
+
+    Args:
+        layouts: the layout of each field.
+        tables: the frames of each field, which has at least one.
+
+    Returns:
+        The (N,) numbers of all frames in rising order; the (N, C) numbers of elements of each in each column, -1 where a field lacks the
+        frame; and the nodes of the columns.
+    """
+    frames = sorted({frame for table in tables.values() for frame in table})
+    columns: dict[str, list[int]] = {}
+    for name in sorted(tables):
+        table, firsts = tables[name], {family.name for family in layouts[name].packing.columns}
+        for column in layouts[name].columns:
+            counts = [table[frame].get(column, 0) if frame in table else -1 for frame in frames]
+            if max(counts) > 0 or column in firsts:
+                columns[f"{field_node(name)}/{column}"] = counts
+    counts_of = np.array(list(columns.values()), "<i8").reshape(len(columns), len(frames)).T
+    return np.array(frames, "<i8"), np.ascontiguousarray(counts_of), list(columns)
+
+
+def number_arrays(read_document: Callable[[str], bytes | None]) -> Iterator[tuple[str, NDArray[Any], dict[str, Any]]]:
+    """Yield poses and times as arrays too, for programs that do not read the text files: the name, the numbers and the attributes."""
+    for name, document, decode, unit in (
+        ("poses", layout.POSES, layout.decode_poses, "m"),
+        ("times", layout.TIMES, layout.decode_times, "s"),
+    ):
+        data = read_document(document)
+        with suppress(FormatError):  # not numbers: the text is kept as it is, and its reader reports the error
+            if data is not None:
+                about = {"type": "carlasc.numbers", "version": VERSION, "dtype": "float64", "unit": unit}
+                yield name, decode(data, document), about | {"document": document}
+
+
+def field_node(field: str) -> str:
+    """Return the node of a field in its sequence's group."""
+    return f"grids/{field}" if "/" in field else f"scans/{field}"
+
+
+def document_node(name: str) -> str:
+    """Return the node of a text file in its sequence's group."""
+    return f"documents/{name}"
+
+
+def _round_up(count: int) -> int:
+    """Round the elements of a chunk up to a multiple of 256."""
+    return -(-count // 256) * 256

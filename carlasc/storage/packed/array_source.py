@@ -1,0 +1,219 @@
+"""Reading packed stores of arrays: zarr and HDF5."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError
+from carlasc.storage.arrays import check_size
+from carlasc.storage.folders.trees import Tree
+from carlasc.storage.packed.array_fields import ArrayField
+from carlasc.storage.packed.array_layout import SEQUENCE, FieldLayout, document_node, field_node
+from carlasc.storage.packed.chunks import StoredArray
+from carlasc.storage.packed.stores import PackedSequence, PackedSource
+from carlasc.storage.protocol import Sequence
+
+_T = TypeVar("_T")
+
+
+class ArrayStore(ABC):
+    """A tree of groups and arrays to read from. It holds no handle between two calls.
+
+    Attributes:
+        location: what to call it in errors.
+        local: whether its bytes are on this machine.
+        tree: the tree of files that it is in.
+    """
+
+    location: str
+    tree: Tree
+    local: bool
+
+    @abstractmethod
+    def attributes(self, node: str) -> dict[str, Any] | None:
+        """Return the attributes of a group or an array, None if there is no such node."""
+
+    @abstractmethod
+    def read_small(self, node: str) -> NDArray[Any]:
+        """Return a whole array, which has one chunk."""
+
+    @abstractmethod
+    def read_document(self, node: str) -> bytes:
+        """Return the bytes of a text file that a sequence lists."""
+
+    @abstractmethod
+    def array(self, node: str) -> StoredArray:
+        """Return an array whose chunks can be read."""
+
+    @abstractmethod
+    def stored_bytes(self, node: str) -> int:
+        """Return the bytes that a node and those below take."""
+
+    def forget(self) -> bool:
+        """Forget what is known of the store, and return whether it can have grown since it was opened."""
+        return False
+
+
+class ArraySource(PackedSource):
+    """A packed store of arrays."""
+
+    def __init__(self, store: ArrayStore) -> None:
+        """Read the attributes of the store's root.
+
+        Raises:
+            FormatError: it is something else, unfinished, or of another version.
+        """
+        super().__init__(store.location, store.attributes(""))
+        self.store = store
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences that the store lists."""
+        return self._sequences()
+
+    def _sequences(self) -> dict[str, ArraySequence]:
+        return {path: ArraySequence(self.store, path, group) for path, group in self.nodes.items()}
+
+    def published_bytes(self) -> dict[str, int]:
+        """Return the bytes that the published files of each field have, from the numbers of elements of the frames."""
+        sizes: Counter[str] = Counter()
+        for sequence in self._sequences().values():
+            sizes["documents"] += sum(len(sequence.read_document(name)) for name in sequence.documents())
+            for field in sorted(sequence.fields()):
+                sizes[field] += sequence.published_bytes(field)
+        return dict(sizes)
+
+    def stored_bytes(self) -> dict[str, int]:
+        """Return the bytes that each field takes."""
+        sizes: Counter[str] = Counter()
+        for path, sequence in self.sequences().items():
+            group = self.nodes[path]
+            sizes["documents"] += self.store.stored_bytes(f"{group}/documents")
+            for field in sequence.fields():
+                sizes[field] += self.store.stored_bytes(f"{group}/{field_node(field)}")
+        return dict(sizes) | {"index": self.store.stored_bytes("") - sizes.total()}
+
+
+class ArraySequence(PackedSequence[ArrayField]):
+    """One sequence of a packed store of arrays: one table says how many elements each frame has in each column."""
+
+    def __init__(self, store: ArrayStore, path: str, group: str) -> None:
+        """Read the attributes of the sequence's group.
+
+        Raises:
+            FormatError: there is no such group, or it is damaged.
+        """
+        self.store = store
+        self.group = group
+        location = f"{store.location}/{group}"
+        attributes = store.attributes(group)
+        if attributes is None or attributes.get("type") != SEQUENCE:
+            raise FormatError(
+                location, expected="the sequence that the store lists", found="none", advice="the store is damaged"
+            )
+        super().__init__(path, location, attributes)
+        self.tree = store.tree
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame."""
+        return self._read_again(lambda: self._field(field).read([frame])[0])
+
+    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
+        """Read several frames: fetched together, decoded in parallel."""
+        numbers = list(frames)
+        return self._read_again(lambda: self._field(field).read(numbers))
+
+    def read_xyz(
+        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Read points as they are stored, as planes: the 4th column is not read, and no rows are put together."""
+        numbers = list(frames)
+        return self._read_again(lambda: self._field("points").read_planes(numbers, spare or []))
+
+    def read_document(self, name: str) -> bytes:
+        """Return a text file's bytes."""
+        self._check_document(name)
+        return self.store.read_document(f"{self.group}/{document_node(name)}")
+
+    def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
+        """Return the files that hold a field of some frames: shards of a zarr store, the one file of an HDF5 store."""
+        return self._field(field).files_of(list(frames))
+
+    def published_bytes(self, field: str) -> int:
+        """Return the bytes of a field's files in the published layout, from the numbers of elements."""
+        return self._field(field).published_bytes()
+
+    def _read_again(self, read: Callable[[], _T]) -> _T:
+        """Read once more, with what the store says now, where something does not fit: a store can grow while it is read."""
+        try:
+            return read()
+        except FormatError:
+            if not self.store.forget():
+                raise
+            self._readers = {}
+            vars(self).pop("_counts", None)
+            return read()
+
+    @cached_property
+    def _counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
+        """The frames of the sequence, and the number of elements of each in each column; -1 where the field lacks the frame."""
+        try:
+            return self._read_counts()
+        except FormatError:  # what was added to the store since its metadata were read may have replaced them
+            if not self.store.forget():
+                raise
+            return self._read_counts()
+
+    def _read_counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
+        where = f"{self.location}/counts"
+        frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
+        if frames.ndim != 1 or (np.diff(frames, prepend=-1) <= 0).any():
+            raise FormatError(where, expected="rising numbers of frames", found="others", advice="the store is damaged")
+        counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
+        columns = (self.store.attributes(f"{self.group}/counts") or {}).get("columns")
+        columns = columns if isinstance(columns, list) else []
+        if counts.shape != (len(frames), len(columns)) or not all(isinstance(name, str) for name in columns):
+            raise FormatError(
+                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, of rising frames", found="others",
+                advice="the store is damaged",
+            )  # fmt: skip
+        return frames, {column: counts[:, number] for number, column in enumerate(columns)}
+
+    def _open_field(self, field: str) -> ArrayField:
+        node = f"{self.group}/{field_node(field)}"
+        where = f"{self.store.location}/{node}"
+        found = FieldLayout.read(where, field, self.store.attributes(node))
+        if found.is_grid:
+            self._check_grid(field, tuple(found.attributes["shape"]))
+        frames, counts = self._counts
+        own = {name: counts[place] for name in found.columns if (place := f"{field_node(field)}/{name}") in counts}
+        return ArrayField(
+            where, found, frames, own, lambda name: self.store.array(f"{node}/{name}"), local=self.store.local
+        )
+
+    def _check_grid(self, field: str, shape: tuple[int, ...]) -> None:
+        """Check that the chunks of a field of a grid have the shape that the grid's params.json says.
+
+        Raises:
+            FormatError: they have another one.
+        """
+        grid = self.grids.get(field.rpartition("/")[0])
+        if grid is None:  # written last, or not at all
+            check_size(shape, np.dtype("<u4"), f"{self.location}: field {field}")
+        elif shape != grid.size:
+            raise FormatError(
+                f"{self.location}: field {field}",
+                expected=f"grids of shape {grid.size}, as in params.json",
+                found=f"{shape}",
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        state.pop("_counts", None)  # a worker reads what it needs
+        return state

@@ -1,0 +1,220 @@
+"""Chunked arrays, read directly from the files that hold the chunks.
+
+A chunk is a range of bytes in a file, in zarr's shards and in HDF5's chunked data sets alike. It is fetched, its checksum is verified,
+and numcodecs decodes it: about a millisecond for a whole scan, where the stores' own libraries take several. No handle stays open, so
+these objects can be pickled, and used on both sides of a fork.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import struct
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import CarlascError, FormatError, describe, import_extra
+from carlasc.running import count_cores
+from carlasc.running.interrupts import postponed_interrupts
+from carlasc.storage.arrays import check_size
+from carlasc.storage.folders.trees import Tree
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
+_BLOSC_HEADER = struct.Struct("<4B3I")
+BLOCK = 1 << 21  # bytes that Blosc compresses together: a whole scan, because smaller blocks compress less
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How chunks become bytes.
+
+    Attributes:
+        codec: "blosc" (Zstandard after a shuffle) or "pcodec".
+        level: compression level of Zstandard or PCodec.
+        shuffle: NO_SHUFFLE, SHUFFLE (bytes) or BITSHUFFLE.
+    """
+
+    codec: Literal["blosc", "pcodec"] = "blosc"
+    level: int = 5
+    shuffle: int = NO_SHUFFLE
+
+    def encode(self, chunk: NDArray[Any], extra: str) -> bytes:
+        """Return a chunk's bytes as they are stored, without the checksum."""
+        if self.codec == "pcodec":
+            return bytes(_pcodec(self.level, extra).encode(np.ascontiguousarray(chunk).reshape(-1)))
+        blosc = import_extra("numcodecs.blosc", extra)
+        return bytes(blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK))
+
+    def decode(self, data: bytes | memoryview, out: NDArray[Any], extra: str) -> None:
+        """Decode a chunk's bytes into `out`, a contiguous array of the chunk's shape and dtype.
+
+        Raises:
+            FormatError: they cannot be decoded, or are those of another number of elements.
+        """
+        try:
+            if self.codec == "pcodec":
+                # numcodecs does not say how many numbers there were: fewer would leave the rest of `out` as it is.
+                progress = import_extra("pcodec", extra).standalone.simple_decompress_into(bytes(data), out.reshape(-1))
+                if progress.n_processed != out.size or not progress.finished:
+                    raise ValueError(f"{progress.n_processed} elements instead of {out.size}")
+            else:
+                _check_blosc(data, out.nbytes)
+                import_extra("numcodecs.blosc", extra).decompress(data, out)
+        except (CarlascError, KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # each codec raises its own types; a panic of PCodec, in Rust, is no Exception
+            raise FormatError("its bytes", problem=f"cannot be decoded: {describe(error)}") from error
+
+
+def _check_blosc(data: bytes | memoryview, size: int) -> None:
+    """Check the header of bytes that Blosc will decode, as `blosc_cbuffer_validate` of C-Blosc does: Blosc believes it.
+
+    The header is that of Blosc 1 (README_CHUNK_FORMAT.rst): version, version of the codec, flags, size of a type, and then as 32-bit
+    numbers the bytes that were compressed, those of a block, and the compressed ones.
+
+    Raises:
+        ValueError: it is that of other data.
+    """
+    if len(data) < _BLOSC_HEADER.size:
+        raise ValueError(f"{len(data)} bytes are no Blosc chunk")
+    *_, decoded, block, encoded = _BLOSC_HEADER.unpack_from(data)
+    if (decoded, encoded) != (size, len(data)) or not 0 < block <= max(decoded, 1):
+        raise ValueError(f"{decoded} bytes from {encoded}, in blocks of {block}, instead of {size} from {len(data)}")
+
+
+@cache
+def _pcodec(level: int, extra: str) -> Any:
+    return import_extra("numcodecs.pcodec", extra).PCodec(level=level)
+
+
+class StoredArray:
+    """An array of a store in chunks, which are counted in C order. The array of a column has an entry for each frame along its first axis.
+
+    Attributes:
+        tree: the tree of files that holds the chunks.
+        name: name of the array, for errors.
+        dtype: type of the elements, little-endian.
+        shape: of the whole array.
+        chunk: shape of a chunk.
+        encoding: how chunks become bytes.
+        slots: number of chunks that an entry of the first axis has room for.
+    """
+
+    extra = "zarr"
+
+    def __init__(
+        self,
+        tree: Tree,
+        name: str,
+        dtype: np.dtype[Any],
+        shape: tuple[int, ...],
+        chunk: tuple[int, ...],
+        encoding: Encoding,
+    ) -> None:
+        self.tree = tree
+        self.name = name
+        self.dtype = dtype
+        self.shape = shape
+        self.chunk = chunk
+        self.encoding = encoding
+        self.slots = math.prod(-(-n // step) for n, step in zip(shape[1:], chunk[1:], strict=True))
+
+    @property
+    def step(self) -> int:
+        """Length of a chunk along the last axis."""
+        return self.chunk[-1]
+
+    def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
+        """Return the file, the first byte and the end of each chunk."""
+        raise NotImplementedError
+
+    def files(self, numbers: Sequence[int]) -> list[str]:
+        """Return the files that hold some chunks, each once."""
+        raise NotImplementedError
+
+    def verify(self, data: memoryview, number: int) -> memoryview:
+        """Return a chunk's encoded bytes without their checksum.
+
+        Raises:
+            FormatError: the checksum does not match.
+        """
+        raise NotImplementedError
+
+    def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
+        """Read chunks as they are stored; all at once from a remote store."""
+        return [memoryview(data) for data in self.tree.read_ranges(self.locate(numbers))]
+
+    def decode(self, data: memoryview, number: int, out: NDArray[Any]) -> None:
+        """Verify a fetched chunk and decode it into `out`."""
+        self.encoding.decode(self.verify(data, number), out, self.extra)
+
+    def read_chunk(self, number: int) -> NDArray[Any]:
+        """Fetch, verify and decode one chunk."""
+        check_size(self.chunk, self.dtype, f"a chunk of {self.name}")
+        out = np.empty(self.chunk, self.dtype)
+        self.decode(self.fetch([number])[0], number, out)
+        return out
+
+
+def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
+    """Apply a function to several items in threads; it should spend its time in decoders, which release the GIL.
+
+    A worker process, such as a DataLoader's, uses one thread: the user has chosen the number of processes.
+    """
+    items = list(items)
+    if len(items) < 2 or multiprocessing.parent_process() is not None:
+        return [function(item) for item in items]
+    return in_threads(function, items)
+
+
+def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
+    """Apply a function in other threads than this one.
+
+    In the main thread, Blosc compresses the blocks of a large chunk in threads of its own, and writes them in the order in which they are
+    done: the bytes would differ from run to run.
+    """
+    with postponed_interrupts():
+        results = _pool(os.getpid()).map(function, items)
+    return list(results)
+
+
+def crc32c(data: bytes | memoryview, extra: str) -> int:
+    """Return the CRC-32C of some bytes: processors have an instruction for it, which makes it six times as fast as CRC-32."""
+    source = data.obj if isinstance(data, memoryview) else data
+    whole = (
+        source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
+    )  # the library takes bytes only
+    return int(import_extra("google_crc32c", extra).value(whole))
+
+
+def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return uninitialised memory of this thread, which the next call returns again."""
+    size = math.prod(shape) * dtype.itemsize
+    if _scratch.memory.size < size:
+        _scratch.memory = np.empty(size, np.uint8)
+    return _scratch.memory[:size].view(dtype).reshape(shape)
+
+
+class _Scratch(threading.local):
+    memory: NDArray[np.uint8] = np.empty(0, np.uint8)
+
+
+_scratch = _Scratch()
+
+
+@cache
+def _pool(_pid: int) -> ThreadPoolExecutor:
+    """Return the threads of this process: after a fork, the object exists in the child, but its threads do not."""
+    threads = 1 if multiprocessing.parent_process() is not None else min(8, count_cores())
+    return ThreadPoolExecutor(threads, thread_name_prefix="carlasc-codec")

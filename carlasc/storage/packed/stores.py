@@ -1,0 +1,306 @@
+"""What all packed stores have in common: the options, the check of a store's root, and reading and writing one sequence."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import Coordinates
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.storage import layout
+from carlasc.storage.folders.names import leads_outside
+from carlasc.storage.packed.output import unfinished_error
+from carlasc.storage.protocol import Sequence, Source, identity_of
+from carlasc.storage.sinks import SequenceWriter, Sink
+
+VERSION = 3  # of the format in docs/storage.md, the same for all packed stores
+STORE = "carlasc.store"
+
+
+@dataclass(frozen=True)
+class PackOptions:
+    """How a store is packed.
+
+    Attributes:
+        small: PCodec for the points: smaller, but only readers with numcodecs' `pcodec` extension open it.
+        lossy_mm: quantise points to this many millimetres; None keeps every bit.
+        block: number of frames in one file of a zarr store, which one task writes.
+
+    Raises:
+        ArgumentError: `lossy_mm` is not above 0 and at most 1000, or `block` is not from 1 to 1024.
+    """
+
+    small: bool = False
+    lossy_mm: float | None = None
+    block: int = 16
+
+    def __post_init__(self) -> None:
+        if self.lossy_mm is not None and not 0 < self.lossy_mm <= 1000:
+            raise ArgumentError("lossy_mm", expected="millimetres above 0, up to 1000", found=str(self.lossy_mm))
+        if not 1 <= self.block <= 1024:
+            raise ArgumentError("block", expected="1 to 1024 frames", found=str(self.block))
+
+    @property
+    def scale_m(self) -> float | None:
+        """Size of one step of a quantised coordinate, metres; None if points are not quantised."""
+        return None if self.lossy_mm is None else self.lossy_mm / 1000
+
+
+class PackedSource(Source):
+    """A packed store.
+
+    Attributes:
+        nodes: the group (or folder) of each sequence in the store, by the sequence's path.
+        lossy_mm: step to which coordinates of points were rounded, millimetres; None if every bit was kept.
+    """
+
+    nodes: Mapping[str, str]
+
+    def __init__(self, location: str, root: Mapping[str, Any] | None) -> None:
+        """Check the attributes of the store's root.
+
+        Raises:
+            FormatError: it is something else, unfinished, or of another version, or a name in it leads out of the store.
+        """
+        self.location = location
+        self.nodes = _check_root(root, location)
+        lossy = (root or {}).get("lossy_mm")
+        self.lossy_mm = float(lossy) if isinstance(lossy, int | float) and lossy else None
+
+    def published_bytes(self) -> dict[str, int]:
+        """Return the bytes that the published files of each field have; empty where the store does not say it."""
+        return {}
+
+    @abstractmethod
+    def stored_bytes(self) -> dict[str, int]:
+        """Return the bytes that each field takes in the store; "documents" for the text files, "index" for all the rest."""
+
+
+def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]:
+    if root is None or root.get("type") != STORE:
+        raise FormatError(where, expected="a store packed by carlasc", found=f"one without the type {STORE}")
+    version = root.get("version", 1)
+    if isinstance(version, bool) or not isinstance(version, int | np.integer) or version < 1:
+        raise FormatError(where, expected="a version above 0", found=repr(version), advice="the store is damaged")
+    if version != VERSION:
+        raise FormatError(
+            where,
+            expected=f"a store of version {VERSION}",
+            found=f"version {version}",
+            advice="upgrade carlasc to read it"
+            if version > VERSION
+            else "it was packed by an earlier, unreleased version of carlasc: pack it again",
+        )
+    if not root.get("complete"):
+        raise unfinished_error(where)
+    sequences = root.get("sequences")
+    if not isinstance(sequences, dict) or not all(isinstance(node, str) for node in sequences.values()):
+        raise FormatError(where, expected="the groups of sequences", found="none", advice="the store is damaged")
+    nodes: dict[str, str] = dict(sorted(sequences.items()))
+    check_names([*nodes, *nodes.values()], where)
+    return nodes
+
+
+class FieldReader(Protocol):
+    """One field of a sequence in a packed store."""
+
+    frames: NDArray[np.int64]
+
+
+_FieldReader = TypeVar("_FieldReader", bound=FieldReader)
+
+
+class PackedSequence(Sequence, Generic[_FieldReader]):
+    """One sequence of a packed store: each field is looked up when it is first read."""
+
+    def __init__(self, path: str, location: str, about: Mapping[str, Any]) -> None:
+        """Take the sequence's split, name, coordinates, fields and text files from its attributes.
+
+        Raises:
+            FormatError: one of them is missing, or a name in them leads out of the store.
+        """
+        self.path = path
+        self.location = location
+        try:
+            self.split: str | None = about["split"]
+            self.name: str = about["name"]
+            self.coordinates = cast(Coordinates, about["coordinates"])
+            self._fields, self._documents = frozenset(about["fields"]), tuple(about["documents"])
+        except KeyError as error:
+            raise FormatError(
+                location, expected=f"the attribute {error.args[0]}", found="none", advice="the store is damaged"
+            ) from error
+        except TypeError as error:
+            raise FormatError(
+                location, expected="lists of fields and text files", found=str(error), advice="the store is damaged"
+            ) from error
+        names = (self.name, self.coordinates, self.split or "", *self._fields, *self._documents)
+        if not all(isinstance(name, str) for name in names) or self.coordinates not in layout.COORDINATES:
+            raise FormatError(
+                location, expected="names of the sequence, its fields and its text files", found="others",
+                advice="the store is damaged",
+            )  # fmt: skip
+        check_names([*self._fields, *self._documents], location)
+        self._readers: dict[str, _FieldReader] = {}
+
+    @abstractmethod
+    def _open_field(self, field: str) -> _FieldReader: ...
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields with at least one frame."""
+        return self._fields
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field."""
+        return self._field(field).frames if field in self._fields else np.empty(0, np.int64)
+
+    def documents(self) -> tuple[str, ...]:
+        """Return the names of the text files."""
+        return self._documents
+
+    def _check_document(self, name: str) -> None:
+        if name not in self._documents:
+            raise MissingDataError(
+                self.location, expected=f"the text file {name}", found=", ".join(self._documents) or "none"
+            )
+
+    def _field(self, field: str) -> _FieldReader:
+        if field not in self._fields:
+            raise MissingDataError(
+                self.location, expected=f"the field {field}", found=", ".join(sorted(self._fields)) or "none"
+            )
+        if field not in self._readers:
+            self._readers[field] = self._open_field(field)
+        return self._readers[field]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"_readers": {}}  # a worker looks up what it needs
+
+
+class PackedSink(Sink):
+    """Writes a packed store by appending: one writer, which writes one sequence after the other."""
+
+    @abstractmethod
+    def finished(self, path: str) -> bool:
+        """Whether an earlier run that was interrupted has written this sequence whole."""
+
+    @abstractmethod
+    def sequence(self, path: str) -> PackedWriter:
+        """Start a sequence; what an interrupted run left of it is removed."""
+
+
+class FieldWriter(ABC):
+    """Takes one field of a sequence, its frames in rising order.
+
+    Attributes:
+        entry: the field in the layout.
+        frames: the frames written so far, in order.
+    """
+
+    def __init__(self, field: str) -> None:
+        self.entry = layout.field_named(field)
+        self.frames: dict[int, None] = {}
+
+    def append(self, frame: int, array: NDArray[Any]) -> None:
+        """Write one frame.
+
+        Raises:
+            FormatError: it does not fit the field, or an earlier frame.
+        """
+        last = next(reversed(self.frames), -1)
+        if frame <= last:
+            raise FormatError("its number", expected=f"frames in rising order, above {last}", found=str(frame))
+        self.entry.check(array, "its array")
+        self.write(frame, array)
+        self.frames[frame] = None
+
+    @abstractmethod
+    def write(self, frame: int, array: NDArray[Any]) -> None:
+        """Write one frame that fits the field."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what is held back."""
+
+
+class PackedWriter(SequenceWriter):
+    """Takes one sequence of a packed store, each field's frames in rising order.
+
+    Attributes:
+        identity: split, name and coordinates, from the path unless they are known better.
+        writers: the fields written so far.
+        contents: the text files written so far.
+    """
+
+    def __init__(self, location: str, path: str) -> None:
+        self.location = location
+        self.path = path
+        self.identity: tuple[str | None, str, Coordinates] = identity_of(path)
+        self.writers: dict[str, FieldWriter] = {}
+        self.contents: dict[str, bytes] = {}
+
+    @abstractmethod
+    def _start_field(self, field: str) -> FieldWriter: ...
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy in another process knows its name only: one process writes the store."""
+        return {"location": self.location, "path": self.path, "identity": self.identity, "writers": {}, "contents": {}}
+
+    def has(self, field: str, frame: int) -> bool:
+        """Whether this run has written it."""
+        return field in self.writers and frame in self.writers[field].frames
+
+    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+        """Append one frame to a field.
+
+        Raises:
+            FormatError: it does not fit the field, or an earlier frame, or the field's name leads out of the store.
+        """
+        if field not in self.writers:
+            check_names([field], self.location)
+            self.writers[field] = self._start_field(field)
+        try:
+            self.writers[field].append(frame, array)
+        except FormatError as error:
+            raise error.within(f"{self.location}: field {field}, frame {frame}") from error
+
+    def write_document(self, name: str, data: bytes) -> None:
+        """Keep a text file's bytes until the sequence is closed."""
+        check_names([name], self.location)
+        self.contents[name] = data
+
+    def read_document(self, name: str) -> bytes | None:
+        """Return a text file's bytes, None if it was not written."""
+        return self.contents.get(name)
+
+    def about(self) -> dict[str, Any]:
+        """Return what the store says of the sequence."""
+        split, name, coordinates = self.identity
+        about = {"path": self.path, "split": split, "name": name, "coordinates": coordinates}
+        return about | {"fields": sorted(self.writers), "documents": sorted(self.contents)}
+
+
+def node_of(path: str, where: str) -> str:
+    """Return the group (or folder) of a sequence in a store: its path, or "sequence" where that is empty.
+
+    Raises:
+        FormatError: the path leads out of the store.
+    """
+    check_names([path], where)
+    return path.strip("/") or "sequence"
+
+
+def check_names(names: list[str], where: str) -> None:
+    """Refuse names that lead out of a store: anybody may have made it.
+
+    Raises:
+        FormatError: names the first of them.
+    """
+    for name in names:
+        if leads_outside(name):
+            raise FormatError(where, expected="names inside the store", found=repr(name), advice="it leads elsewhere")

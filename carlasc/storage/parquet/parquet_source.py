@@ -1,0 +1,308 @@
+"""Reading packed stores of Parquet tables: one file per field, one row group per frame.
+
+Parquet has checksums of pages and none of its footer, and one wrong bit there makes pyarrow 26 end the process: an exception of C++ that
+nothing catches. So a store says the checksums of its footers, and a footer is compared before pyarrow sees it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading
+from carlasc.storage import layout
+from carlasc.storage.arrays import check_ratio, check_size
+from carlasc.storage.files import parse_json
+from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
+from carlasc.storage.packed.output import TABLES_MARK
+from carlasc.storage.packed.stores import PackedSequence, PackedSource
+from carlasc.storage.parquet.table_columns import column_types, join_columns
+from carlasc.storage.protocol import Sequence
+
+SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
+NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables
+FOOTERS = "footers"  # its key with the checksums of the footers of the tables
+FRAMES = "frames.parquet"  # one row per frame
+DOCUMENTS = "documents.parquet"  # one row per text file
+_END = 8  # bytes: the length of the footer, and "PAR1"
+_MARK = b"PAR1"
+_LONGEST = 1 << 28  # bytes; a sequence of ten thousand frames has some megabytes
+
+
+class ParquetSource(PackedSource):
+    """A folder of packed Parquet tables."""
+
+    def __init__(self, tree: Tree) -> None:
+        """Read the file that marks the store.
+
+        Raises:
+            DependencyError: pyarrow is not installed.
+            FormatError: the store is unfinished, or of another version.
+        """
+        import_extra("pyarrow.parquet", "parquet")
+        super().__init__(tree.location, parse_json(bytes(tree.read(TABLES_MARK)), tree.where(TABLES_MARK)))
+        self.tree = tree
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences that the store lists."""
+        return {path: ParquetSequence(self.tree, path, folder) for path, folder in self.nodes.items()}
+
+    def stored_bytes(self) -> dict[str, int]:
+        """Return the bytes of each field's file; for a local folder only."""
+        sizes: Counter[str] = Counter()
+        for path, sequence in self.sequences().items():
+            folder = Path(self.location) / self.nodes[path]
+            sizes["documents"] += (folder / DOCUMENTS).stat().st_size
+            for field in sequence.fields():
+                sizes[field] += (folder / f"{field}.parquet").stat().st_size
+        files = (Path(folder) / name for folder, _, names in os.walk(self.location) for name in names)
+        return dict(sizes) | {"index": sum(file.stat().st_size for file in files) - sizes.total()}
+
+
+class ParquetSequence(PackedSequence["FieldTable"]):
+    """One sequence of a store of tables."""
+
+    tree: Tree
+
+    def __init__(self, tree: Tree, path: str, folder: str) -> None:
+        self.tree = tree
+        self.folder = folder
+        where = f"{folder}/{SEQUENCE}"
+        about = parse_json(bytes(tree.read(where)), tree.where(where))
+        super().__init__(path, tree.where(folder), about)
+        self._footers = about.get(FOOTERS)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one row group."""
+        table = self._field(field)
+        per_voxel = layout.field_named(field).per == "voxel"
+        grid = field.rpartition("/")[0]
+        if per_voxel and grid not in self.grids:
+            where = f"{self.location}/{layout.params_file(grid)}"
+            raise FormatError(where, expected="the geometry of the grid", found="none", advice="the store is damaged")
+        return table.read(frame, self.grids[grid].size if per_voxel else None)
+
+    def read_document(self, name: str) -> bytes:
+        """Return a text file's bytes."""
+        self._check_document(name)
+        path = f"{self.folder}/{DOCUMENTS}"
+        self._check_footer(DOCUMENTS)
+        with opened(self.tree, path) as file:
+            for column in (
+                g.column(k)
+                for g in map(file.metadata.row_group, range(file.metadata.num_row_groups))
+                for k in range(g.num_columns)
+            ):
+                check_ratio(column.total_uncompressed_size, column.total_compressed_size, self.tree.where(path))
+            rows = file.read(["name", "data"], use_threads=False).to_pylist()
+            data = next((row["data"] for row in rows if row["name"] == name), None)
+        if not isinstance(data, bytes):
+            raise FormatError(
+                self.tree.where(path), expected=f"the text file {name}", found="none", advice="the store is damaged"
+            )
+        return data
+
+    def _check_footer(self, name: str) -> None:
+        found = self._footers.get(name) if isinstance(self._footers, dict) else None
+        check_footer(self.tree, f"{self.folder}/{name}", found)
+
+    def _open_field(self, field: str) -> FieldTable:
+        self._check_footer(f"{field}.parquet")
+        return FieldTable(self.tree, f"{self.folder}/{field}.parquet", field)
+
+
+class FieldTable:
+    """One field's file: its footer is read once, a row group when its frame is read."""
+
+    def __init__(self, tree: Tree, path: str, field: str) -> None:
+        self.tree = tree
+        self.path = path
+        self.field = field
+        self.where = tree.where(path)
+        with opened(tree, path) as file:
+            self._metadata = file.metadata
+            about = parse_json(file.metadata.metadata[b"carlasc"], self.where)
+            self._types = column_types(layout.field_named(field), check_attributes(about, self.where))
+            _check_types(file.schema_arrow, self._types, self.where)
+        self.attributes = about
+        frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
+        if not frames or len(frames) != len(rows) or not _rise(frames):
+            raise FormatError(
+                self.where,
+                expected="rising frames, and the number of rows of each",
+                found="others",
+                advice="the store is damaged",
+            )
+        self.frames = np.array(frames, np.int64)
+        groups = np.cumsum(np.array(rows, np.int64) > 0) - 1  # an empty frame has none
+        self._groups = dict(zip(frames, zip(groups.tolist(), rows, strict=True), strict=True))
+
+    def read(self, frame: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
+        """Read one frame; its values have `shape` if that is given."""
+        if frame not in self._groups:
+            raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
+        rows = self._groups[frame][1]
+        where = f"{self.where}: field {self.field}, frame {frame}"
+        most = None if shape is None else math.prod(shape)
+        if most is not None and rows != most:
+            raise FormatError(where, expected=f"{most} voxels", found=str(rows))
+        if rows:
+            columns = self._read_group(frame, most is None)
+        else:
+            columns = {name: np.empty(0, "u1" if type_ == "binary" else type_) for name, type_ in self._types.items()}
+        with reading(where, "values of the field", "the store is damaged"):
+            array = join_columns(layout.field_named(self.field), columns, self.attributes)
+            return array if shape is None else array.reshape(shape)
+
+    def _read_group(self, frame: int, bounded: bool) -> dict[str, NDArray[Any]]:
+        """Return the columns of a frame. Its numbers of rows and bytes are compared with the footer before they are unpacked.
+
+        `bounded` says that nothing but the size of the largest scan bounds them.
+        """
+        (group, rows), where = self._groups[frame], f"{self.where}: field {self.field}, frame {frame}"
+        with reading(where, "the rows of a frame", "is it truncated or corrupted?"):
+            about = self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
+            if about is None or about.num_rows != rows:
+                found = "none" if about is None else str(about.num_rows)
+                raise FormatError(where, expected=f"{rows} rows", found=found)
+            if bounded:
+                for type_ in self._types.values():
+                    check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)
+            for column in map(about.column, range(about.num_columns)):
+                if column.path_in_schema in self._types:
+                    check_ratio(column.total_uncompressed_size, column.total_compressed_size, where)
+        try:
+            with opened(self.tree, self.path, self._metadata) as file:
+                table = file.read_row_group(group, columns=list(self._types), use_threads=False)
+                columns = {name: _to_numpy(table[name]) for name in self._types}
+        except FormatError as error:
+            raise error.within(f"field {self.field}, frame {frame}") from error
+        for name, column in columns.items():
+            if len(column) != rows or column.dtype != (object if self._types[name] == "binary" else self._types[name]):
+                raise FormatError(
+                    where,
+                    expected=f"{rows} values of {self._types[name]} in {name}",
+                    found=f"{len(column)} of {column.dtype}",
+                )
+        return columns
+
+
+@contextmanager
+def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
+    """Open a Parquet file; its footer is not read again where `metadata` is given.
+
+    Raises:
+        FormatError: it does not exist, is truncated, or the checksum of a page does not match.
+    """
+    parquet = import_extra("pyarrow.parquet", "parquet")
+    where = tree.where(path)
+    try:
+        place = tree.open(path) if isinstance(tree, RemoteTree) else where
+        with (
+            reading(where, "a Parquet file", "is it truncated or corrupted?"),
+            parquet.ParquetFile(place, metadata=metadata, page_checksum_verification=True) as file,
+        ):
+            yield file
+    except FormatError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            raise FormatError(
+                where, expected="the table that the sequence lists", found="none", advice="the store is damaged"
+            ) from error
+        raise
+
+
+def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
+    """Return what the footer of a table says of its values.
+
+    Raises:
+        FormatError: it does not say it, or the step of coordinates is not a length, or labels do not have one or two bytes.
+    """
+    scale, label_bytes = about.get("scale_m"), about.get("label_bytes", 1)
+    if ("scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)) or label_bytes not in (1, 2):
+        raise FormatError(
+            where,
+            expected="a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
+            found=f"{scale!r} and {label_bytes!r}",
+            advice="the store is damaged",
+        )
+    return {**about, "label_bytes": label_bytes}
+
+
+def footer_checksum(tree: Tree, path: str) -> int:
+    """Return the CRC-32 of a table's footer, with its length and the mark behind it.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it does not end as a Parquet file does.
+    """
+    end = bytes(tree.read_range(path, -_END, 0))
+    if len(end) != _END or not end.endswith(_MARK):
+        raise FormatError(tree.where(path), expected="a Parquet file", found="another end", advice="is it truncated?")
+    length = int.from_bytes(end[:4], "little")
+    if length > _LONGEST:
+        raise FormatError(tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=str(length))
+    return zlib.crc32(tree.read_range(path, -_END - length, 0))
+
+
+def footer_checksums(folder: Path) -> dict[str, int]:
+    """Return the checksum of each table below a folder on this machine, by its path there."""
+    tree = LocalTree(folder, mapped=False)
+    paths = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.parquet"))
+    return {path: footer_checksum(tree, path) for path in paths}
+
+
+def check_footer(tree: Tree, path: str, expected: object) -> None:
+    """Compare a table's footer with its checksum.
+
+    Raises:
+        FormatError: it is another one.
+    """
+    try:
+        found = footer_checksum(tree, path)
+    except MissingDataError as error:
+        raise FormatError(
+            tree.where(path),
+            expected="the table that the sequence lists",
+            found="none",
+            advice="the store is damaged",
+        ) from error
+    if found != expected:
+        raise FormatError(
+            tree.where(path),
+            problem="the checksum of the footer does not match",
+            advice="the store is corrupted: fetch or pack it again",
+        )
+
+
+def _check_types(schema: Any, types: Mapping[str, str], where: str) -> None:
+    found = {name: str(schema.field(name).type) if name in schema.names else "nothing" for name in types}
+    # pyarrow calls float32 "float" and float64 "double"
+    short = {"float32": "float", "float64": "double", "float16": "halffloat"}
+    for name, type_ in types.items():
+        if found[name] != short.get(type_, type_):
+            raise FormatError(where, expected=f"{type_} in {name}", found=found[name], advice="the store is damaged")
+
+
+def _counts(values: object) -> list[int]:
+    """Return a list of numbers from JSON; an empty one where it is something else."""
+    right = isinstance(values, list) and all(type(value) is int and 0 <= value < 2**48 for value in values)
+    return values if right else []  # type: ignore[return-value]
+
+
+def _rise(values: list[int]) -> bool:
+    return all(one < other for one, other in itertools.pairwise(values))
+
+
+def _to_numpy(column: Any) -> NDArray[Any]:
+    """Return a row group's column, without a copy where it has one chunk and no missing values."""
+    return np.asarray(column.chunk(0).to_numpy(zero_copy_only=False) if column.num_chunks == 1 else column.to_numpy())

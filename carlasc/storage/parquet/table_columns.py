@@ -1,0 +1,120 @@
+"""How a field's frames become columns of a Parquet table, and come back.
+
+Parquet's own dictionaries and byte-stream split make them small: values keep their published types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.boxes import BOXES_DTYPE
+from carlasc.errors import FormatError
+from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
+from carlasc.storage.packed.columns import narrow, quantise
+
+AXES = frozenset("xyz")
+"""Columns of points that are quantised; not quantised, they have Parquet's byte-stream split, for numbers that seldom repeat."""
+
+
+def describe(entry: Field, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
+    """Return what a reader needs to know besides the columns.
+
+    Args:
+        entry: the field.
+        array: its first frame.
+        scale_m: step to which coordinates are rounded; None keeps them.
+    """
+    if entry.kind == "position" and scale_m:
+        return {"scale_m": scale_m}
+    return {"label_bytes": array.dtype["label"].itemsize} if entry.kind == "votes" else {}
+
+
+def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
+    """Return the name of each column's type in pyarrow, from what `describe` returned."""
+    match entry.kind:
+        case "position":
+            return {name: "int32" if "scale_m" in attributes and name in AXES else "float32" for name in entry.names}
+        case "picture":
+            return {"jpeg": "binary"}
+        case "votes":
+            return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
+        case "boxes":
+            return {name: BOXES_DTYPE[name].name for name in entry.names}
+        case _:
+            return dict.fromkeys(entry.names, np.dtype(entry.dtype).name)
+
+
+def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Return a frame's columns: those of a table, the columns of (N, K) rows, the values of a grid in C order, or one picture.
+
+    Raises:
+        FormatError: labels of votes are wider than those of the first frame, or coordinates cannot be quantised.
+    """
+    types = column_types(entry, attributes)
+    if entry.kind == "picture":
+        picture = np.empty(1, object)
+        picture[0] = array.tobytes()
+        return {"jpeg": picture}
+    if entry.kind == "votes" and array.dtype["label"].itemsize != attributes["label_bytes"]:
+        raise FormatError(
+            "its labels",
+            expected=f"{attributes['label_bytes']} bytes each, as in the first frame",
+            found=str(array.dtype["label"].itemsize),
+        )
+    if array.dtype.names:
+        return {name: np.ascontiguousarray(array[name]) for name in types}
+    rows, scale = array.reshape(-1, len(types)), attributes.get("scale_m")
+    return {
+        name: quantise(rows[:, k], scale)
+        if scale and name in AXES
+        else np.ascontiguousarray(rows[:, k], np.dtype(entry.dtype).newbyteorder("="))
+        for k, name in enumerate(types)
+    }
+
+
+def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> NDArray[Any]:
+    """Return a frame's array: a table, (N, K) rows, (N,) values (classes in the narrowest type that holds them), or a picture's bytes."""
+    first = next(iter(columns.values()))
+    if entry.kind == "picture":
+        return np.frombuffer(first[0], np.uint8)
+    if entry.kind in ("votes", "boxes"):
+        dtype = (
+            BOXES_DTYPE
+            if entry.kind == "boxes"
+            else VOTES_DTYPE
+            if attributes["label_bytes"] == 1
+            else WIDE_VOTES_DTYPE
+        )
+        table = np.empty(len(first), dtype)
+        for name, column in columns.items():
+            table[name] = column
+        return table
+    if len(columns) == 1:
+        return narrow(first) if entry.kind == "class" else first
+    rows, scale = np.empty((len(first), len(columns)), np.float32), attributes.get("scale_m")
+    for k, (name, column) in enumerate(columns.items()):
+        rows[:, k] = column * scale if scale and name in AXES else column
+    return rows
+
+
+def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
+    """Return what frames.parquet tells about one frame of a field."""
+    if field == "points":
+        finite = array[np.isfinite(array).all(axis=1), :3]
+        reach = float(np.sqrt((finite.astype(np.float64) ** 2).sum(axis=1).max())) if len(finite) else None
+        return {"points": len(array), "farthest_m": reach}
+    if field == "labels":
+        return {"labelled_points": int(np.count_nonzero(array))}
+    if field == "flow":
+        return {"moving_points": int((array != 0).any(axis=1).sum())}
+    if field == "boxes":
+        return {"boxes": len(array)}
+    if field.endswith("/labels"):
+        return {f"{field.removesuffix('/labels')}_occupied_voxels": int(np.count_nonzero(array))}
+    if field.endswith("/counts"):
+        return {f"{field.removesuffix('/counts')}_known_voxels": int(np.count_nonzero(array))}
+    return {}

@@ -1,0 +1,258 @@
+"""Writing blocks of frames of a field to a zarr store, by any number of processes at a time.
+
+A block has one object per column, and last a table of its frames. An object that exists already is merged with: nothing that another
+process wrote is lost.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.packed.array_fields import ArrayField
+from carlasc.storage.packed.array_layout import FieldLayout, FrameTable
+from carlasc.storage.packed.stores import PackOptions
+from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.shards import (
+    METADATA,
+    ZarrArray,
+    column_metadata,
+    encode_chunk,
+    group_metadata,
+    join_shard,
+    split_shard,
+)
+
+BLOCKS = "blocks"  # folder of the tables
+_ASKED_ONE_BY_ONE = 4  # blocks; a caller that asks for more is going to ask for all
+_FRESH_S = 1.0  # "does not exist" is not answered from a listing older than this
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """A frame of a field as it is stored: its chunks in each column that it needs, and their number of elements."""
+
+    counts: dict[str, int]
+    chunks: dict[str, list[bytes]]
+
+
+def encode_frame(field_layout: FieldLayout, array: NDArray[np.generic]) -> EncodedFrame:
+    """Return a frame as it is stored.
+
+    Raises:
+        FormatError: it does not fit the field.
+    """
+    counts, chunks = field_layout.divide(array)
+    encodings = {name: field_layout.columns[name].encoding for name in chunks}
+    return EncodedFrame(
+        counts, {name: [encode_chunk(chunk, encodings[name]) for chunk in parts] for name, parts in chunks.items()}
+    )
+
+
+class StoredField:
+    """A field in a store that is being written.
+
+    Attributes:
+        node: its group.
+        field: its name.
+    """
+
+    def __init__(self, target: Target, node: str, field: str, options: PackOptions) -> None:
+        self.target = target
+        self.node = node
+        self.field = field
+        self.options = options
+        self.where = f"{target.location}/{node}"
+        self._layout: FieldLayout | None = None
+        self._tables: dict[int, FrameTable | None] = {}
+        self._listed_s: float | None = None
+        self._denied: set[int] = set()
+        self._asked = 0
+
+    def layout(self) -> FieldLayout | None:
+        """Return where its frames are; None if the field does not exist."""
+        if self._layout is None:
+            path = f"{self.node}/{METADATA}"
+            try:
+                metadata = parse_json(bytes(self.target.tree.read(path)), self.target.tree.where(path))
+            except MissingDataError:
+                return None
+            self._layout = FieldLayout.read(self.where, self.field, metadata.get("attributes"))
+        return self._layout
+
+    def create(self, typical: Callable[[], tuple[int, ...]]) -> FieldLayout:
+        """Return where its frames are; a new field is created, and the first of several processes decides where its frames are.
+
+        Args:
+            typical: returns the shape of a grid, or (number of elements of a typical frame,).
+        """
+        if (found := self.layout()) is not None:
+            return found
+        planned = FieldLayout.plan(self.field, self.options, typical())
+        self.target.put(f"{self.node}/{METADATA}", to_json(group_metadata(planned.attributes)), create=True)
+        return self._known_layout()
+
+    def _known_layout(self) -> FieldLayout:
+        if (found := self.layout()) is None:
+            raise FormatError(self.where, expected="the field", found="none", advice="another program removed it")
+        return found
+
+    def has(self, frame: int) -> bool:
+        """Whether a frame exists.
+
+        The first few blocks that are asked for are looked up, then all blocks are listed. "No" is answered from a listing at most once
+        per frame, and not after a second: other processes write meanwhile.
+        """
+        block = frame // self.options.block
+        if self._exists(frame):
+            return True
+        if self._listed_s is not None:
+            outdated = frame in self._denied or time.monotonic() - self._listed_s > _FRESH_S
+        else:
+            outdated = frame in self._denied or (block not in self._tables and self._asked >= _ASKED_ONE_BY_ONE)
+        if outdated:
+            self._list()
+        elif self._listed_s is None and block not in self._tables:
+            self._tables[block] = self.table(block)
+            self._asked += 1
+        if self._exists(frame):
+            return True
+        self._denied.add(frame)
+        return False
+
+    def refresh(self) -> None:
+        """Forget which frames were missing."""
+        whole = {block: table for block, table in self._tables.items() if len(table or {}) == self.options.block}
+        self._tables, self._listed_s, self._denied, self._asked = dict(whole), None, set(), 0
+
+    def _exists(self, frame: int) -> bool:
+        return frame in (self._tables.get(frame // self.options.block) or {})
+
+    def _list(self) -> None:
+        """Read the tables of all blocks that may have changed."""
+        found = {
+            path: block for path in self.target.paths(f"{self.node}/{BLOCKS}") if (block := block_of(path)) is not None
+        }
+        changed = [path for path, block in found.items() if len(self._tables.get(block) or {}) < self.options.block]
+        for path, data in zip(changed, self.target.tree.read_many(changed), strict=True):
+            self._tables[found[path]] = self._parse(data, path)
+        self._listed_s = time.monotonic()
+        self._denied = set()
+
+    def table(self, block: int) -> FrameTable | None:
+        """Return what the table of a block says now; None if the block does not exist."""
+        path = table_path(self.node, block)
+        try:
+            return self._parse(self.target.tree.read(path), path)
+        except MissingDataError:
+            return None
+
+    def _parse(self, data: bytes | memoryview, path: str) -> FrameTable | None:
+        """Return a table; None for an empty file, which a power failure can leave: the block is then made again."""
+        return parse_table(bytes(data), self.target.tree.where(path)) if data else None
+
+    def read(self, frame: int) -> NDArray[np.generic] | None:
+        """Read a frame; None if it does not exist."""
+        block = frame // self.options.block
+        found = self.layout()
+        if found is None:
+            return None
+        if not self._exists(frame):
+            self._tables[block] = self.table(block)
+        needed = (self._tables[block] or {}).get(frame)
+        if needed is None:
+            return None
+        counts = {name: np.array([needed.get(name, 0)]) for name in found.columns}
+        local = isinstance(self.target, LocalTarget)
+        field = ArrayField(
+            self.where, found, np.array([frame]), counts, lambda name: self._array(found, name, block), local=local
+        )
+        return field.read([frame])[0]
+
+    def _array(self, found: FieldLayout, name: str, block: int) -> ZarrArray:
+        size = self.options.block
+        metadata = column_metadata(found, found.columns[name], size, (block + 1) * size)
+        return ZarrArray.from_metadata(self.target.tree, f"{self.node}/{name}", metadata)
+
+    def columns(self, block: int, frames: Mapping[int, EncodedFrame]) -> list[str]:
+        """Return the columns whose object changes when frames are written to a block: those that they need, or needed before."""
+        before = self._tables.get(block) or {}
+        needed = {name for frame, encoded in frames.items() for name in (*encoded.chunks, *before.get(frame, {}))}
+        return sorted(needed)
+
+    def put_column(self, name: str, block: int, frames: Mapping[int, EncodedFrame]) -> None:
+        """Write the object of one column of a block: frames that it has already are kept, or replaced by those given."""
+        found = self._known_layout()
+        array = self._array(found, name, block)
+        slots = array.slots
+        path, room = array.file(block), array.per_shard or 1
+        places = {frame: frame % self.options.block * slots for frame in frames}
+        new = {places[f] + k: chunk for f, e in frames.items() for k, chunk in enumerate(e.chunks.get(name, ()))}
+        data = join_shard(new, room)
+        if self.target.put(path, data, create=True):
+            return
+        taken = {first + k for first in places.values() for k in range(slots)}
+        there = bytes(self.target.tree.read(path))
+        while (merged := _merge(there, new, taken, room, self.target.tree.where(path))) != there:
+            self.target.put(path, merged)
+            there = bytes(self.target.tree.read(path))  # another process may have replaced it meanwhile
+
+    def put_table(self, block: int, frames: Mapping[int, EncodedFrame]) -> None:
+        """Write the table of a block, once its objects are whole: with the frames that it has already."""
+        path, ours = table_path(self.node, block), {frame: encoded.counts for frame, encoded in frames.items()}
+        if not self.target.put(path, format_table(ours), create=True):
+            there = self.table(block) or {}
+            while there | ours != there:
+                self.target.put(path, format_table(there | ours))
+                there = self.table(block) or {}
+            ours = there
+        self._tables[block] = ours
+
+
+def _merge(there: bytes, new: Mapping[int, bytes], taken: set[int], room: int, where: str) -> bytes:
+    """Return the file of a shard with new chunks, and with those of the present file that are not in slots that are taken."""
+    there_now = split_shard(there, room, where) if there else {}  # a power failure can leave an empty file
+    kept = {slot: chunk for slot, chunk in there_now.items() if slot not in taken}
+    return join_shard({**kept, **new}, room)
+
+
+def table_path(node: str, block: int) -> str:
+    """Return the path of the table of a block."""
+    return f"{node}/{BLOCKS}/{block:06d}.json"
+
+
+def block_of(path: str) -> int | None:
+    """Return the block whose table is at a path; None if no table is."""
+    folder, _, name = path.rpartition("/")
+    stem = name.removesuffix(".json")
+    is_table = folder.rpartition("/")[2] == BLOCKS and name != stem and stem.isascii() and stem.isdigit()
+    return int(stem) if is_table else None
+
+
+def format_table(table: FrameTable) -> bytes:
+    """Return the bytes of a table: {"frames": {"17": {"xyz": 120800}, ...}}, frames and columns in order."""
+    return to_json({"frames": {str(frame): dict(sorted(table[frame].items())) for frame in sorted(table)}})
+
+
+def parse_table(data: bytes, where: str) -> FrameTable:
+    """Read a table.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    try:
+        frames = parse_json(data, where)["frames"]
+        return {
+            int(frame): {str(name): int(count) for name, count in counts.items()} for frame, counts in frames.items()
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(
+            where, expected="the frames of a block", found="something else",
+            advice="remove this file and run the same command again",
+        ) from error  # fmt: skip

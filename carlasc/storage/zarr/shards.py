@@ -1,0 +1,326 @@
+"""The objects of a zarr store: shards of chunks, each with an index of its own, and the metadata that describe them.
+
+See the zarr specification v3, "sharding_indexed" and "crc32c".
+"""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.folders.trees import Tree
+from carlasc.storage.packed.array_layout import FieldLayout
+from carlasc.storage.packed.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
+from carlasc.storage.packed.columns import Column
+
+METADATA = "zarr.json"
+_SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}
+_LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
+_CRC = {"name": "crc32c"}
+_CHECKSUM = 4  # bytes
+_RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c
+_ABSENT = 2**64 - 1  # offset and length of a chunk that does not exist
+
+
+class ZarrArray(StoredArray):
+    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, in shards along its first axis or in one chunk.
+
+    Attributes:
+        per_shard: number of chunks of a shard; None if the array is not sharded.
+    """
+
+    per_shard: int | None = None
+
+    @classmethod
+    def from_metadata(cls, tree: Tree, node: str, metadata: Mapping[str, Any]) -> ZarrArray:
+        """Read the metadata of an array.
+
+        Raises:
+            FormatError: its codecs or its chunks are not those that carlasc writes.
+        """
+        with reading(tree.where(node), "the codecs and chunks that carlasc writes"):
+            shape, dtype = _numbers(metadata["shape"], 0), np.dtype(metadata["data_type"]).newbyteorder("<")
+            if dtype.kind not in "uif":
+                raise ValueError(f"elements of {dtype.name}")
+            outer = _numbers(metadata["chunk_grid"]["configuration"]["chunk_shape"], 1)
+            codecs, chunk = metadata["codecs"], outer
+            if sharded := codecs[0]["name"] == "sharding_indexed":
+                chunk = _numbers(codecs[0]["configuration"]["chunk_shape"], 1)
+                codecs = codecs[0]["configuration"]["codecs"]
+            if not len(shape) == len(outer) == len(chunk) > 0:
+                raise ValueError(f"shape {shape}, chunks {outer} of {chunk}")
+            encoding = encoding_of(codecs)
+            if any(n > limit for n, limit in zip(shape[1:], outer[1:], strict=True)):
+                raise ValueError(f"shape {shape} in shards of {outer}, which divide other axes than the first")
+            found = cls(tree, node, dtype, shape, chunk, encoding)
+            found.per_shard = outer[0] // chunk[0] * found.slots if sharded else None
+            found._index_first = sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
+        found._indices = {}
+        return found
+
+    _index_first: bool
+    _indices: dict[int, ShardIndex]
+
+    def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
+        """Look up chunks in the indices of their shards, which are read once, those of one call together."""
+        per_shard = self.per_shard
+        if per_shard is None:
+            return [(self.file(number), 0, -1) for number in numbers]
+        if any(number // per_shard not in self._indices for number in numbers):
+            self._read_indices({number // per_shard for number in numbers})
+        places = []
+        for number in numbers:
+            shard, slot = divmod(number, per_shard)
+            place = self._indices[shard].place(slot)
+            if place is None:
+                raise FormatError(
+                    self.tree.where(self.file(shard)),
+                    expected=f"chunk {number}",
+                    found="none",
+                    advice="the store is damaged",
+                )
+            places.append((self.file(shard), *place))
+        return places
+
+    def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
+        """Read chunks as they are stored."""
+        try:
+            if self.per_shard is None:
+                return [memoryview(data) for data in self.tree.read_many([self.file(number) for number in numbers])]
+            return super().fetch(numbers)
+        except MissingDataError as error:
+            raise FormatError(
+                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+            ) from error
+
+    def files(self, numbers: Sequence[int]) -> list[str]:
+        """Return the shards that hold some chunks."""
+        return [self.file(shard) for shard in dict.fromkeys(number // (self.per_shard or 1) for number in numbers)]
+
+    def verify(self, data: memoryview, number: int) -> memoryview:
+        """Verify the crc32c at the end of a chunk."""
+        return without_checksum(data, f"chunk {number} of {self.name}")
+
+    def file(self, number: int) -> str:
+        """Return the path of a shard, or of a chunk of an array without shards."""
+        return f"{self.name}/c/{'/'.join([str(number), *['0'] * (len(self.shape) - 1)])}"
+
+    def _read_indices(self, shards: set[int]) -> None:
+        missing = sorted(shards - self._indices.keys())
+        if not missing:
+            return
+        size = index_bytes(self.per_shard or 1)
+        start, end = (0, size) if self._index_first else (-size, 0)
+        files = [self.file(shard) for shard in missing]
+        found = self.tree.read_ranges([(file, start, end) for file in files])
+        for shard, file, data in zip(missing, files, found, strict=True):
+            self._indices[shard] = ShardIndex(memoryview(data), self.per_shard or 1, f"the index of {file}")
+
+
+class ShardIndex:
+    """Where the chunks of a shard are in its file. Only those that exist take memory."""
+
+    def __init__(self, data: memoryview, per_shard: int, what: str) -> None:
+        """Read an index.
+
+        Args:
+            data: the bytes of the index, with its checksum.
+            per_shard: number of chunks that the shard has room for.
+            what: its name in errors.
+
+        Raises:
+            FormatError: it is cut short, or the checksum does not match.
+        """
+        if len(data) != index_bytes(per_shard):
+            raise FormatError(
+                what, expected=f"{index_bytes(per_shard)} bytes", found=str(len(data)), advice="the store is damaged"
+            )
+        table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
+        slots = np.flatnonzero(table[:, 0] != _ABSENT)
+        self.slots = array("q", slots.astype("=i8").tobytes())  # looking up one number is faster than in NumPy's arrays
+        self._offsets, self._lengths = (array("Q", column.astype("=u8").tobytes()) for column in table[slots].T)
+
+    def place(self, slot: int) -> tuple[int, int] | None:
+        """Return the first byte and the end of a chunk in the file; None if the chunk does not exist."""
+        position = bisect_left(self.slots, slot)
+        if position == len(self.slots) or self.slots[position] != slot:
+            return None
+        offset = self._offsets[position]
+        return offset, offset + self._lengths[position]
+
+
+def encode_chunk(chunk: NDArray[Any], encoding: Encoding) -> bytes:
+    """Return a chunk as it is in a shard, with its checksum."""
+    return _with_checksum(encoding.encode(chunk, "zarr"))
+
+
+def join_shard(chunks: Mapping[int, bytes | memoryview], per_shard: int) -> bytes:
+    """Return the file of a shard: its index, then its chunks.
+
+    Args:
+        chunks: the chunks that exist, as `encode_chunk` returns them, by their number in the shard.
+        per_shard: number of chunks that the shard has room for.
+    """
+    table = np.full((per_shard, 2), _ABSENT, "<u8")
+    offset = index_bytes(per_shard)
+    for slot in sorted(chunks):
+        table[slot] = offset, len(chunks[slot])
+        offset += len(chunks[slot])
+    return b"".join([_with_checksum(table.tobytes()), *(chunks[slot] for slot in sorted(chunks))])
+
+
+def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int, memoryview]:
+    """Return the chunks of a shard, as they are in its file, by their number in it.
+
+    Raises:
+        FormatError: the index is damaged.
+    """
+    view = memoryview(data)
+    index = ShardIndex(view[: index_bytes(per_shard)], per_shard, what)
+    found = {slot: place for slot in index.slots if (place := index.place(slot)) is not None}
+    if any(end > len(view) for _, end in found.values()):
+        raise FormatError(what, expected="chunks inside the file", found="others", advice="the store is damaged")
+    return {slot: view[start:end] for slot, (start, end) in found.items()}
+
+
+def index_bytes(per_shard: int) -> int:
+    """Return the size of the index of a shard, with its checksum."""
+    return 16 * per_shard + _CHECKSUM
+
+
+def without_checksum(data: memoryview, what: str) -> memoryview:
+    """Return bytes without the checksum at their end.
+
+    Raises:
+        FormatError: the checksum does not match.
+    """
+    if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
+        raise FormatError(
+            what, problem="the checksum does not match", advice="the store is corrupted: fetch or pack it again"
+        )
+    return data[:-_CHECKSUM]
+
+
+def _numbers(values: Any, least: int) -> tuple[int, ...]:
+    """Return a list of whole numbers from JSON.
+
+    Raises:
+        ValueError: it is something else, or a number is below `least`, or does not fit into an int64.
+    """
+    if not isinstance(values, list) or not all(type(value) is int and least <= value < 2**63 for value in values):
+        raise ValueError(f"{values!r} for a shape")
+    return tuple(values)
+
+
+def _with_checksum(data: bytes) -> bytes:
+    return data + crc32c(data, "zarr").to_bytes(_CHECKSUM, "little")
+
+
+def group_metadata(attributes: Mapping[str, Any], nodes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the metadata of a group.
+
+    Args:
+        attributes: the group's attributes.
+        nodes: the metadata of all nodes below it, by path, which are then consolidated in it.
+    """
+    metadata: dict[str, Any] = {"attributes": dict(attributes), "zarr_format": 3, "node_type": "group"}
+    if nodes is not None:
+        metadata["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": dict(nodes)}
+    return metadata
+
+
+def array_metadata(
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    chunk: tuple[int, ...],
+    encoding: Encoding,
+    attributes: Mapping[str, Any],
+    shard: tuple[int, ...] | None = None,
+) -> dict[str, Any]:
+    """Return the metadata of an array.
+
+    Args:
+        dtype: type of its elements.
+        shape: its shape.
+        chunk: shape of a chunk.
+        encoding: how a chunk becomes bytes; its crc32c follows.
+        attributes: the array's attributes.
+        shard: shape of a shard; None for an array without shards.
+    """
+    codecs = codecs_of(encoding, dtype)
+    if shard is not None:
+        sharding = {
+            "chunk_shape": list(chunk),
+            "codecs": codecs,
+            "index_codecs": [_LITTLE, _CRC],
+            "index_location": "start",
+        }
+        codecs = [{"name": "sharding_indexed", "configuration": sharding}]
+    return {
+        "attributes": dict(attributes),
+        "shape": list(shape),
+        "data_type": dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(shard or chunk)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": 0.0 if dtype.kind == "f" else 0,
+        "codecs": codecs,
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+    }
+
+
+def codecs_of(encoding: Encoding, dtype: np.dtype[Any]) -> list[dict[str, Any]]:
+    """Return the codecs of a chunk: those of its encoding, and crc32c."""
+    if encoding.codec == "pcodec":
+        return [{"name": "numcodecs.pcodec", "configuration": {"level": encoding.level}}, _CRC]
+    shuffle = next(name for name, number in _SHUFFLES.items() if number == encoding.shuffle)
+    blosc = {
+        "typesize": dtype.itemsize,
+        "cname": "zstd",
+        "clevel": encoding.level,
+        "shuffle": shuffle,
+        "blocksize": BLOCK,
+    }
+    return [_LITTLE if dtype.itemsize > 1 else {"name": "bytes"}, {"name": "blosc", "configuration": blosc}, _CRC]
+
+
+def encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
+    """Return the encoding that the (inner) codecs in an array's metadata describe.
+
+    Raises:
+        ValueError: they are not those of an `Encoding`.
+    """
+    names = [codec["name"] for codec in codecs]
+    if names == ["numcodecs.pcodec", "crc32c"]:
+        return Encoding("pcodec", codecs[0]["configuration"]["level"])
+    if names == ["bytes", "blosc", "crc32c"] and codecs[0].get("configuration", {}).get("endian", "little") == "little":
+        settings = codecs[1]["configuration"]
+        return Encoding("blosc", settings["clevel"], _SHUFFLES[settings["shuffle"]])
+    raise ValueError(f"codecs {', '.join(names)}")
+
+
+def column_metadata(field_layout: FieldLayout, column: Column, block: int, frames: int) -> dict[str, Any]:
+    """Return the metadata of a column's array.
+
+    Args:
+        field_layout: the layout of its field.
+        column: the column.
+        block: number of frames of a shard.
+        frames: number of frames that the array has room for, a multiple of `block`.
+    """
+    shape = field_layout.frame_shape(column)
+    return array_metadata(
+        np.dtype(column.dtype),
+        (frames, *shape),
+        field_layout.chunk_shape(column),
+        column.encoding,
+        field_layout.column_attributes(column),
+        (block, *shape),
+    )

@@ -1,0 +1,261 @@
+"""Finishing a zarr store: its tables become one table per sequence, and its metadata are written, the root's last.
+
+Everything is derived from the objects that exist, so that finishing may be interrupted and repeated, and any process can do it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from numpy.typing import NDArray
+
+from carlasc.errors import ConflictError, FormatError, MissingDataError
+from carlasc.storage.files import parse_json, remove_stale, to_json
+from carlasc.storage.packed.array_layout import (
+    FIELD,
+    SEQUENCE,
+    FieldLayout,
+    FrameTable,
+    count_elements,
+    document_node,
+    field_node,
+    number_arrays,
+)
+from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
+from carlasc.storage.packed.stores import STORE, VERSION, check_names
+from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.block_tables import block_of, parse_table
+from carlasc.storage.zarr.root import read_root, remove_replaced
+from carlasc.storage.zarr.shards import METADATA, array_metadata, column_metadata, encode_chunk, group_metadata
+
+EXPECTED = "expected.json"  # the frames that a run has announced
+_SMALL = Encoding(shuffle=SHUFFLE)
+
+
+@dataclass
+class FinishedStore:
+    """What a store holds.
+
+    Attributes:
+        location: the store.
+        sequences: number of frames of each field, by the path of the sequence.
+        missing: number of announced frames that are not there, likewise.
+    """
+
+    location: str
+    sequences: dict[str, dict[str, int]] = field(default_factory=dict)
+    missing: dict[str, dict[str, int]] = field(default_factory=dict)
+
+
+@dataclass
+class StoreNodes:
+    """The metadata of nodes, and the files to write."""
+
+    metadata: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def group(self, node: str, attributes: Mapping[str, Any]) -> None:
+        """Add a group, and the groups above it that are not there."""
+        parts = node.split("/")
+        for end in range(1, len(parts)):
+            self.metadata.setdefault("/".join(parts[:end]), group_metadata({}))
+        self.metadata[node] = group_metadata(attributes)
+
+    def small(self, node: str, values: NDArray[Any], attributes: Mapping[str, Any]) -> None:
+        """Add an array of one chunk."""
+        about = {"version": VERSION, "dtype": values.dtype.name, **attributes}
+        chunk = tuple(max(1, n) for n in values.shape)
+        self.metadata[node] = array_metadata(values.dtype, values.shape, chunk, _SMALL, about)
+        if values.size:
+            (data,) = in_threads(lambda array: encode_chunk(array, _SMALL), [values])
+            self.files[f"{node}/c/{'/'.join('0' * values.ndim)}"] = data
+
+
+def finish(target: Target, *, incomplete: bool = False) -> FinishedStore:
+    """Finish a store: write what it holds, by which it can be opened. A finished store is brought up to date.
+
+    Args:
+        target: where the store is.
+        incomplete: finish although frames are missing that a run has announced.
+
+    Returns:
+        What it holds.
+
+    Raises:
+        ConflictError: announced frames are missing, and `incomplete` is not given.
+        FormatError: something in it is damaged.
+        MissingDataError: there is no store of version 2.
+    """
+    if isinstance(target, LocalTarget):
+        remove_stale(target.folder, deep=True)
+    paths = sorted(target.paths())
+    while True:
+        result = _write_metadata(target, paths, incomplete)
+        before, paths = paths, sorted(target.paths())
+        if _tables_of(before) == _tables_of(paths):
+            return result
+        # another process has added something meanwhile, and may have written its metadata before ours
+
+
+def _tables_of(paths: list[str]) -> list[str]:
+    return [path for path in paths if block_of(path) is not None or f"/{document_node('')}" in path]
+
+
+def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> FinishedStore:
+    root = read_root(target)
+    if root is None or root.get("type") != STORE or root.get("version") != VERSION:
+        raise MissingDataError(target.location, expected=f"a zarr store of version {VERSION}", found="none")
+    if not isinstance(block := root.get("block"), int) or block < 1:
+        raise FormatError(
+            target.location, expected="a number of frames in block", found=repr(block), advice="the store is damaged"
+        )
+    groups = _groups(target, paths)
+    result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
+    for node, attributes in groups.items():
+        if attributes.get("type") == SEQUENCE:
+            if not {"path", "split", "name", "coordinates"} <= attributes.keys():
+                raise FormatError(
+                    f"{target.location}/{node}", expected="a sequence", found="less", advice="the store is damaged"
+                )
+            sequences[attributes["path"]] = node
+            inside = [path for path in paths if path.startswith(f"{node}/")]
+            fields = {
+                name: about
+                for name, about in groups.items()
+                if about.get("type") == FIELD and name == f"{node}/{field_node(about.get('field', ''))}"
+            }
+            _finish_sequence(target, node, attributes, inside, fields, block, nodes, result)
+    check_names([*sequences, *sequences.values()], target.location)
+    if result.missing and not incomplete:
+        raise _missing(result)
+    about = root | {"complete": True}
+    sequences = dict(sorted(sequences.items()))
+    if (
+        root.get("complete") is True
+    ):  # a store that is brought up to date cannot be opened while its tables and its root disagree
+        target.put(METADATA, to_json(group_metadata(root | {"complete": False})))
+    target.put_many(nodes.files | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()})
+    all_nodes = dict(sorted(nodes.metadata.items()))
+    target.put(METADATA, to_json(group_metadata(about | {"sequences": sequences}, all_nodes)))
+    remove_replaced(target)
+    return result
+
+
+def _groups(target: Target, paths: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return the attributes of the groups of sequences and fields."""
+    files = [path for path in paths if path.endswith(f"/{METADATA}")]
+    found = {}
+    for path, data in zip(files, target.tree.read_many(files), strict=True):
+        metadata = parse_json(bytes(data), target.tree.where(path))
+        if metadata.get("node_type") == "group":
+            found[path.removesuffix(f"/{METADATA}")] = metadata.get("attributes", {})
+    return found
+
+
+def _finish_sequence(
+    target: Target,
+    node: str,
+    attributes: Mapping[str, Any],
+    paths: list[str],
+    groups: Mapping[str, Mapping[str, Any]],
+    block: int,
+    nodes: StoreNodes,
+    result: FinishedStore,
+) -> None:
+    """Add the nodes of a sequence, and count its frames."""
+    fields, tables = dict[str, FieldLayout](), _read_tables(target, paths)
+    for group, about in groups.items():
+        name = about["field"]
+        if tables.get(group):
+            fields[name] = FieldLayout.read(f"{target.location}/{group}", name, about)
+            nodes.group(group, about)
+    found = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
+    _count(target, node, attributes["path"], paths, found, result)
+    frames, counts, columns = count_elements(fields, found)
+    for place, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
+        kind, _, column = place.rpartition("/")
+        name = kind.partition("/")[2]
+        if most > 0:
+            room = -(-(max(found[name]) + 1) // block) * block
+            nodes.metadata[f"{node}/{place}"] = column_metadata(fields[name], fields[name].columns[column], block, room)
+    documents = sorted(
+        path.removeprefix(f"{node}/{document_node('')}")
+        for path in paths
+        if path.startswith(f"{node}/{document_node('')}")
+    )
+    nodes.group(node, {**attributes, "fields": sorted(found), "documents": documents})
+    nodes.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
+    nodes.small(f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns})
+
+    def read_document(name: str) -> bytes | None:
+        return bytes(target.tree.read(f"{node}/{document_node(name)}")) if name in documents else None
+
+    for name, numbers, about in number_arrays(read_document):
+        nodes.small(f"{node}/{name}", numbers, about)
+
+
+def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, FrameTable]:
+    """Return the frames of each field, by its group."""
+    files = [path for path in paths if block_of(path) is not None]
+    tables: dict[str, FrameTable] = {}
+    for path, data in zip(files, target.tree.read_many(files), strict=True):
+        group = path.rpartition("/")[0].rpartition("/")[0]
+        tables.setdefault(group, {}).update(parse_table(bytes(data), target.tree.where(path)))
+    return tables
+
+
+def _count(
+    target: Target, node: str, path: str, paths: list[str], tables: Mapping[str, FrameTable], result: FinishedStore
+) -> None:
+    """Count the frames of a sequence, and those that were announced and are missing."""
+    result.sequences[path] = {name: len(table) for name, table in tables.items()}
+    announced = f"{node}/{EXPECTED}"
+    if announced not in paths:
+        return
+    expected = parse_expected(bytes(target.tree.read(announced)), target.tree.where(announced))
+    missing = {name: len(frames - tables.get(name, {}).keys()) for name, frames in expected.items()}
+    if missing := {name: count for name, count in missing.items() if count}:
+        result.missing[path] = missing
+
+
+def format_expected(frames: Mapping[str, set[int]]) -> bytes:
+    """Return the bytes of the announced frames: ranges [first, end) of each field."""
+    ranges: dict[str, list[list[int]]] = {}
+    for name in sorted(frames):
+        found = ranges.setdefault(name, [])
+        for frame in sorted(frames[name]):
+            if found and found[-1][1] == frame:
+                found[-1][1] += 1
+            else:
+                found.append([frame, frame + 1])
+    return to_json(ranges)
+
+
+def parse_expected(data: bytes, where: str) -> dict[str, set[int]]:
+    """Read the announced frames.
+
+    Raises:
+        FormatError: they are damaged.
+    """
+    try:
+        found = parse_json(data, where).items()
+        return {name: {frame for first, end in ranges for frame in range(first, end)} for name, ranges in found}
+    except (TypeError, ValueError) as error:
+        raise FormatError(
+            where, expected="ranges of frames", found="something else", advice="remove this file and run again"
+        ) from error
+
+
+def _missing(result: FinishedStore) -> ConflictError:
+    path, fields = next(iter(result.missing.items()))
+    name, count = next(iter(fields.items()))
+    total = sum(sum(counts.values()) for counts in result.missing.values())
+    more = f", {total} in the whole store" if total > count else ""
+    return ConflictError(
+        result.location,
+        expected="all frames that the run announced",
+        found=f"{count} of {name} missing in {path or 'its sequence'}{more}",
+        advice="run the same command again, or give `incomplete=True`",
+    )

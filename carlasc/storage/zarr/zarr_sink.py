@@ -1,0 +1,269 @@
+"""Writing packed zarr stores: in place, block by block, by any number of processes at a time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from carlasc.core.grids import Coordinates
+from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.storage import layout
+from carlasc.storage.files import to_json
+from carlasc.storage.packed.array_layout import SEQUENCE, document_node, field_node, typical_size
+from carlasc.storage.packed.chunks import in_threads
+from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of
+from carlasc.storage.protocol import identity_of
+from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame
+from carlasc.storage.zarr.root import StoreRoot, existing_options
+from carlasc.storage.zarr.shards import METADATA, group_metadata
+from carlasc.storage.zarr.zarr_finish import EXPECTED, finish, format_expected, parse_expected
+from carlasc.storage.zarr.zarr_source import ZarrSource
+
+_PUTS = 16  # objects that are written side by side
+_T = TypeVar("_T")
+
+
+class ZarrSink(Sink):
+    """Writes a packed zarr store, in place: on a local disk and in an object store alike.
+
+    Several processes may write one store at the same time, each with a sink of its own, or with pickled copies of one writer. The store
+    cannot be opened until `finish` has written its metadata.
+    """
+
+    is_readable = True
+
+    def __init__(
+        self, out: str | os.PathLike[str] | Target, options: PackOptions | None = None, overwrite: bool = False
+    ) -> None:
+        """Start a store, or join one that is being written, or was interrupted, with the same options.
+
+        More may be added to a finished store: it can be read meanwhile, and what is added is seen after `finish`.
+
+        Args:
+            out: the store.
+            options: how it is packed; None: as the store is packed that exists.
+            overwrite: start again where a finished store exists, or one with other options. A finished local store is kept as `<name>.replaced`
+                until the new one is finished; in an object store it is removed first.
+
+        Raises:
+            ConflictError: something else exists there.
+            DependencyError: zarr's codecs are not installed.
+        """
+        for module in ("numcodecs", "google_crc32c"):
+            import_extra(module, "zarr")
+        self.target = out if isinstance(out, Target) else LocalTarget(Path(out))
+        self.location = self.target.location
+        self.options = options or (PackOptions() if overwrite else existing_options(self.target)) or PackOptions()
+        if self.options.small:
+            import_extra("pcodec", "zarr")
+        self._root = StoreRoot(self.target, self.options, overwrite)
+        self.is_finished = self._root.is_finished
+
+    def sequence(self, path: str) -> ZarrWriter:
+        """Start or continue a sequence."""
+        return ZarrWriter(self.target, node_of(path, self.location), path, self.options, self._root)
+
+    def finish(self, *, incomplete: bool = False) -> None:
+        """Write the metadata by which the store can be opened.
+
+        Raises:
+            ConflictError: frames that a run has announced (`SequenceWriter.expect`) are not there, and `incomplete` is not given.
+        """
+        self._root.begin()
+        finish(self.target, incomplete=incomplete)
+        self.is_finished = True
+
+    def source(self) -> ZarrSource:
+        """Return the store, which must be finished."""
+        return ZarrSource(self.target.tree)
+
+
+class ZarrWriter(SequenceWriter):
+    """Writes one sequence of a zarr store.
+
+    `write_frames` writes blocks of frames at once. `write` keeps the frames of a block in memory until a frame of another block comes, or
+    the writer is closed; in a pickled copy, which nobody closes, it writes each frame at once.
+
+    Attributes:
+        identity: split, name and coordinates, from the path unless they are known better.
+    """
+
+    concurrent = True
+
+    def __init__(self, target: Target, group: str, path: str, options: PackOptions, root: StoreRoot) -> None:
+        self.target = target
+        self.group = group
+        self.path = path
+        self.location = f"{target.location}/{group}"
+        self.identity: tuple[str | None, str, Coordinates] = identity_of(path)
+        self.options = options
+        self.block = options.block
+        self._rows: dict[str, int] = {}
+        self._root = root
+        self._begun = False
+        self._keeps = True
+        self._fields: dict[str, StoredField] = {}
+        self._held: dict[str, dict[int, EncodedFrame]] = {}  # of one block
+
+    def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
+        """Record what a run is going to write: the store cannot be finished without it by accident."""
+        self._rows.update(rows or {})
+        path = f"{self.group}/{EXPECTED}"
+        there = self._read(path)
+        known = {} if there is None else parse_expected(there, self.target.tree.where(path))
+        merged = known | {name: known.get(name, set()) | set(map(int, numbers)) for name, numbers in frames.items()}
+        if merged != known:
+            self._start()
+            self.target.put(path, format_expected(merged))
+
+    def has(self, field: str, frame: int) -> bool:
+        """Whether this process or another one has written it."""
+        layout.field_named(field)
+        return frame in self._held.get(field, {}) or self._field(field).has(frame)
+
+    def refresh(self) -> None:
+        """Forget which frames were missing."""
+        for field in self._fields.values():
+            field.refresh()
+
+    def read(self, field: str, frame: int) -> NDArray[Any] | None:
+        """Return a frame that exists, None if it does not."""
+        if frame in self._held.get(field, {}):
+            self._flush()
+        return self._field(field).read(frame)
+
+    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+        """Write one frame: it is stored with the others of its block."""
+        encoded = self._encode({frame: {field: array}})
+        if not self._keeps:
+            self._put(frame // self.block, encoded)
+            return
+        if any(other // self.block != frame // self.block for frames in self._held.values() for other in frames):
+            self._flush()
+        self._held.setdefault(field, {}).update(encoded[field])
+
+    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+        """Write the fields of several frames; those of one block together."""
+        self._flush()
+        for block in sorted({frame // self.block for frame in frames}):
+            self._put(block, self._encode({frame: frames[frame] for frame in frames if frame // self.block == block}))
+
+    def write_document(self, name: str, data: bytes) -> None:
+        """Write a text file."""
+        check_names([name], self.location)
+        self._start()
+        self.target.put(f"{self.group}/{document_node(name)}", data)
+
+    def create_document(self, name: str, data: bytes) -> bool:
+        """Write a text file unless it exists."""
+        check_names([name], self.location)
+        self._start()
+        return self.target.put(f"{self.group}/{document_node(name)}", data, create=True)
+
+    def read_document(self, name: str) -> bytes | None:
+        """Return the bytes of a text file, None if it does not exist."""
+        check_names([name], self.location)
+        return self._read(f"{self.group}/{document_node(name)}")
+
+    def remove_grid(self, grid: str) -> None:
+        """Remove the report and the frames of a grid, then its params.json."""
+        check_names([grid], self.location)
+        self._start()
+        self._flush()
+        self.target.remove(f"{self.group}/{document_node(layout.report_file(grid))}")
+        self.target.remove(f"{self.group}/grids/{grid}")
+        self.target.remove(f"{self.group}/{document_node(layout.params_file(grid))}")
+        self._fields = {name: field for name, field in self._fields.items() if not name.startswith(f"{grid}/")}
+
+    def close(self) -> None:
+        """Write the frames that are kept in memory."""
+        self._start()
+        self._flush()
+
+    def _start(self) -> None:
+        """Create the store and the sequence, with the first thing that is written."""
+        if not self._begun:
+            self._root.begin()
+            split, name, coordinates = self.identity
+            about = {"type": SEQUENCE, "version": VERSION, "path": self.path, "split": split, "name": name}
+            data = to_json(group_metadata(about | {"coordinates": coordinates}))
+            self.target.put(f"{self.group}/{METADATA}", data, create=True)
+            self._begun = True
+
+    def _field(self, field: str) -> StoredField:
+        if field not in self._fields:
+            check_names([field], self.location)
+            self._fields[field] = StoredField(self.target, f"{self.group}/{field_node(field)}", field, self.options)
+        return self._fields[field]
+
+    def _encode(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> dict[str, dict[int, EncodedFrame]]:
+        """Encode frames, in parallel in threads; new fields are created."""
+        self._start()
+        items = [(field, frame, array) for frame, fields in frames.items() for field, array in fields.items()]
+        arrays: dict[str, list[NDArray[Any]]] = {}
+        for name, frame, array in items:
+            with _naming(self.location, name, frame):
+                layout.field_named(name).check(array, "its array")
+            arrays.setdefault(name, []).append(array)
+        layouts = {
+            name: self._field(name).create(
+                partial(typical_size, layout.field_named(name), found, self._rows, self.read_document)
+            )
+            for name, found in arrays.items()
+        }
+
+        def encode(item: tuple[str, int, NDArray[Any]]) -> EncodedFrame:
+            name, frame, array = item
+            with _naming(self.location, name, frame):
+                return encode_frame(layouts[name], array)
+
+        result: dict[str, dict[int, EncodedFrame]] = {}
+        for (name, frame, _), encoded in zip(items, in_threads(encode, items), strict=True):
+            result.setdefault(name, {})[frame] = encoded
+        return result
+
+    def _put(self, block: int, encoded: Mapping[str, Mapping[int, EncodedFrame]]) -> None:
+        """Write the objects of a block, then the tables which say that they are whole, that of the field that is given last at the end."""
+        fields = {name: self._field(name) for name in encoded}
+        objects = [(name, column) for name, field in fields.items() for column in field.columns(block, encoded[name])]
+        self._each(lambda part: fields[part[0]].put_column(part[1], block, encoded[part[0]]), objects)
+        *others, last = encoded
+        self._each(lambda name: fields[name].put_table(block, encoded[name]), others)
+        fields[last].put_table(block, encoded[last])
+
+    def _each(self, function: Callable[[_T], None], items: list[_T]) -> None:
+        """Call a function with several items side by side, as it waits for an object store or for a disk."""
+        with ThreadPoolExecutor(_PUTS) as pool:
+            list(pool.map(function, items))
+
+    def _flush(self) -> None:
+        held, self._held = self._held, {}
+        if held:
+            self._put(next(iter(next(iter(held.values())))) // self.block, held)
+
+    def _read(self, path: str) -> bytes | None:
+        try:
+            return bytes(self.target.tree.read(path))
+        except MissingDataError:
+            return None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_held": {}, "_fields": {}, "_keeps": False}
+
+
+@contextmanager
+def _naming(location: str, field: str, frame: int) -> Iterator[None]:
+    """Add the store, the field and the frame to the place of an error."""
+    try:
+        yield
+    except FormatError as error:
+        raise error.within(f"{location}: field {field}, frame {frame}") from error

@@ -1,0 +1,126 @@
+"""Reading packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core specification.
+
+Any zarr v3 library reads them. Here, the shards' indices and chunks are read directly, which takes a tenth of zarr-python's time per chunk.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading
+from carlasc.storage.files import parse_json
+from carlasc.storage.folders.trees import RemoteTree, Tree
+from carlasc.storage.packed.array_source import ArraySource, ArrayStore
+from carlasc.storage.zarr.shards import METADATA, ZarrArray
+
+
+class ZarrSource(ArraySource):
+    """A packed zarr store: a folder, a URL, or a zip of either."""
+
+    def __init__(self, tree: Tree) -> None:
+        """Read the store's metadata.
+
+        Raises:
+            DependencyError: zarr's codecs are not installed.
+            FormatError: it is another zarr store, unfinished, or of another version.
+        """
+        for module in ("numcodecs", "google_crc32c"):
+            import_extra(module, "zarr")
+        super().__init__(ZarrStore(tree))
+
+
+class ZarrStore(ArrayStore):
+    """The nodes of a finished zarr store, whose metadata are all in its root."""
+
+    def __init__(self, tree: Tree) -> None:
+        self.tree = tree
+        self.location = tree.location
+        self.local = not isinstance(tree, RemoteTree)
+
+    @cached_property
+    def _root(self) -> dict[str, Any]:
+        return parse_json(bytes(self.tree.read(METADATA)), self.tree.where(METADATA))
+
+    @cached_property
+    def _sizes(self) -> dict[str, int]:
+        return self.tree.sizes() if isinstance(self.tree, RemoteTree) else {}
+
+    def forget(self) -> bool:
+        """Forget the metadata: they are read again."""
+        vars(self).pop("_root", None)
+        return True
+
+    def attributes(self, node: str) -> dict[str, Any] | None:
+        """Return a node's attributes."""
+        metadata = self._metadata(node)
+        if metadata is None:
+            return None
+        return _mapping(metadata.get("attributes", {}), f"{self.location}/{node}", "attributes")
+
+    def read_small(self, node: str) -> NDArray[Any]:
+        """Return an array of one chunk."""
+        array = self.array(node)
+        if 0 in array.shape:
+            with reading(f"{self.location}/{node}", "the shape of an array"):
+                return np.empty(array.shape, array.dtype)
+        try:
+            return array.read_chunk(0)[tuple(slice(n) for n in array.shape)]
+        except FormatError as error:
+            raise error.within(f"{self.location}/{node}") from error
+
+    def read_document(self, node: str) -> bytes:
+        """Return the bytes of a text file, which is a file of the store."""
+        try:
+            return bytes(self.tree.read(node))
+        except MissingDataError as error:
+            raise FormatError(
+                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+            ) from error
+
+    def array(self, node: str) -> ZarrArray:
+        """Return an array whose chunks can be read."""
+        metadata = self._metadata(node)
+        if metadata is None or metadata.get("node_type") != "array":
+            raise FormatError(
+                f"{self.location}/{node}",
+                expected="an array",
+                found="none" if metadata is None else "a group",
+                advice="the store is damaged",
+            )
+        return ZarrArray.from_metadata(self.tree, node, metadata)
+
+    def stored_bytes(self, node: str) -> int:
+        """Return the bytes of the files below a node; for a folder only."""
+        if isinstance(self.tree, RemoteTree):
+            prefix = f"{node}/" if node else ""
+            return sum(size for path, size in self._sizes.items() if path.startswith(prefix))
+        files = os.walk(f"{self.location}/{node}")
+        return sum((Path(folder) / name).stat().st_size for folder, _, names in files for name in names)
+
+    def _metadata(self, node: str) -> dict[str, Any] | None:
+        if not node:
+            return self._root
+        consolidated = self._root.get("consolidated_metadata")
+        if consolidated:
+            where = self.tree.where(METADATA)
+            nodes = _mapping(_mapping(consolidated, where, "consolidated_metadata").get("metadata"), where, "metadata")
+            return None if node not in nodes else _mapping(nodes[node], f"{self.location}/{node}", "metadata")
+        path = f"{node}/{METADATA}"
+        return parse_json(bytes(self.tree.read(path)), self.tree.where(path)) if self.tree.is_file(path) else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key not in ("_root", "_sizes")}
+
+
+def _mapping(value: Any, where: str, name: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise FormatError(
+            where, expected=f"an object in {name}", found=type(value).__name__, advice="the store is damaged"
+        )
+    return value

@@ -1,0 +1,155 @@
+"""Boxes around actors: the annotated ones of a frame, or the tightest ones around the points of each actor; and how they are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.boxes import Boxes
+from carlasc.core.scans import Scan
+from carlasc.errors import MissingDataError
+from carlasc.viewing import colors as palette
+from carlasc.viewing.colors import AFTER_CLASSES, Entry
+from carlasc.viewing.finding import list_fields
+from carlasc.viewing.remapping import RemappedSequence
+from carlasc.viewing.rendering.drawings import Drawing
+from carlasc.viewing.rendering.meshes import QuadMesh, box, join
+
+BOX = Entry("box, with a bar to its front", palette.ARROW, AFTER_CLASSES + 10)
+"""The entry of a legend for boxes."""
+
+_BAR_M = 0.08  # width of the edges of a box
+_MIN_SPEED_M_S = 0.5  # slower actors may move by the noise of their points alone
+_LEAST_SIZE_M = 0.1
+_FEWEST_POINTS = 5
+_CLOSE_M = 0.05  # nearer points count as being on the side
+_ANGLES = np.deg2rad(np.arange(0, 90, 2.0))
+
+_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1]
+
+
+def check_boxes(data: RemappedSequence) -> None:
+    """Check that a sequence has boxes, or actors to put boxes around.
+
+    Raises:
+        MissingDataError: it has neither.
+    """
+    if not data.has("boxes") and not data.has("points", "instances"):
+        raise MissingDataError(
+            data.sequence.location,
+            expected="the field boxes, or points with instances",
+            found=list_fields(data.sequence),
+            advice="leave out `boxes`",
+        )
+
+
+def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
+    """Return the boxes of a frame: those of the field `boxes`, or else the tightest ones around the points of each actor.
+
+    Raises:
+        FormatError: the boxes or the scan do not have the format.
+    """
+    annotated = data.read_boxes(frame)
+    if annotated is not None:
+        return annotated
+    numbered = not data.has("boxes") and frame in data.frames_with("points", "instances")
+    return tight_boxes(data.read_scan(frame) if numbered else Scan(np.empty((0, 3), np.float32)))
+
+
+def tight_boxes(scan: Scan) -> Boxes:
+    """Return the tightest upright box around the points of each numbered actor that has at least five.
+
+    A box points to where its actor moves. One that does not move points along the longer side of the rectangle to whose sides its
+    points are closest, to either of its two ends.
+
+    Args:
+        scan: with instances; with flow, boxes of moving actors have the right direction.
+    """
+    rows: list[tuple[int, int, float, NDArray[np.float64], NDArray[np.float64]]] = []
+    instances = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances
+    for actor in np.unique(instances[instances > 0]).tolist():
+        members = np.flatnonzero(instances == actor)
+        if len(members) < _FEWEST_POINTS:
+            continue
+        points = scan.points[members].astype(np.float64)
+        velocity = np.zeros(3) if scan.flow is None else scan.flow[members].astype(np.float64).mean(axis=0)
+        yaw = _direction(points[:, :2], velocity)
+        turned = _turned(points, yaw)
+        lower, upper = turned.min(axis=0), turned.max(axis=0)
+        label = 0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax())
+        center = _turned(((lower + upper) / 2)[None], -yaw)[0]
+        rows.append((actor, label, yaw, center, np.maximum(upper - lower, _LEAST_SIZE_M)))
+    yaws = np.array([row[2] for row in rows])
+    zeros = np.zeros(len(rows))
+    return Boxes(
+        np.array([row[0] for row in rows], np.uint32),
+        np.array([row[1] for row in rows], np.uint32),
+        np.array([row[3] for row in rows]).reshape(-1, 3),
+        np.column_stack([np.cos(yaws / 2), zeros, zeros, np.sin(yaws / 2)]).reshape(-1, 4),
+        np.array([row[4] for row in rows]).reshape(-1, 3),
+        np.zeros(len(rows), np.bool_),
+    )
+
+
+def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
+    """Return a drawing with the edges of boxes, and a bar on the floor of each from its middle to its front."""
+    if not len(boxes.tracks):
+        return drawing
+    mesh = box_edges(boxes)
+    return replace(
+        drawing,
+        mesh=mesh if drawing.mesh is None else join([drawing.mesh, mesh]),
+        legend=[*drawing.legend, BOX],
+    )
+
+
+def box_edges(boxes: Boxes) -> QuadMesh:
+    """Return the edges of boxes as bars."""
+    bars = []
+    for sensor_T_box, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True):
+        corners = _CORNERS * size
+        ends = [(corners[a], corners[b]) for a, b in _EDGES]
+        floor = -size[2] / 2
+        ends.append((np.array([0.0, 0.0, floor]), np.array([size[0] / 2 + 0.8, 0.0, floor])))
+        for start, end in ends:
+            lower, upper = np.minimum(start, end) - _BAR_M / 2, np.maximum(start, end) + _BAR_M / 2
+            bar = box(lower, upper, palette.ARROW)
+            rotation = sensor_T_box[:3, :3]
+            bars.append(
+                replace(
+                    bar,
+                    corners=(bar.corners @ rotation.T + sensor_T_box[:3, 3]).astype(np.float32),
+                    normals=(bar.normals @ rotation.T).astype(np.float32),
+                    edges=np.zeros_like(bar.edges),
+                )
+            )
+    return join(bars)
+
+
+def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
+    """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle to whose sides its points are closest.
+
+    A LiDAR sees one or two sides of a vehicle. The smallest rectangle around them is often tilted; the closest one is not (Zhang, Xu, Dong
+    and Dolan, "Efficient L-shape fitting for vehicle detection using laser scanners", 2017).
+    """
+    if np.linalg.norm(velocity[:2]) > _MIN_SPEED_M_S:
+        return float(np.arctan2(velocity[1], velocity[0]))
+    best, longest, most = 0.0, True, -1.0
+    for angle in _ANGLES:
+        cos, sin = np.cos(angle), np.sin(angle)
+        rectangle = points @ np.array([[cos, -sin], [sin, cos]])
+        lower, upper = rectangle.min(axis=0), rectangle.max(axis=0)
+        to_side = np.minimum(rectangle - lower, upper - rectangle).min(axis=1)
+        closeness = float((1 / np.maximum(to_side, _CLOSE_M)).sum())
+        if closeness > most:
+            best, longest, most = float(angle), bool(upper[0] - lower[0] >= upper[1] - lower[1]), closeness
+    return best if longest else best + float(np.pi / 2)
+
+
+def _turned(points: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
+    """Return points in a frame whose x axis has a yaw in the frame of the points."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return points @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,253 @@
+"""`render`: pictures and films of a scene, written to a file."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError
+from carlasc.running.options import Run
+from carlasc.running.processes import run_all
+from carlasc.storage import Sequence as StoredSequence
+from carlasc.storage import Source
+from carlasc.viewing.colors import merge_legends
+from carlasc.viewing.finding import SceneSource
+from carlasc.viewing.rendering.actor_boxes import check_boxes
+from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
+from carlasc.viewing.rendering.drawings import GridColor, check_color
+from carlasc.viewing.rendering.encoding import FILMS, STILLS, encodable_size, is_film, write_pictures
+from carlasc.viewing.rendering.pages import draw_legend
+from carlasc.viewing.rendering.panels import (
+    Cell,
+    FrameRenderer,
+    PictureRenderer,
+    caption_panels,
+    columns_of,
+    plan_cells,
+)
+from carlasc.viewing.rendering.styles import StyleOptions
+from carlasc.viewing.scene import Scene, SceneReader, as_scene
+from carlasc.viewing.targets import check_target
+
+ORBIT_PICTURES = 120  # of an orbit around a single frame
+_DRIVE_FPS, _ORBIT_FPS = 10.0, 20.0  # frames are 0.1 s apart, so that a film runs at the speed of the drive
+
+_ONE = (Scene, str, os.PathLike, Source, StoredSequence)  # what is one source; anything else is a list of them
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """What was drawn.
+
+    Attributes:
+        out: the file.
+        sequence: path of the sequence; of several, separated by commas.
+        what: what is shown, side by side.
+        frames: the frames that are shown.
+        pictures: number of pictures in the file.
+        size: (width, height) pixels.
+        classes: name of the class table.
+        elapsed_s: how long it took, seconds.
+        notes: what was chosen where the scene left a choice, and which parts of a picture are empty.
+        legend: the file of the legend if it is apart, or None.
+    """
+
+    out: Path
+    sequence: str
+    what: tuple[str, ...]
+    frames: tuple[int, ...]
+    pictures: int
+    size: tuple[int, int]
+    classes: str
+    elapsed_s: float
+    notes: tuple[str, ...]
+    legend: Path | None = None
+
+
+def render(
+    source: Scene | SceneSource | Sequence[Scene | SceneSource],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    what: str | None = None,
+    color: GridColor = "class",
+    boxes: bool = False,
+    camera: CameraOptions = CameraOptions(),  # noqa: B008 (frozen)
+    style: StyleOptions = StyleOptions(),  # noqa: B008 (frozen)
+    fps: float | None = None,
+    overwrite: bool = False,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
+) -> RenderResult:
+    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). No screen and no GPU are needed.
+
+    A list of scenes is drawn as panels of one size, from the same camera, with captions: a PNG has a panel for each frame of each
+    scene, a film one for each scene.
+
+    Args:
+        source: a `Scene`; or anything that a scene's `source` may be; or a list of these.
+        out: file name that ends in .png, .gif, .mp4 or .webp; None names the file after the sequence, in the current folder.
+            A scene without `frames` gives a picture of the first frame, or a film of all frames.
+        what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by side. None draws the grid,
+            with a ground truth also the truth and the errors; or the scan if there is no grid.
+        color: what the colours of the grid mean: "class"; or "confidence" (the probability that a voxel is occupied), "views" (the
+            scans that saw it), "votes", or "inferred" (where the knowledge comes from): see `docs/format.md#evidence`.
+        boxes: whether boxes around actors are drawn: those of the field `boxes`, or else the tightest ones around the points of each
+            actor of `instances`.
+        camera: from where the scene is seen. By default the camera follows the ego vehicle, behind and above it, because grids and
+            scans are in the frame of its sensor.
+        style: size, legend, captions and type; for a screen or for a paper.
+        fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
+        overwrite: whether an existing file is replaced.
+        run: how the pictures are spread over processes, and who is told of the progress.
+
+    Returns:
+        What was drawn, and the file that it is in.
+
+    Raises:
+        ArgumentError: an argument has no meaning, or arguments contradict each other.
+        MissingDataError: a sequence, grid, field or frame does not exist.
+        FormatError: the data do not have the format.
+        ConflictError: `out` exists.
+        StorageError: `out` cannot be written; nothing is left behind.
+        DependencyError: a package is missing; the message names the extra.
+    """
+    started = time.monotonic()
+    together = not isinstance(source, _ONE)
+    scenes = [as_scene(source)] if isinstance(source, _ONE) else [as_scene(one) for one in source]
+    _check_together(scenes, style, together=together)
+    readers, film = _open_scenes(scenes, what, out, orbit=camera.orbit, together=together)
+    target = _name_after(readers[0], film) if out is None else Path(out)
+    check_target(target, STILLS + FILMS, overwrite)
+    _check_kind(target, None if together else readers[0], style, film=film, orbit=camera.orbit)
+    legend_file = style.sheet.legend_file(target) if style.legend and style.sheet.legend_apart else None
+    if legend_file is not None:
+        check_target(legend_file, STILLS, overwrite)
+    for reader in readers:
+        check_color(color, reader)
+        if boxes:
+            check_boxes(reader.data)
+
+    renderers = [FrameRenderer.of(reader, camera, ego=style.ego, color=color, boxes=boxes) for reader in readers]
+    pictures = plan_cells(renderers, film)
+    shown = [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells] if style.legend else []
+    entries = merge_legends(shown)
+    sheet = replace(style.sheet, size=encodable_size(target, style.sheet.size))
+    drawer = PictureRenderer(
+        sheet,
+        [] if sheet.legend_apart else entries,
+        caption_panels(pictures[0], style.captions, film) if together else (),
+        style.columns or (columns_of(pictures[0]) if together else None),
+    )
+    shots = _plan_shots(drawer, pictures, camera)
+    if fps is None:
+        fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
+    with closing(run_all(_take, shots, run)) as drawn:
+        write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
+    if legend_file is not None and entries and sheet.font_size is not None:
+        write_pictures(legend_file, [draw_legend(entries, sheet.font_size, sheet.size[0])], fps, sheet.dpi)
+    return RenderResult(
+        target,
+        ", ".join(dict.fromkeys(reader.path for reader in readers)),
+        readers[0].contents,
+        tuple(sorted({cell.frame for cells in pictures for cell in cells})),
+        len(shots),
+        sheet.size,
+        readers[0].table.name,
+        time.monotonic() - started,
+        tuple(_notes_of(readers, pictures)),
+        legend_file if entries else None,
+    )
+
+
+def _check_together(scenes: Sequence[Scene], style: StyleOptions, *, together: bool) -> None:
+    """Raise ArgumentError for a style that has no meaning with this number of scenes."""
+    if not scenes:
+        raise ArgumentError("source", expected="at least one source", found="none")
+    if not together and (style.captions or style.columns is not None):
+        name = "captions" if style.captions else "columns"
+        raise ArgumentError(name, expected="several sources or frames in one picture", found="one")
+
+
+def _open_scenes(
+    scenes: Sequence[Scene], what: str | None, out: str | os.PathLike[str] | None, *, orbit: bool, together: bool
+) -> tuple[list[SceneReader], bool]:
+    """Return readers of the frames that are drawn, and whether a film is made of them."""
+    readers = [scene.open(what) for scene in scenes]
+    several = any(scene.frames is not None and len(r.frames) > 1 for scene, r in zip(scenes, readers, strict=True))
+    film = is_film(Path(out)) if out is not None else orbit or (several and not together)
+    if orbit or not film:
+        readers = [
+            replace(reader, frames=reader.frames[:1]) if scene.frames is None else reader
+            for scene, reader in zip(scenes, readers, strict=True)
+        ]
+    return readers, film
+
+
+def _check_kind(target: Path, alone: SceneReader | None, style: StyleOptions, *, film: bool, orbit: bool) -> None:
+    """Raise ArgumentError if a still picture cannot hold what is asked for, or a film has the style of paper.
+
+    `alone` is the reader if each of its frames is a picture of its own, or None.
+    """
+    advice = "name a .gif, .mp4 or .webp"
+    if not film and alone is not None and len(alone.frames) > 1:
+        found = f"{len(alone.frames)} frames for {target.name}"
+        raise ArgumentError("out", expected="a single frame for a PNG", found=found, advice=advice)
+    if orbit and not film:
+        raise ArgumentError("orbit", expected="a film", found=target.name, advice=advice)
+    if style.name == "paper" and film:
+        raise ArgumentError("style", expected="screen for a film", found=style.name, advice="name a .png")
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """One picture: what is drawn, and from where."""
+
+    drawer: PictureRenderer
+    cells: list[Cell]
+    viewpoint: Viewpoint
+
+
+def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions) -> list[_Shot]:
+    """Return which frames are seen from where in each picture."""
+    if not camera.orbit:
+        return [_Shot(drawer, cells, camera.viewpoint) for cells in pictures]
+    if len(pictures) == 1:
+        pictures = pictures * ORBIT_PICTURES
+    angles = 2 * np.pi * np.arange(len(pictures)) / len(pictures)
+    return [_Shot(drawer, cells, camera.viewpoint.turned(float(a))) for cells, a in zip(pictures, angles, strict=True)]
+
+
+def _take(shot: _Shot) -> NDArray[np.uint8]:
+    return shot.drawer.render(shot.cells, shot.viewpoint)
+
+
+def _reported(
+    pictures: Iterator[NDArray[np.uint8]], total: int, progress: Callable[[int, int], None] | None
+) -> Iterator[NDArray[np.uint8]]:
+    for done, picture in enumerate(pictures, 1):
+        yield picture
+        if progress is not None:
+            progress(done, total)
+
+
+def _name_after(reader: SceneReader, film: bool) -> Path:
+    """Return a file name made of the sequence, of what is shown and of the frames."""
+    first, last = reader.frames[0], reader.frames[-1]
+    what = "" if reader.contents == ("grid",) else f"_{'_'.join(reader.contents)}"
+    numbers = f"{first:06d}" if first == last else f"{first:06d}-{last:06d}"
+    return Path(f"{reader.data.sequence.name or 'carlasc'}{what}_{numbers}.{'mp4' if film else 'png'}")
+
+
+def _notes_of(readers: Sequence[SceneReader], pictures: list[list[Cell]]) -> dict[str, None]:
+    """Return what readers chose and, for a single picture, which parts are empty; each note once, in order."""
+    notes = [note for reader in readers for note in reader.notes]
+    for cell in pictures[0] if len(pictures) == 1 else []:
+        drawings = ((content, cell.renderer.draw(content, cell.frame)) for content in cell.renderer.reader.contents)
+        notes += [f"{content}: {drawing.note}" for content, drawing in drawings if drawing.note]
+    return dict.fromkeys(notes)

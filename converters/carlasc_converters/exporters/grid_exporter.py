@@ -1,0 +1,193 @@
+"""What exporters of voxel grids share: the grid that is taken, its classes, its axes and its voxels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc import storage
+from carlasc.converting import FrameExporter, TargetFrame, is_same, resample_to, resampling_notes
+from carlasc.core.axes import mirror_points
+from carlasc.core.benchmarks import IGNORED
+from carlasc.core.grids import GridSpec
+from carlasc.errors import ArgumentError, MissingDataError
+from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
+
+GridName = Annotated[
+    str | None,
+    "Grid that is exported. Default: the one with exactly the voxels of the other data set, else the one of the smallest voxels.",
+]
+Predictions = Annotated[bool, "The grids are the output of a network, without counts: all of their voxels are known."]
+_CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
+
+
+class GridExporter(FrameExporter):
+    """Writes voxel grids of a given geometry, in classes of a given table.
+
+    Attributes:
+        target: geometry of the grids that are written, in the frame that `frame_of` returns.
+        maps: name of a class table -> id -> class that is written, or IGNORED for classes whose voxels are unknown.
+        kind: the attribute of a `Kind` that holds its class.
+        free: the class of free voxels.
+        slug: a name for the exact grid in the layout.
+    """
+
+    target: ClassVar[GridSpec]
+    maps: ClassVar[Mapping[str, Mapping[int, int]]]
+    kind: ClassVar[Literal["occ3d", "raw"]] = "occ3d"
+    free: ClassVar[int]
+    slug: ClassVar[str]
+
+    def __init__(self, grid: GridName = None, *, predictions: Predictions = False) -> None:
+        self.grid, self.predictions = grid, predictions
+
+    def frame_of(self, sequence: storage.Sequence) -> TargetFrame:
+        """Return the frame of the grids that are written."""
+        return TargetFrame()
+
+    def check(self, sequence: storage.Sequence) -> list[str]:
+        """Return what resampling loses; raise if there is no such grid, or no map of its classes."""
+        name, axes, frame = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
+        mapping_of(self.maps, self.kind, sequence.classes_of(name), f"{sequence.location}/{name}")
+        if not self.predictions and f"{name}/counts" not in sequence.fields():
+            raise MissingDataError(
+                f"{sequence.location}/{name}",
+                expected="counts, which say which voxels are known",
+                found="none",
+                advice="if the grids are predictions, give `predictions=True`",
+            )
+        notes = resampling_notes(frame.spec_in(sequence.grids[name], axes), self.target, name)
+        if notes and sequence.metadata.has_rays:  # without rays, scans give no grids
+            exact = frame.spec_from(self.target, axes)
+            size = ",".join(map(str, exact.size))
+            bounds = ",".join(f"{value:g}" for pair in zip(exact.lower, exact.upper, strict=True) for value in pair)
+            notes.append(
+                f"`carlasc regrid SOURCE --observe scans --size {size} --bounds {bounds} --name {self.slug}` makes the exact grid"
+            )
+        return notes
+
+    def frames(self, sequence: storage.Sequence) -> list[int]:
+        """Return the frames that have the grid."""
+        return sequence.frames(f"{self.grid_of(sequence)}/labels").tolist()
+
+    def grid_of(self, sequence: storage.Sequence) -> str:
+        """Return the name of the grid to export.
+
+        Raises:
+            MissingDataError: the sequence has no Cartesian grid, or none of that name.
+            ArgumentError: the grid of that name is not Cartesian.
+        """
+        grids = {name: spec for name, spec in sequence.grids.items() if f"{name}/labels" in sequence.fields()}
+        return choose_grid(sequence, grids, self.grid, (self.target, self.frame_of(sequence)))
+
+    def read(self, sequence: storage.Sequence, frame: int) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+        """Return a frame's grid in the target's voxels and classes: (X, Y, Z) labels, and which voxels are known.
+
+        Raises:
+            CarlascError: the grid cannot be read, or has an id that is not in its class table.
+        """
+        codes, known = self.read_codes(sequence, frame)
+        classes = np.arange(-1, int(codes.max(initial=0))).astype(codes.dtype)
+        classes[0] = self.free
+        return classes[codes], known
+
+    def read_codes(
+        self, sequence: storage.Sequence, frame: int
+    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+        """Return what `read` does, with 0 for voxels that are free or unknown, and class + 1 for others."""
+        name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
+        grid, table = sequence.grid(name, frame), sequence.classes_of(name)
+        where = f"{sequence.location}: {name} of frame {frame}"
+        lookup = lookup_of(mapping_of(self.maps, self.kind, table, where))
+        classes = classes_of(grid.labels, lookup, table, where)
+        known = np.ones(grid.spec.size, np.bool_) if self.predictions else grid.known & (classes != IGNORED)
+        codes: NDArray[np.unsignedinteger] = np.where(classes == self.free, 0, classes + 1).astype(
+            np.uint16 if lookup.max() > 254 else np.uint8
+        )
+        return resample_to(
+            place.turn(codes, axes), place.turn(known, axes), place.spec_in(grid.spec, axes), self.target
+        )
+
+
+def choose_grid(
+    sequence: storage.Sequence,
+    grids: Mapping[str, GridSpec],
+    wanted: str | None,
+    target: tuple[GridSpec, TargetFrame] | None = None,
+) -> str:
+    """Return the name of the grid to export.
+
+    Args:
+        sequence: the sequence.
+        grids: geometry of its grids, by name.
+        wanted: the grid that was asked for; None takes the one that has the voxels of the target, else that of the smallest voxels.
+        target: geometry that is written, and its frame.
+
+    Raises:
+        MissingDataError: the sequence has no Cartesian grid, or none of that name.
+        ArgumentError: the grid of that name is not Cartesian.
+    """
+    if wanted is not None:
+        if wanted not in grids:
+            found = ", ".join(grids) or "none"
+            raise MissingDataError(sequence.location, expected=f"the grid {wanted}", found=found)
+        if grids[wanted].coordinates != "cartesian":
+            found = f"{sequence.location}/{wanted}, which is cylindrical"
+            raise ArgumentError("grid", expected="a Cartesian grid", found=found)
+        return wanted
+    flat = {name: spec for name, spec in grids.items() if spec.coordinates == "cartesian"}
+    if not flat:
+        found = "only cylindrical ones" if grids else "none"
+        raise MissingDataError(
+            sequence.location, expected="a Cartesian grid", found=found, advice="make one: `carlasc regrid`"
+        )
+    if target is not None:
+        spec, frame = target
+        for name, candidate in flat.items():
+            if is_same(frame.spec_in(candidate, sequence.metadata.axes), spec):
+                return name
+    return min(flat, key=lambda name: (float(np.prod(flat[name].voxel_size)), name))
+
+
+def number_folders(names: Sequence[str], prefix: str, digits: int) -> dict[str, str]:
+    """Return a number of so many digits for each name: that of names which end in the prefix and a number, and the next free one of others."""
+    numbers = {name: match[1] for name in names if (match := re.search(rf"{prefix}(\d{{{digits}}})$", name))}
+    free = (f"{number:0{digits}d}" for number in range(10_000) if f"{number:0{digits}d}" not in numbers.values())
+    return {name: numbers.get(name) or next(free) for name in names}
+
+
+def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[float, bool]:
+    """Return the height of the sensor above the ground in metres, and whether it was assumed.
+
+    It is the one that was given, that of the first sensor in carlasc.json, or that of CarlaSC. Sequences without carlasc.json are CarlaSC's.
+    """
+    if given is not None:
+        return given, False
+    sensors = sequence.metadata.extra.get("sensors")
+    first = sensors[0] if isinstance(sensors, list) and sensors else None
+    height = first.get("height_m") if isinstance(first, dict) else None
+    if isinstance(height, int | float) and not isinstance(height, bool):
+        return float(height), False
+    return _CARLASC_HEIGHT_M, storage.layout.METADATA in sequence.documents()
+
+
+def read_points(sequence: storage.Sequence, frame: int) -> NDArray[np.float32]:
+    """Return (N, 4) points and remission of a frame, right-handed; none if the frame has no scan."""
+    if not np.isin(frame, sequence.frames("points")):
+        return np.empty((0, 4), np.float32)
+    points = np.asarray(sequence.read("points", frame), np.float32)
+    return points if sequence.metadata.axes == "right" else mirror_points(points)
+
+
+def scan_occupancy(sequence: storage.Sequence, points: NDArray[np.float32], spec: GridSpec) -> NDArray[np.bool_]:
+    """Return the voxels that hold a point of a scan: (X, Y, Z) of a grid in right-handed axes, as the points."""
+    occupancy = np.zeros(spec.num_voxels, np.bool_)
+    distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
+    low, high = sequence.metadata.min_range_m or 0.0, sequence.metadata.max_range_m or np.inf
+    index = spec.flat_index(points[(distance >= low) & (distance <= high), :3])
+    occupancy[index[index >= 0]] = True
+    return occupancy.reshape(spec.size)

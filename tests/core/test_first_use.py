@@ -1,0 +1,104 @@
+"""What the first use compiles: formatting the messages of NumPy's errors takes longer than our loops."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from carlasc.core import first_use
+
+PROGRAM = """
+import numpy as np
+from numba.core import event
+
+class Compiled(event.Listener):
+    def on_start(self, found):
+        print(found.data["dispatcher"].py_func.__module__, found.data["dispatcher"].py_func.__name__)
+    def on_end(self, found):
+        pass
+
+event.register("numba:compile", Compiled())
+
+from carlasc.metrics.counting import count_arrays
+from carlasc.viewing.rendering.cameras import Camera
+from carlasc.viewing.rendering.meshes import box
+from carlasc.viewing.rendering.rasterizing import hits, visible_triangles
+
+labels = np.zeros(9, np.uint8)
+count_arrays(labels, labels, None, 3)
+mesh, camera = box((-1, -1, 2), (1, 1, 3), (1, 2, 3)), Camera(np.zeros(3), np.eye(3), 1.0)
+seen = visible_triangles(mesh, camera, 8, 8)
+hits(mesh.corners, seen.reshape(-1), *camera.rays(8, 8, slice(0, 8)))
+"""
+
+
+def test_loops_compile_without_the_messages_of_numpy(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    ran = subprocess.run(
+        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    compiled = [line.split() for line in ran.stdout.splitlines()]
+    assert {"_count_pairs", "_fill", "hits", "_rays"} <= {name for _, name in compiled}
+    assert not [name for module, name in compiled if "unicode" in module]
+
+
+NOTED = """
+import sys
+from carlasc.core.first_use import note_compiling
+note_compiling(lambda: print("told"), after_s=float(sys.argv[1]))
+assert "numba" not in sys.modules
+import numpy as np
+from carlasc.metrics.counting import count_arrays
+labels = np.zeros(9, np.uint8)
+count_arrays(labels, labels, None, 3)
+"""
+
+
+def told(cache, after_s):
+    """Return how often a process that counts pairs of labels is told that it compiles."""
+    ran = subprocess.run(
+        [sys.executable, "-c", NOTED, str(after_s)],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return ran.stdout.split().count("told")
+
+
+def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_done_before(tmp_path):
+    assert told(tmp_path / "long", 0.01) == 1
+    assert told(tmp_path / "long", 0.01) == 0
+    assert told(tmp_path / "short", 60) == 0
+
+
+def test_the_time_of_several_loops_is_added_up(monkeypatch):
+    times, notes, timers = iter([0.0, 0.7, 5.0, 5.2]), [], []
+
+    class Timer:
+        def __init__(self, wait_s, call):
+            self.wait_s, self.call, self.daemon, self.cancelled = wait_s, call, False, False
+            timers.append(self)
+
+        def start(self):
+            pass
+
+        def cancel(self):
+            self.cancelled = True
+
+    monkeypatch.setattr(first_use, "Timer", Timer)
+    monkeypatch.setattr(first_use.time, "perf_counter", lambda: next(times))
+    note = first_use.CompilingNote(lambda: notes.append("told"), 1.0)
+    note.start()
+    note.start()  # a loop that the first one calls
+    note.end()
+    note.end()
+    assert timers[0].cancelled and not notes
+    note.start()
+    assert timers[1].wait_s == pytest.approx(0.3)
+    timers[1].call()
+    note.end()
+    note.start()
+    assert notes == ["told"] and len(timers) == 2

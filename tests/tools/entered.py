@@ -1,0 +1,125 @@
+"""`python -m entered [CASE ...]`: how many files and functions of `carlasc` make one frame, and how deeply they call each other.
+
+What is loaded or compiled once is left out: each case runs once before it is counted. A call counts if its code is in a file of the package,
+that of a compiled loop too where Numba tells of it. Comprehensions, generator expressions and lambdas count like functions; from Python 3.12
+on, most comprehensions are no calls, so a version before it counts more. A generator is as deep as the call that resumes it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import carlasc
+from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, regrid
+from carlasc.captures import Lidar
+
+PACKAGE = str(Path(carlasc.__file__).parent) + os.sep
+SPEC = GridSpec.published().with_size((32, 32, 8))
+LIDAR = Lidar(channels=16, points=4000)
+FRAMES = 6
+ONE = Run(workers=1)
+
+
+@dataclass
+class Entered:
+    """What was entered while a function ran.
+
+    Attributes:
+        functions: the functions, as `file:name`, with the paths of files in the package.
+        deepest: the longest chain of them that were in progress at one time, the caller first.
+    """
+
+    functions: set[str] = field(default_factory=set)
+    deepest: tuple[str, ...] = ()
+
+    @property
+    def depth(self) -> int:
+        """Greatest number of functions in progress at one time."""
+        return len(self.deepest)
+
+    @property
+    def files(self) -> set[str]:
+        """The files of these functions."""
+        return {function.partition(":")[0] for function in self.functions}
+
+    def __str__(self) -> str:
+        return f"{len(self.files)} files, {len(self.functions)} functions, {self.depth} deep"
+
+
+def entered(function: Callable[[], object]) -> Entered:
+    """Run a function, and return what of the package it entered in this thread."""
+    found, stack = Entered(), list[str]()
+
+    def profile(frame: FrameType, event: str, _: Any) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(PACKAGE):
+            stack.append(f"{code.co_filename.removeprefix(PACKAGE)}:{code.co_qualname}")
+            found.functions.add(stack[-1])
+            if len(stack) > found.depth:
+                found.deepest = tuple(stack)
+        elif event == "return" and code.co_filename.startswith(PACKAGE):
+            stack.pop()
+
+    before = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        function()
+    finally:
+        sys.setprofile(before)
+    return found
+
+
+def cases(folder: Path) -> dict[str, Callable[[], object]]:
+    """Write small simulated data into a folder, and return what is counted, by name. Each call does the work anew.
+
+    One frame of a capture and of scans is made, each with its tracks, its report and all other files of a run.
+    """
+    carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, run=ONE)
+    regrid(folder / "capture", SPEC, folder / "grids", run=ONE)
+    finer = GridSpec.published().with_size((64, 64, 16))
+    regrid(folder / "capture", finer, folder / "finer", run=ONE)
+    middle, observe = FRAMES // 2, FromScans()
+    dataset = Dataset(folder / "grids", grid="evaluation_32x32x8")
+
+    def scans() -> object:
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            return regrid(folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), run=ONE)
+
+    def capture() -> object:
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            return regrid(folder / "capture", SPEC, out, observe=FromCapture(), frames=(middle, middle + 1), run=ONE)
+
+    return {
+        "regrid from scans": scans,
+        "regrid of a capture": capture,
+        "Dataset[1]": lambda: dataset[1],
+        "evaluate": lambda: carlasc.evaluate(folder / "grids", folder / "grids", run=ONE),
+    }
+
+
+def count_case(case: Callable[[], object]) -> Entered:
+    """Return what a case enters the second time that it runs."""
+    case()
+    return entered(case)
+
+
+def main() -> None:
+    """Print what each case enters; of the cases that are named, the functions and the deepest chain too."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = {name: count_case(case) for name, case in cases(Path(folder)).items()}
+    for name, own in found.items():
+        print(f"{name}: {own}")
+        if name in sys.argv[1:]:
+            print(*sorted(own.functions), sep="\n")
+            print(*(f"{'  ' * level}{function}" for level, function in enumerate(own.deepest)), sep="\n")
+
+
+if __name__ == "__main__":
+    main()
