@@ -208,8 +208,6 @@ class GridEvidence:
             labels: (N,) class ids; points with id 0 are unlabelled and left out. None compares with any class but free.
             grid: the grid of this frame, with geometry `spec`.
         """
-        from carlasc.inspection.agreement import KNOWN, OCCUPIED, RIGHT, Voxels
-
         if labels is None:  # a voxel of any class but free is right
             labels, chosen, right = np.zeros(len(points), np.uint8), np.arange(len(points)), OCCUPIED
         else:
