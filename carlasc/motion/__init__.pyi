@@ -9,8 +9,6 @@ from .evidence import Sighting as Sighting
 from .evidence import find_evidence as find_evidence
 from .ground import ground_height as ground_height
 from .ground import ground_points as ground_points
-from .movers import Movers as Movers
-from .movers import find_movers as find_movers
 from .movers import follow_movers as follow_movers
 from .options import MotionOptions as MotionOptions
 from .options import MotionSource as MotionSource
@@ -28,5 +26,4 @@ from .tracks import BODY_MARGIN_M as BODY_MARGIN_M
 from .tracks import LONGEST_M as LONGEST_M
 from .tracks import Track as Track
 from .tracks import complete_bodies as complete_bodies
-from .tracks import link_segments as link_segments
 from .tracks import make_track as make_track

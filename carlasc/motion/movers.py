@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import thin
-from carlasc.motion.evidence import FreeSpaceEvidence, Sighting, find_evidence
+from carlasc.motion.evidence import FreeSpaceEvidence
 from carlasc.motion.paths import estimate_path, headings_of, is_standing, nearest_points
 from carlasc.motion.segments import Segment
 
@@ -36,56 +36,6 @@ class Mover:
 
     segments: tuple[Segment, ...]
     rigid: bool
-
-
-@dataclass(frozen=True)
-class Movers:
-    """What moved in a drive.
-
-    Attributes:
-        moved: (M,) int64 indices of the points of each frame that belong to something that moved, tracked or not. They must be left out
-            of other frames.
-        tracked: the movers whose sightings overlay better along an estimated path than standing.
-    """
-
-    moved: Mapping[int, NDArray[np.int64]]
-    tracked: tuple[Mover, ...]
-
-    @property
-    def segments(self) -> list[Segment]:
-        """The segments of all tracked movers, for `link_segments`."""
-        return [segment for mover in self.tracked for segment in mover.segments]
-
-
-def find_movers(
-    scans: Iterable[Sighting],
-    *,
-    movable: Collection[int] = (),
-    deformable: Collection[int] = (),
-    first_instance: int = 1,
-    default_label: int = 0,
-) -> Movers:
-    """Find what moved in the scans of a drive from the free space that other scans saw, and follow it over time.
-
-    Scans are read one by one, and only those of some seconds are held. A block of a drive gives the same evidence as the whole drive, if
-    the scans of `HORIZON_S` before and after it are given too.
-
-    Args:
-        scans: the scans in order of time, in one world frame whose z is up.
-        movable: classes of objects that can move, if the scans have labels.
-        deformable: classes of objects that change their shape as they move. Without labels, the size tells.
-        first_instance: number of the first mover; others follow.
-        default_label: class of movers without labels.
-
-    Returns:
-        The points that moved, and the movers that earned a track.
-    """
-    moved: dict[int, NDArray[np.int64]] = {}
-    evidence = find_evidence(scans, movable=movable)
-    tracked = follow_movers(
-        evidence, moved, deformable=deformable, first_instance=first_instance, default_label=default_label
-    )
-    return Movers(moved, tuple(tracked))
 
 
 def follow_movers(

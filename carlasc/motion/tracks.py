@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -15,7 +15,7 @@ from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, r
 from carlasc.errors import reading
 from carlasc.motion.bodies import Extent, Sizes, measure
 from carlasc.motion.paths import estimate_path, headings_of, is_standing, resample
-from carlasc.motion.segments import MIN_SPEED_M_S, Chain, Linker, Segment, Standing
+from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
@@ -94,35 +94,6 @@ class Track:
         return bool(
             self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M
         )
-
-
-def link_segments(
-    segments: Iterable[Segment],
-    times: Mapping[int, float],
-    standing: Mapping[int, Standing] | None = None,
-    *,
-    deformable: Collection[int] = (),
-) -> list[Track]:
-    """Link the segments of several scans into tracks.
-
-    Args:
-        segments: the segments of all scans, in any order.
-        times: seconds by frame, for every frame with a segment.
-        standing: the standing points of each scan, in which an actor that stops, for example at a crossing, is found until it continues.
-        deformable: classes whose actors change their shape; without flow, the centre of their points is followed.
-
-    Returns:
-        Tracks in order of their first segment, with whole bodies.
-    """
-    by_frame: dict[int, list[Segment]] = {}
-    for segment in segments:
-        by_frame.setdefault(segment.frame, []).append(segment)
-    linker = Linker()
-    chains: list[Chain] = []
-    for frame in sorted(by_frame.keys() | (standing or {}).keys()):
-        chains += linker.add(frame, times[frame], by_frame.get(frame, []), (standing or {}).get(frame))
-    chains += linker.finish()
-    return complete_bodies([make_track(chain, times, deformable=deformable) for chain in chains])
 
 
 def make_track(

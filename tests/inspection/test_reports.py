@@ -15,8 +15,8 @@ from carlasc import GridSpec, Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.groundtruth import FromScans, regrid
 from carlasc.inspection import report, validate, write_report_page
-from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.reports import ReportResult
+from carlasc.inspection.validation import Freshness
 from carlasc.storage import FolderSink, layout
 
 FRAMES = 7
@@ -38,7 +38,7 @@ def copied(made, tmp_path):
 
 
 def test_the_report_of_a_run_is_read(made, monkeypatch):
-    monkeypatch.delattr("carlasc.storage.folders.published.PublishedSequence.read")  # no frame is read
+    monkeypatch.delattr("carlasc.storage.published.PublishedSequence.read")  # no frame is read
     result = report(made)
     assert result.failures == ()
     assert result.reports[NAME].frames == tuple(range(FRAMES))

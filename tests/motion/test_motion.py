@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.references.whole_drives import link_segments
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, scan_of
 
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
-from carlasc.motion import link_segments, segment_by_flow, segment_by_instances, standing_points
+from carlasc.motion import segment_by_flow, segment_by_instances, standing_points
 
 FRAMES = range(30)
 TIMES = {frame: frame * PERIOD_S for frame in range(60)}

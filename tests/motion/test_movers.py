@@ -1,10 +1,8 @@
 """Movers are followed over time, and only what overlays better along a path than standing earns a track."""
 
 import numpy as np
+from helpers.references.whole_drives import find_movers, link_segments
 from helpers.scenes.moving_scenes import CAR, PERSON, WALLS, car, film, person
-
-from carlasc.motion import link_segments
-from carlasc.motion.movers import find_movers
 
 
 def movers(scene, frames=40, **options):

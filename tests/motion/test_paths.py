@@ -1,13 +1,28 @@
-"""Velocities from points alone, of actors with known motion."""
+"""Velocities from points alone, of actors with known motion; what smoothing keeps and removes; the compiled loops against plain NumPy."""
 
 import numpy as np
 import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
-from carlasc.motion.paths import best_sighting, estimate_path, follow, headings_of, is_standing
+from carlasc.core.geometry import rotation_z
+from carlasc.motion.paths import (
+    _median,
+    best_sighting,
+    ends,
+    estimate_path,
+    follow,
+    headings_of,
+    is_standing,
+    lay,
+    nearest_points,
+    resample,
+    smooth,
+    smooth_at,
+)
 
 FRAMES = range(25)
 SECONDS = np.array(FRAMES) * PERIOD_S
+TIMES = np.arange(40) * 0.1
 
 
 def sightings_of(actor, view=None, count=400):
@@ -107,3 +122,80 @@ def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
     sightings = sightings_of(actor)
     path = follow(sightings, SECONDS, best_sighting(sightings))
     assert np.abs(np.diff(path, axis=0) - (0.8, 0, 0)).max() < 0.1
+
+
+def test_parabolas_and_their_slopes_are_kept():
+    values = np.column_stack([3 + 2 * TIMES - 0.5 * TIMES**2, TIMES])
+    smoothed, slopes = smooth(values, TIMES, np.ones(40), 0.5)
+    assert np.allclose(smoothed, values)
+    assert np.allclose(slopes, np.column_stack([2 - TIMES, np.ones(40)]))
+
+
+def test_noise_is_averaged_over_the_whole_window():
+    noise = np.random.default_rng(0).normal(0, 0.1, (40, 3))
+    smoothed = [np.std(smooth(noise, TIMES, np.ones(40), half_s)[0][10:30]) for half_s in (0.5, 1.0)]
+    assert smoothed[1] < smoothed[0] < 0.065
+
+
+def test_a_single_outlier_does_not_bend_the_path():
+    values = np.column_stack([8 * TIMES])
+    values[20] += 5.0
+    smoothed, slopes = smooth(values, TIMES, np.ones(40), 0.5)
+    assert np.abs(np.delete(smoothed[:, 0] - 8 * TIMES, 20)).max() < 0.1
+    assert np.abs(slopes - 8).max() < 0.2
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_few_values_give_a_line_or_a_constant(count):
+    smoothed, slopes = smooth(5 * TIMES[:count, None], TIMES[:count], np.ones(count), 0.01)
+    assert np.allclose(smoothed[:, 0], 5 * TIMES[:count])
+    assert np.allclose(slopes, 5 if count > 1 else 0)
+
+
+def test_a_path_goes_on_at_its_last_velocity():
+    positions, velocities = np.array([[0.0, 0, 0], [2, 0, 0]]), np.array([[1.0, 0, 0], [3, 0, 0]])
+    path, speed = resample(np.array([-1.0, 0.5, 3.0]), np.array([0.0, 1.0]), positions, velocities)
+    assert path[:, 0].tolist() == [-1.0, 1.0, 8.0]
+    assert speed[:, 0].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_one_time_alone_is_smoothed_as_among_all():
+    values = np.random.default_rng(1).normal(size=(40, 3))
+    weights = np.random.default_rng(2).uniform(1, 200, 40)
+    smoothed, slopes = smooth(values, TIMES, weights, 0.4)
+    for index in (0, 7, 39):
+        assert np.array_equal(smooth_at(index, values, TIMES, weights, 0.4), (smoothed[index], slopes[index]))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8])
+def test_the_weights_of_outliers_follow_the_median_of_numpy(count):
+    values = np.random.default_rng(count).exponential(size=count)
+    assert _median(values) == np.median(values)
+
+
+def test_nearest_points_are_those_of_all_pairs():
+    rng = np.random.default_rng(1)
+    points, model = rng.uniform(-1, 1, (50, 3)), rng.uniform(-1, 1, (40, 3))
+    index, squared = nearest_points(points, model)
+    pairs = np.square(points[:, None] - model[None]).sum(axis=2)
+    assert np.array_equal(index, pairs.argmin(axis=1))
+    assert np.allclose(squared, pairs.min(axis=1))
+
+
+def test_points_are_laid_on_planes_with_the_bits_of_numpy():
+    rng = np.random.default_rng(2)
+    points, arm, normal = rng.normal(size=(3, 80, 3))
+    place, scale, share = rotation_z(0.7)[:3, 0] * 30, 0.3, 0.4
+    slope, weighted, off = lay(points, place, arm, normal, scale, share)
+    distance = ((points - place - arm) * normal).sum(axis=1)
+    turning = arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]
+    weight = 1 / (1 + (distance / scale) ** 2) * share / 0.05**2
+    assert np.array_equal(off, distance)
+    assert np.array_equal(slope, np.column_stack([normal, turning]))
+    assert np.array_equal(weighted, slope * weight[:, None])
+
+
+@pytest.mark.parametrize("count", [1, 2, 20, 21, 26, 50, 51, 101, 400])
+def test_ends_are_quantiles(count):
+    values = np.random.default_rng(count).normal(size=count)
+    assert ends(values) == pytest.approx(np.quantile(values, (0.02, 0.98)), abs=1e-15)

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.references.whole_drives import link_segments
 
-from carlasc.motion import Segment, Standing, link_segments
+from carlasc.motion import Segment, Standing
 
 CAR, PERSON = 10, 4
 TIMES = {frame: 0.1 * frame for frame in range(100)}

@@ -168,7 +168,7 @@ class Ballot:
             ArgumentError: it votes in a region, and the ballot has none.
         """
         from carlasc.core.cells import as_pose
-        from carlasc.groundtruth.voting import kernel, rays
+        from carlasc.groundtruth.voting import kernel
 
         self.classes.check(observation.labels, "observation labels")
         hit_region = kernel.ANYWHERE if observation.hit_region is None else observation.hit_region
@@ -179,13 +179,11 @@ class Ballot:
             )
         labels = np.require(observation.labels, np.uint16, ["C", "A", "W"])
         self._make_room(len(observation))
-        pose = as_pose(observation.grid_T_sensor)
         kernel.vote(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
             labels,
             labels if observation.hits is None else np.where(observation.hits, labels, np.uint16(0)),
-            pose,
-            rays.GridView.of(pose, self._cells),
+            as_pose(observation.grid_T_sensor),
             self._cells,
             self.free_step_m,
             self.num_observations,

@@ -34,6 +34,7 @@ from carlasc.groundtruth.voting.rays import (
     place_points,
     sample_voxel,
     unit_ray,
+    view_from,
 )
 
 BLOCK = 256  # number of rays whose coordinates fit into the L1 cache
@@ -229,7 +230,6 @@ def vote(
     labels: NDArray[np.uint16],
     hit_labels: NDArray[np.uint16],
     pose: Pose,
-    view: GridView,
     cells: Cells,
     free_step_m: float,
     voter: int,
@@ -244,7 +244,6 @@ def vote(
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
         hit_labels: (N,) uint16, the classes that the points vote for; 0 where only the ray votes.
         pose: grid_T_sensor.
-        view: the grid as seen from the sensor.
         cells: the cells of the grid.
         free_step_m: distance between two free samples, metres.
         voter: number of the observation.
@@ -252,7 +251,7 @@ def vote(
         free_region: region in which rays vote, ANYWHERE, or NOT_AT_ALL.
         tally: the votes so far, with room for N more candidates.
     """
-    rays, hits = empty_rays(BLOCK), np.empty(BLOCK, np.int32)
+    view, rays, hits = view_from(pose, cells), empty_rays(BLOCK), np.empty(BLOCK, np.int32)
     for begin in range(0, len(labels), BLOCK):
         block = labels[begin : begin + BLOCK]
         corner = points[3 * begin : 3 * (begin + len(block))]

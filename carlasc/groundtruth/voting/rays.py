@@ -98,40 +98,42 @@ class GridView(NamedTuple):
     sure: float
     reach: float
 
-    @classmethod
-    def of(cls, pose: Pose, cells: Cells) -> GridView:
-        """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
-        size, lower, upper = (np.array(v, np.float64) for v in (cells.size, cells.lower, cells.upper))
-        voxel = np.array(cells.voxel_size)
-        # The published size of a cell is a float32 difference divided by n, so n cells may not end exactly at the upper bound.
-        ends = (upper - lower) / voxel
-        margin = MARGIN + np.abs(ends - size).max() + (AZIMUTH_ERROR / voxel[1] if cells.cylindrical else 0.0)
-        low, high = np.full(3, -MARGIN / 2), np.maximum(ends, size) + MARGIN / 2
-        scale, origin, finest = 1 / voxel, lower.copy(), voxel.min()
-        if cells.cylindrical:
-            scale[:2], origin[:2], finest = 1.0, 0.0, min(voxel[0], voxel[2])
-            low[:2], high[:2] = -upper[0] - MARGIN, upper[0] + MARGIN
-        matrix = np.array(pose).reshape(3, 4).copy()
-        matrix[:, 3] -= origin
-        matrix *= scale[:, None]
-        # Rounding may add at most a quarter of the margin. This limits how far a point may be, and how near to the axis.
-        allowed = MARGIN / 4 * finest / (_NEAR_AXIS if cells.cylindrical else 1.0)
-        known = np.abs(np.array(pose)[3::4]).max() + np.abs(lower).max() + np.abs(upper).max()
-        reach = (allowed / _ROUNDING - known) / 4
-        axis = finest / voxel[1] / _NEAR_AXIS
-        return cls(
-            cells.cylindrical,
-            tuple(matrix.ravel().tolist()),
-            tuple(low.tolist()),
-            tuple(high.tolist()),
-            tuple(size.tolist()),
-            (1 / voxel[0], 1 / voxel[1]),
-            (lower[0] / voxel[0], lower[1] / voxel[1]),
-            2 * math.pi / voxel[1],
-            axis,
-            0.5 - margin,
-            reach,
-        )
+
+@jit
+def view_from(pose: Pose, cells: Cells) -> GridView:
+    """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
+    lower, upper, voxel, curved = cells.lower, cells.upper, cells.voxel_size, cells.cylindrical
+    nx, ny, nz = float(cells.size[0]), float(cells.size[1]), float(cells.size[2])
+    # The published size of a cell is a float32 difference divided by n, so n cells may not end exactly at the upper bound.
+    ex, ey, ez = (upper[0] - lower[0]) / voxel[0], (upper[1] - lower[1]) / voxel[1], (upper[2] - lower[2]) / voxel[2]
+    margin = MARGIN + max(abs(ex - nx), abs(ey - ny), abs(ez - nz)) + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
+    low, high = (-MARGIN / 2, -MARGIN / 2), (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
+    sx, sy, sz = 1 / voxel[0], 1 / voxel[1], 1 / voxel[2]
+    origin, finest = (lower[0], lower[1]), min(voxel[0], voxel[1], voxel[2])
+    if curved:
+        low, high = (-upper[0] - MARGIN, -upper[0] - MARGIN), (upper[0] + MARGIN, upper[0] + MARGIN)
+        sx, sy, origin, finest = 1.0, 1.0, (0.0, 0.0), min(voxel[0], voxel[2])
+    # Rounding may add at most a quarter of the margin. This limits how far a point may be, and how near to the axis.
+    allowed = MARGIN / 4 * finest / (_NEAR_AXIS if curved else 1.0)
+    known = max(abs(pose[3]), abs(pose[7]), abs(pose[11])) + max(abs(lower[0]), abs(lower[1]), abs(lower[2]))
+    known += max(abs(upper[0]), abs(upper[1]), abs(upper[2]))
+    return GridView(
+        curved,
+        (
+            *(pose[0] * sx, pose[1] * sx, pose[2] * sx, (pose[3] - origin[0]) * sx),
+            *(pose[4] * sy, pose[5] * sy, pose[6] * sy, (pose[7] - origin[1]) * sy),
+            *(pose[8] * sz, pose[9] * sz, pose[10] * sz, (pose[11] - lower[2]) * sz),
+        ),
+        (low[0], low[1], -MARGIN / 2),
+        (high[0], high[1], max(ez, nz) + MARGIN / 2),
+        (nx, ny, nz),
+        (1 / voxel[0], 1 / voxel[1]),
+        (lower[0] / voxel[0], lower[1] / voxel[1]),
+        2 * math.pi / voxel[1],
+        finest / voxel[1] / _NEAR_AXIS,
+        0.5 - margin,
+        (allowed / _ROUNDING - known) / 4,
+    )
 
 
 class RayBlock(NamedTuple):

@@ -1,0 +1,101 @@
+"""The motion of a drive whose scans are all in memory: what the pass of a run does block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.motion import (
+    Linker,
+    Segment,
+    Sighting,
+    Standing,
+    Track,
+    complete_bodies,
+    find_evidence,
+    follow_movers,
+    make_track,
+)
+from carlasc.motion.movers import Mover
+
+
+def link_segments(
+    segments: Iterable[Segment],
+    times: Mapping[int, float],
+    standing: Mapping[int, Standing] | None = None,
+    *,
+    deformable: Collection[int] = (),
+) -> list[Track]:
+    """Link the segments of several scans into tracks.
+
+    Args:
+        segments: the segments of all scans, in any order.
+        times: seconds by frame, for every frame with a segment.
+        standing: the standing points of each scan, in which an actor that stops, for example at a crossing, is found until it continues.
+        deformable: classes whose actors change their shape; without flow, the centre of their points is followed.
+
+    Returns:
+        Tracks in order of their first segment, with whole bodies.
+    """
+    by_frame: dict[int, list[Segment]] = {}
+    for segment in segments:
+        by_frame.setdefault(segment.frame, []).append(segment)
+    linker = Linker()
+    chains: list[list[Segment]] = []
+    for frame in sorted(by_frame.keys() | (standing or {}).keys()):
+        chains += linker.add(frame, times[frame], by_frame.get(frame, []), (standing or {}).get(frame))
+    chains += linker.finish()
+    return complete_bodies([make_track(chain, times, deformable=deformable) for chain in chains])
+
+
+@dataclass(frozen=True)
+class Movers:
+    """What moved in a drive.
+
+    Attributes:
+        moved: (M,) int64 indices of the points of each frame that belong to something that moved, tracked or not. They must be left out
+            of other frames.
+        tracked: the movers whose sightings overlay better along an estimated path than standing.
+    """
+
+    moved: Mapping[int, NDArray[np.int64]]
+    tracked: tuple[Mover, ...]
+
+    @property
+    def segments(self) -> list[Segment]:
+        """The segments of all tracked movers, for `link_segments`."""
+        return [segment for mover in self.tracked for segment in mover.segments]
+
+
+def find_movers(
+    scans: Iterable[Sighting],
+    *,
+    movable: Collection[int] = (),
+    deformable: Collection[int] = (),
+    first_instance: int = 1,
+    default_label: int = 0,
+) -> Movers:
+    """Find what moved in the scans of a drive from the free space that other scans saw, and follow it over time.
+
+    Scans are read one by one, and only those of some seconds are held. A block of a drive gives the same evidence as the whole drive, if
+    the scans of `HORIZON_S` before and after it are given too.
+
+    Args:
+        scans: the scans in order of time, in one world frame whose z is up.
+        movable: classes of objects that can move, if the scans have labels.
+        deformable: classes of objects that change their shape as they move. Without labels, the size tells.
+        first_instance: number of the first mover; others follow.
+        default_label: class of movers without labels.
+
+    Returns:
+        The points that moved, and the movers that earned a track.
+    """
+    moved: dict[int, NDArray[np.int64]] = {}
+    evidence = find_evidence(scans, movable=movable)
+    tracked = follow_movers(
+        evidence, moved, deformable=deformable, first_instance=first_instance, default_label=default_label
+    )
+    return Movers(moved, tuple(tracked))
