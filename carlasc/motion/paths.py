@@ -181,7 +181,17 @@ def resample(
     positions: NDArray[np.float64],
     velocities: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (A, 3) positions and (A, 3) velocities at the times `at`: linear between the (F,) known times, constant velocity beyond."""
+    """Return positions and velocities at other times: linear between the known times, at constant velocity beyond.
+
+    Args:
+        at: (A,) the other times, seconds.
+        seconds: (F,) the known times, increasing.
+        positions: (F, 3) metres.
+        velocities: (F, 3) m/s.
+
+    Returns:
+        (A, 3) positions and (A, 3) velocities.
+    """
     path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
     speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
