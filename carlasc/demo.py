@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult

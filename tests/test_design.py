@@ -64,7 +64,7 @@ def test_no_room_imports_one_below_it():
 
 
 def test_rooms_import_rooms_and_not_the_top_package():
-    for room in ("converting", "testing"):
+    for room in ("converting", "running", "testing"):
         for path in (PACKAGE / room).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 names = {alias.name for alias in node.names} if isinstance(node, ast.Import | ast.ImportFrom) else set()
@@ -83,3 +83,59 @@ def test_one_frame_from_scans_passes_through_few_files(tmp_path):
     found = count_case(cases(tmp_path)["regrid from scans"])
     assert len(found.files) <= MOST_FILES, sorted(found.files)
     assert found.depth <= DEEPEST, found.deepest
+
+
+def modules_of(path):
+    """Yield the full names of the modules that a file imports, wherever in it; by name too (`import_extra("s3fs", ...)`)."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            yield node.module or ""
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id in ("import_extra", "import_module")
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+        ):
+            yield str(node.args[0].value)
+
+
+CLIENTS = (
+    "aiobotocore",
+    "aiohttp",
+    "boto3",
+    "botocore",
+    "fsspec",
+    "http.client",
+    "httpx",
+    "httpx2",
+    "huggingface_hub",
+    "requests",
+    "s3fs",
+    "urllib.request",
+    "urllib3",
+)
+
+
+def test_nothing_outside_of_transport_sends_a_request():
+    transport = PACKAGE / "storage" / "transport"
+    files = [path for place in (PACKAGE, ROOT / "converters") for path in place.rglob("*.py")]
+    for path in files:
+        if transport not in path.parents:
+            found = {name for name in modules_of(path) if any(name == c or name.startswith(f"{c}.") for c in CLIENTS)}
+            assert not found, f"{path.relative_to(ROOT)} imports {', '.join(sorted(found))}"
+
+
+def test_the_protocols_of_stores_rest_on_no_store_and_on_no_transport():
+    allowed = {"files", "layout", "metadata", "protocol"}
+    for name in ("protocol", "sinks"):
+        path = PACKAGE / "storage" / f"{name}.py"
+        names = {
+            part[2]
+            for module in modules_of(path)
+            if (part := module.split("."))[:2] == ["carlasc", "storage"] and len(part) > 2
+        }
+        assert names <= allowed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(names - allowed))}"

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from carlasc import cli
+from carlasc.converting import converter_names, exporter_names
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -166,10 +168,21 @@ def problems_of(page, text, commands):
 
 
 def options_of_commands():
-    return {
-        name: {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
-        for name, command in group().commands.items()
-    }
+    return {name: options_of(command) | declared_options(name) for name, command in group().commands.items()}
+
+
+def options_of(command):
+    return {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+
+
+def declared_options(name):
+    """Return the options that converters or exporters declare, where the command takes them."""
+    if name not in ("convert", "export"):
+        return set()
+    names = converter_names() if name == "convert" else exporter_names()
+    declared = import_module(f"carlasc.cli.{name}").declared_options
+    commands = [cli.make_command(name, options) for one in names if (options := declared([one]))]
+    return set().union(*map(options_of, commands))
 
 
 def test_commands_and_options_in_the_text_exist():

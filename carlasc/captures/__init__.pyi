@@ -1,6 +1,7 @@
 from .carla.recording import RecordResult as RecordResult
 from .carla.recording import record as record
 from .carla.server import ServerError as ServerError
+from .carla.server import ServerOptions as ServerOptions
 from .raw import Capture as Capture
 from .raw import SensorRecording as SensorRecording
 from .raw import find_captures as find_captures

@@ -23,7 +23,8 @@ from carlasc.core.scans import Scan, check_finite
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.storage.arrays import ArrayFormat, parse_npy
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, tree_of
+from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
+from carlasc.storage.transport.trees import LocalTree, Tree
 
 RAW = "raw"
 """Name of the folder that holds a capture, in the folder of its sequence."""

@@ -16,8 +16,7 @@ from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.storage.remote import target_of
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 
 
 class CaptureWriter:

@@ -70,7 +70,10 @@ def capture(
     """
     signal.signal(signal.SIGTERM, _interrupt)  # clean up the server also when a batch system ends the command
     with progress_bar("capture") as progress:
-        result = carlasc.record(out, **vars(server), count=count, **sensors.arguments(), progress=progress)
+        place = carlasc.captures.ServerOptions(server.host, server.port, server.traffic_port, server.timeout_s)
+        result = carlasc.record(
+            out, server=place, town=server.town, count=count, **sensors.arguments(), progress=progress
+        )
     if json:
         print_json(result)
         return

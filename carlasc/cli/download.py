@@ -29,8 +29,7 @@ def download(
 
     A zip need not be extracted: every command reads it in place.
     """
-    from carlasc.storage.downloads import TransferSettings
-    from carlasc.storage.downloads import download as fetch
+    from carlasc.storage import download as fetch
 
     with progress_bar("Downloading", unit="MB") as show:
         result = fetch(
@@ -40,7 +39,7 @@ def download(
             extract=extract,
             keep=keep,
             base_url=base_url,
-            settings=TransferSettings(connections=connections),
+            connections=connections,
             progress=lambda done, total: show(done // 10**6, total // 10**6),
         )
     if json:

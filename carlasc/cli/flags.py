@@ -161,7 +161,7 @@ class WorkFlags(Flags):
             usual: number of processes if none is given; None for one per core.
             shown: whether there is a progress bar.
         """
-        from carlasc.running.options import Run
+        from carlasc.running.spreading import Run
 
         part = self._part()
         bar = progress_bar(title, unit) if shown else nullcontext()
@@ -204,6 +204,6 @@ class RunFlags(WorkFlags):
     ] = None
 
     def _part(self) -> dict[str, Any]:
-        from carlasc.running.parts import Part
+        from carlasc.running.spreading import Part
 
         return {} if self.part is None else {"part": Part.parse(self.part)}

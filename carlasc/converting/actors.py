@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, headings_of, is_standing
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
@@ -125,7 +125,14 @@ class ActorMotion:
         self._velocities: dict[int, dict[int, Velocity]] = {}
 
     def add(self, frame: int, seconds: float, first_T_sensor: Transform, actors: Iterable[ActorSighting]) -> None:
-        """Add the actors of the next frame, seen by a sensor with the (4, 4) pose `first_T_sensor`."""
+        """Add the actors of the next frame.
+
+        Args:
+            frame: its number.
+            seconds: its time.
+            first_T_sensor: (4, 4) pose of the sensor.
+            actors: what was seen of each actor.
+        """
         for sighting in actors:
             chain = self._chains.get(sighting.actor)
             if chain is None or frame - chain.frames[-1] > _MAX_GAP or len(chain.frames) >= _MAX_SIGHTINGS:

@@ -18,9 +18,8 @@ from carlasc.converting.exporter import Exported, Exporter, FrameExporter, Seque
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.converting.results import ExportResult, Failure, StepCounter, check_outside
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
-from carlasc.running.options import Run
-from carlasc.running.parts import Part
 from carlasc.running.processes import one_pool, run_all
+from carlasc.running.spreading import Part, Run
 from carlasc.storage.durability import make_folder, rename, sync_tree
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json, write_atomic, write_many
 

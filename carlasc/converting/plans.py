@@ -110,6 +110,12 @@ def choose_recordings(
 ) -> list[Recording]:
     """Return the recordings that were asked for, by the whole name or its last part, and of the wanted split.
 
+    Args:
+        recordings: those that exist.
+        source: the data set, for errors.
+        wanted: names or the last parts of them; None for all.
+        split: the split in lower case, or "all".
+
     Raises:
         MissingDataError: a name does not exist, or no recording is left; lists those that exist.
         ConflictError: two recordings have one name.
@@ -273,6 +279,11 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     """Write carlasc.json, times and the voxel grid's params.json, and take over the poses that an earlier run estimated.
 
     A second estimate might differ in its last digits.
+
+    Args:
+        plan: the recording and where it is written.
+        target: the axes and classes in which it is written.
+        metadata: what carlasc.json says of all recordings.
 
     Raises:
         ConflictError: other poses, times or metadata exist there.

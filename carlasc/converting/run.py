@@ -25,15 +25,13 @@ from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting
 from carlasc.groundtruth.run import RegridResult, regrid
 from carlasc.motion.options import PoseOptions
-from carlasc.running.options import Run
-from carlasc.running.parts import Part
 from carlasc.running.processes import one_pool
+from carlasc.running.spreading import Part, Run
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.remote import check_shared
 from carlasc.storage.sinks import Sink
-from carlasc.storage.targets import LocalTarget
+from carlasc.storage.transport.targets import LocalTarget, check_shared
 
 Grids = GridOptions | Literal["voxels"] | None
 

@@ -124,7 +124,13 @@ def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> No
 def in_blocks(
     items: Sequence[Item], number_of: Callable[[Item], int], writer: SequenceWriter
 ) -> Iterator[Sequence[Item]]:
-    """Yield frames in the blocks that a worker does in one task: those that are stored together, or else a few in a row."""
+    """Yield frames in the blocks that a worker does in one task: those that are stored together, or else a few in a row.
+
+    Args:
+        items: the frames, by increasing number.
+        number_of: returns the number of a frame.
+        writer: says how many frames are stored together.
+    """
     if writer.block == 1:
         yield from (items[i : i + _FRAMES] for i in range(0, len(items), _FRAMES))
     else:
@@ -173,8 +179,13 @@ class ScanBlock(StageBlock[ScanJob]):
 def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str, NDArray[Any]]:
     """Return the fields of a scan in the axes and classes of the target, points last: a frame that has points is complete.
 
+    Args:
+        scan: the scan, right-handed, with class ids of the data set.
+        target: the axes and classes in which it is written.
+        where: the frame, for errors.
+
     Raises:
-        FormatError: a class id is unknown. `where` is the frame.
+        FormatError: a class id is unknown.
     """
     fields: dict[str, NDArray[Any]] = {}
     if scan.labels is not None:

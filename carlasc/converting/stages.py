@@ -25,8 +25,8 @@ from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_ra
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage.metadata import Metadata
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
@@ -64,8 +64,10 @@ class Conversion:
         """Convert the recording, or what an earlier run left to do."""
         plan = self.plan
         begin(plan, self.target, metadata)
-        if plan.poses is None and plan.rig.needs_motion:
-            self._estimate_first()
+        if plan.poses is None and plan.rig.needs_motion:  # scans are corrected by the poses: each is then read twice
+            self.steps.expect(len(plan.recording.frames))
+            plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps))
+            write_poses(plan, self.target)
         velocities = self._read_scans()
         if plan.poses is not None:
             write_poses(plan, self.target)
@@ -82,14 +84,7 @@ class Conversion:
     @property
     def has_scans(self) -> bool:
         """Whether the scan of any frame exists."""
-        return any(handle.number not in self._failed for handle in self.plan.recording.frames)
-
-    def _estimate_first(self) -> None:
-        """Estimate the poses before scans are written, because scans are corrected by them: each scan is then read twice."""
-        plan = self.plan
-        self.steps.expect(len(plan.recording.frames))
-        plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps))
-        write_poses(plan, self.target)
+        return any(self.plan.writer.has("points", handle.number) for handle in self.plan.recording.frames)
 
     def _read_scans(self) -> Mapping[int, Mapping[int, Velocity]]:
         """Read each frame once, and write its scan; return the velocities of numbered actors by frame.
@@ -118,7 +113,7 @@ class Conversion:
             if follow:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
-        if found or (estimate and not self.failures):  # where every frame failed, that is what is reported
+        if estimate and len(self._failed) < len(plan.recording.frames):  # where every frame failed, that is reported
             plan.take_estimate(fill_gaps(list(found), np.array(list(found.values())), plan.recording))
         return actors.finish()
 

@@ -93,7 +93,13 @@ def at_frames(world_T_vehicle: NDArray[np.float64], times: NDArray[np.float64]) 
 
 
 def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F, 4, 4) first_T_scan by frame number. Poses of the frames are taken as they are, others are interpolated."""
+    """Return (F, 4, 4) first_T_scan by frame number. Poses of the frames are taken as they are, others are interpolated.
+
+    Args:
+        trajectory: poses of the vehicle, with times.
+        recording: says where the scan is on the vehicle.
+        times: (F,) seconds by frame number, by the same clock.
+    """
     given = trajectory.world_T_vehicle
     same = trajectory.seconds is not None and np.array_equal(trajectory.seconds, times)
     poses = (given if same else trajectory.at(times)) @ recording.vehicle_T_scan
@@ -176,6 +182,11 @@ def odometry_range(converter: type[Converter]) -> tuple[float, float]:
 
 def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
     """Return (F, 4, 4) poses by frame number from those of some frames: others have the pose of the frame before.
+
+    Args:
+        frames: M frame numbers, increasing.
+        poses: (M, 4, 4) their poses.
+        recording: its last frame is the last that gets a pose.
 
     Raises:
         MissingDataError: there is none.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.dataset.samples import Dataset
 from carlasc.errors import CarlascError
-from carlasc.storage.caching import CachedTree
+from carlasc.storage.transport.caching import CachedTree
 
 _THREADS = 3  # files that are fetched side by side, each in several ranges
 _STOP_S = (

@@ -30,8 +30,8 @@ from carlasc.dataset.selection import (
 from carlasc.dataset.transforms import Sample
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, import_extra
 from carlasc.storage import Sequence, Source, as_source, layout
-from carlasc.storage.caching import CachedTree
 from carlasc.storage.metadata import Axes
+from carlasc.storage.transport.caching import CachedTree
 
 FIELDS = (
     "occupancy",

@@ -24,7 +24,7 @@ from carlasc.groundtruth.options import FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence

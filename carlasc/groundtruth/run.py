@@ -18,14 +18,12 @@ from carlasc.groundtruth.from_scans.sequences import scan_sequences
 from carlasc.groundtruth.inputs import GridPlan, SequenceInput
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.work import FrameFailure, SequenceJob, Work
-from carlasc.running.options import Run
 from carlasc.running.processes import one_pool
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.folders.trees import is_url
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Source
-from carlasc.storage.remote import check_shared
 from carlasc.storage.resuming import (
     RECORD,
     RECORD_FORMAT,
@@ -36,6 +34,8 @@ from carlasc.storage.resuming import (
     check_name,
 )
 from carlasc.storage.sinks import Sink
+from carlasc.storage.transport.targets import check_shared
+from carlasc.storage.transport.trees import is_url
 
 RULES = {"capture": 1, "scans": 2, "grid": 1}
 """Version of the rule by which grids are made, by what observes the scene. It changes only when the same input gives other grids."""

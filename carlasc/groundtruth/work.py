@@ -24,8 +24,8 @@ from carlasc.errors import CarlascError, ConflictError, FormatError, MissingData
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, RunProgress, SequenceInput
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
 from carlasc.groundtruth.reporting.report import Report
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.resuming import check_scan
 from carlasc.storage.sinks import SequenceWriter

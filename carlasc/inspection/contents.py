@@ -15,7 +15,7 @@ from carlasc.errors import CarlascError
 from carlasc.inspection.evidence import check_evidence
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.storage import layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence
 
 _FASTEST_M_S = 100.0

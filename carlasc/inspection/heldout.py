@@ -24,8 +24,8 @@ from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequence
 from carlasc.groundtruth.inputs import GridPlan, RunProgress
 from carlasc.inspection.heldout_scores import HeldOutScores
 from carlasc.motion.tracks import MovingActors
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 

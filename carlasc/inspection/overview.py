@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from carlasc.captures.raw import Capture, find_captures
 from carlasc.errors import CarlascError, MissingDataError, without_credentials
 from carlasc.storage import as_source, layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
 

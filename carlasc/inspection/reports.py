@@ -19,11 +19,11 @@ from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
 from carlasc.motion.options import MotionOptions, PoseOptions
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import write_output
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source

@@ -23,10 +23,10 @@ from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default

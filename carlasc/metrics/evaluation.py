@@ -13,8 +13,8 @@ from carlasc.metrics.conventions import CONVENTIONS, Convention
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
 from carlasc.metrics.scorer import LabelPair, Scorer, Scoring
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 
 _TOGETHER = 8  # frames that a worker scores in one task
 

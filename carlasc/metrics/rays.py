@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.casting import cast_rays, rayiou_directions
+from carlasc.metrics.casting import cast_rays, cast_rays_on_device, rayiou_directions
 from carlasc.metrics.counting import device_of, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 
@@ -164,8 +164,6 @@ class RayIoU:
         if device is None:
             return cast_rays(grids, spec, origins, self.directions, free=self.free)
         import torch
-
-        from carlasc.metrics.casting import cast_rays_on_device
 
         on_device = torch.from_numpy(grids.astype(np.int32)).to(device)
         voxels, depths = cast_rays_on_device(on_device, spec, origins, self.directions, free=self.free)

@@ -178,17 +178,3 @@ class Forecasting:
         for horizon, matrix in other.matrices.items():
             self.matrices[horizon] += matrix
         return self
-
-
-def frames_ahead(horizon_s: float, period_s: float) -> int:
-    """Return how many frames a horizon is ahead.
-
-    Raises:
-        ArgumentError: it is no whole number of frames.
-    """
-    ahead = horizon_s / period_s
-    if abs(ahead - round(ahead)) > 1e-6:
-        raise ArgumentError(
-            "horizon_s", expected=f"a multiple of the frame period {period_s:g} s", found=f"{horizon_s:g} s"
-        )
-    return round(ahead)

@@ -11,8 +11,8 @@ from itertools import islice, takewhile
 from typing import Any, TypeVar
 
 from carlasc.errors import CarlascError, import_extra
-from carlasc.running.engines import DaskClient, LazyClient
 from carlasc.running.pools import LostTaskError
+from carlasc.running.spreading import DaskClient, LazyClient
 from carlasc.running.workers import Session, run_task
 
 Item = TypeVar("Item")

@@ -11,8 +11,8 @@ from itertools import chain, islice
 from typing import TypeVar
 
 from carlasc.errors import CarlascError
-from carlasc.running.options import Run
 from carlasc.running.pools import LostTaskError, OwnProcesses
+from carlasc.running.spreading import Run
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.folders.trees import is_url
 from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.remote import check_shared
 from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.transport.targets import check_shared
+from carlasc.storage.transport.trees import is_url
 
 Progress = Callable[[int, int], None]
 _FEW = 4  # tasks for which it does not pay to start another process

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees one that is half written."""
+"""Writing files so that a reader never sees one that is half written; JSON; names that lead out of a folder."""
 
 from __future__ import annotations
 
@@ -213,6 +213,17 @@ def parse_json_value(data: bytes | str, where: str) -> Any:
         raise FormatError(where, expected="JSON", found="something else", advice=describe(error)) from error
 
 
+def leads_outside(name: str) -> bool:
+    """Whether a name with parts joined by "/" may lead out of the folder that it is relative to, on any system.
+
+    Names come from archives and stores, which anybody may have made. Such are absolute names, names with a drive ("C:"), with a part "..", with a
+    backslash, and with a zero byte or half a character, which no file can have.
+    """
+    return name.startswith("/") or ".." in name.split("/") or bool(_DRIVE.match(name) or _NEVER.search(name))
+
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+_NEVER = re.compile("[\\\\\0\ud800-\udfff]")
 _HALF = re.compile(rb"\\u[dD][89a-fA-F]")
 _PART = ".part"
 _FREE_SPACE = "free some space and run again"

@@ -7,19 +7,19 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.running.parts import Part
-from carlasc.storage.caching import Cache, CachedTree
-from carlasc.storage.folders.folder import FolderSink, FolderSource
-from carlasc.storage.folders.hub import HUB
-from carlasc.storage.folders.published import PublishedSource
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree, is_url
-from carlasc.storage.folders.zipped import ZipTree
+from carlasc.running.spreading import Part
+from carlasc.storage.folder import FolderSink, FolderSource
 from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK, unfinished, unfinished_error
 from carlasc.storage.packed.stores import PackedSink, PackOptions
 from carlasc.storage.protocol import Source
-from carlasc.storage.remote import target_of
+from carlasc.storage.published import PublishedSource
 from carlasc.storage.sinks import Sink
-from carlasc.storage.targets import Target
+from carlasc.storage.transport.caching import Cache, CachedTree
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.servers import HUB
+from carlasc.storage.transport.targets import Target, target_of
+from carlasc.storage.transport.trees import LocalTree, Tree, is_url
+from carlasc.storage.transport.zipped import ZipTree
 
 PACKED = (".zarr", ".h5", ".hdf5", ".parquet")
 """Endings of the names of packed stores."""

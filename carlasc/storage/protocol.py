@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import PurePosixPath
-from typing import Any, Self, cast
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,26 @@ from carlasc.core.tables import table_from_json
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import Tree
 from carlasc.storage.metadata import Metadata, check_format
+
+
+class FileTree(Protocol):
+    """The files that a store is made of, wherever they are: all that this protocol knows of them.
+
+    Attributes:
+        location: its name in errors: a folder, a zip, a URL.
+    """
+
+    location: str
+
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
+        """Return a file's bytes.
+
+        Args:
+            path: the file, its parts joined by "/".
+            size: the bytes that it has if it is what it should be; None where nothing says it.
+        """
+        ...
 
 
 class Sequence(ABC):
@@ -49,7 +67,7 @@ class Sequence(ABC):
     split: str | None
     name: str
     coordinates: Coordinates
-    tree: Tree | None = None
+    tree: FileTree | None = None
     _given_poses: NDArray[np.float64] | None = None
 
     @abstractmethod

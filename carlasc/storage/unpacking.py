@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from carlasc.errors import ConflictError
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage.copying import blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
-from carlasc.storage.folders.folder import FolderSink
-from carlasc.storage.folders.trees import is_url
+from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place, unfinished
 from carlasc.storage.protocol import Source
+from carlasc.storage.transport.trees import is_url
 
 _BLOCK = 16  # frames that one task unpacks
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.storage import layout
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 
 FRAMES = (0, 1, 2, 5)
 """Frames of the sequence WHOLE."""

@@ -22,4 +22,4 @@ from .scene import Scene as Scene
 from .scene import SceneReader as SceneReader
 from .targets import ViewResult as ViewResult
 from .viewer import view as view
-from .window.window import Window as Window
+from .window import Window as Window

@@ -14,7 +14,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.tables import TABLES, remaps_between
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import Sequence, Source, as_source, layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 from carlasc.viewing.remapping import RemappedSequence
 
 SceneSource = str | os.PathLike[str] | Source | Sequence

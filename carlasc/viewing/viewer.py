@@ -13,7 +13,7 @@ from carlasc.viewing.page.page import PAGES, write_page
 from carlasc.viewing.recordings.recording import RECORDINGS, write_recording
 from carlasc.viewing.scene import Scene, as_scene
 from carlasc.viewing.targets import ViewResult
-from carlasc.viewing.window.window import show_window
+from carlasc.viewing.window import show_window
 
 
 @overload

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
-from carlasc.storage.folders.names import leads_outside
+from carlasc.storage.files import leads_outside
 from carlasc_converters import json_rows
 from carlasc_converters.nuscenes_classes import CLASS_IDS
 from carlasc_converters.rigid import poses_of

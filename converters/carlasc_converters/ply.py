@@ -115,7 +115,7 @@ class PlyVertices:
         """Yield all vertices in their order, at most `size` at a time. Only one chunk is in memory if the caller keeps none.
 
         Raises:
-            FormatError: as for `read`.
+            FormatError: the file does not hold what its header says.
         """
         if self.lines is None:
             for start in range(0, self.count, size):

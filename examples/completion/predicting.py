@@ -15,7 +15,7 @@ from carlasc import ClassTable, Dataset, GridSpec, collate
 from carlasc.core import CARLASC11, SEMANTICKITTI19, FrameRange, Frames
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Metadata, layout
-from carlasc.storage.folders.folder import FolderWriter
+from carlasc.storage.folder import FolderWriter
 from completion.config import Config
 from completion.inference import Mode, prepare
 from completion.networks import KINDS, build_network

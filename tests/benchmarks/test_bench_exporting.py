@@ -16,7 +16,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.running import Run
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 
 pytestmark = pytest.mark.slow
 

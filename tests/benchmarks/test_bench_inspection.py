@@ -16,7 +16,7 @@ from carlasc.inspection import validate
 from carlasc.inspection.agreement import GridEvidence
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 
 pytestmark = pytest.mark.slow
 

@@ -26,8 +26,8 @@ from helpers.scenes.lidar_frames import street_frame
 
 import carlasc
 from carlasc.dataset import Dataset, ShardSampler
-from carlasc.storage.folders.trees import RemoteTree
 from carlasc.storage.packing import pack
+from carlasc.storage.transport.remote_tree import RemoteTree
 
 pytestmark = pytest.mark.slow
 

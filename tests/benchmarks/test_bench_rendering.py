@@ -10,7 +10,7 @@ import pytest
 from carlasc import Run
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from carlasc.viewing import Scene, render, render_grid, render_scan
 
 pytestmark = pytest.mark.slow

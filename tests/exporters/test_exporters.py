@@ -77,13 +77,13 @@ def test_the_exporter_of_the_documentation_works(installed, tmp_path):
 
 
 def test_options_of_the_command_line_are_those_of_the_constructor(installed, tmp_path):
-    result = run("topviews", installed, tmp_path / "out", "--option", "above_m=-1.0", "--workers", "1")
+    result = run("topviews", installed, tmp_path / "out", "--above-m=-1.0", "--workers", "1")
     assert result.exit_code == 0, result.output
     assert "note: unknown voxels are shown as free" in result.output
     assert f"{PATH} -> {tmp_path / 'out' / 'town07_light'}" in result.output
     assert "3 frames written in" in result.output
     assert 7 not in np.load(tmp_path / "out" / "town07_light" / "000000.npy")  # the road is below
-    result = run("topviews", installed, tmp_path / "out", "--option", "above_m=-2.0", "--workers", "1")
+    result = run("topviews", installed, tmp_path / "out", "--above-m=-2.0", "--workers", "1")
     assert result.exit_code == 1
     assert "expected frames that were exported with grid=evaluation, above_m=-2.0" in result.stderr
     assert "`--overwrite`" in result.stderr
@@ -92,11 +92,10 @@ def test_options_of_the_command_line_are_those_of_the_constructor(installed, tmp
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--option", "above_m"), "--option: expected NAME=VALUE, each name once, found 'above_m'"),
-        (("--option", "a=1", "--option", "a=2"), "--option: expected NAME=VALUE, each name once, found 'a=2'"),
-        (("--option", "above_m=high"), "above_m: expected a number, found 'high'"),
-        (("--option", "below_m=1"), "options: expected one of grid, above_m, found below_m"),
-        (("--predictions",), "options: expected one of grid, above_m, found predictions"),
+        (("--above-m",), "option '--above-m' requires an argument"),
+        (("--above-m", "high"), "invalid value for '--above-m'"),
+        (("--below-m", "1"), "no such option: --below-m"),
+        (("--predictions",), "no such option: --predictions"),
     ],
 )
 def test_wrong_options_are_named_and_the_exit_code_is_2(installed, tmp_path, options, message):

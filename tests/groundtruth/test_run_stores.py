@@ -148,7 +148,7 @@ def test_the_clocks_of_machines_do_not_matter(source, tmp_path):
 
 
 def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(source, tmp_path, monkeypatch):
-    from carlasc.storage import targets
+    from carlasc.storage.transport import targets
 
     write, left = targets.write_atomic, [6]
 

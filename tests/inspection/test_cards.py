@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
 from helpers.datasets.tiny_kitti import write_tiny_kitti
-from storage.test_zipped import write_zip
+from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc

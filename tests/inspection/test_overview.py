@@ -12,7 +12,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import MissingDataError
 from carlasc.inspection.overview import info
 from carlasc.storage import layout
-from carlasc.storage.folders.published import PublishedSequence
+from carlasc.storage.published import PublishedSequence
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def copied(made, tmp_path):
 
 
 def test_the_report_of_a_run_is_read(made, monkeypatch):
-    monkeypatch.delattr("carlasc.storage.folders.published.PublishedSequence.read")  # no frame is read
+    monkeypatch.delattr("carlasc.storage.published.PublishedSequence.read")  # no frame is read
     result = report(made)
     assert result.failures == ()
     assert result.reports[NAME].frames == tuple(range(FRAMES))

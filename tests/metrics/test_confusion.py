@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 
@@ -8,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from carlasc import Grid, GridSpec
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics import ConfusionMatrix
+from carlasc.metrics import ConfusionMatrix, score_truth
+
+SMALL = GridSpec("cartesian", (8, 8, 2), (-4.0, -4.0, -1.0), (4.0, 4.0, 1.0))
 
 K = 11
 
@@ -169,3 +173,35 @@ def test_a_matrix_is_reset_merged_and_computed_as_every_metric_is():
     }
     merged.reset()
     assert merged == ConfusionMatrix(K)
+
+
+def test_truth_is_scored_over_voxels_known_to_both():
+    spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
+
+    def grid(labels, counts):
+        return Grid(spec, np.array(labels, np.uint8).reshape(4, 1, 1), np.array(counts, np.float32).reshape(4, 1, 1))
+
+    score = score_truth(grid([1, 2, 0, 2], [1, 1, 0, 3]), grid([1, 1, 0, 2], [1, 2, 5, 0]), 3)
+    assert (score.known, score.known_reference, score.known_both) == (3, 3, 2)
+    assert score.coverage == pytest.approx(2 / 3)
+    assert score.accuracy == pytest.approx(1 / 2)
+    np.testing.assert_array_equal(score.matrix.false_positives, [0, 0, 1])
+    total = score + score
+    assert (total.known_both, total.matrix.total) == (4, 4)
+    assert total.coverage == score.coverage
+
+
+def test_truth_is_scored_only_where_the_mask_says():
+    spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
+    grid = Grid(spec, np.array([1, 2, 0, 2], np.uint8).reshape(4, 1, 1), np.ones(spec.size, np.float32))
+    score = score_truth(grid, grid, 3, np.array([True, True, False, False]).reshape(4, 1, 1))
+    assert (score.known, score.known_reference, score.known_both, score.matrix.total) == (2, 2, 2, 2)
+    empty = score_truth(grid, grid, 3, np.zeros(spec.size, bool))
+    assert math.isnan(empty.coverage) and math.isnan(empty.accuracy)
+
+
+def test_truth_of_another_grid_is_refused():
+    grid = Grid(SMALL, np.zeros(SMALL.size, np.uint8))
+    other = SMALL.with_size((4, 4, 2))
+    with pytest.raises(FormatError, match="expected the reference's"):
+        score_truth(grid, Grid(other, np.zeros(other.size, np.uint8)), 2)

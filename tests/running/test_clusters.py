@@ -13,7 +13,7 @@ from helpers.processes import jobs
 from carlasc import Run
 from carlasc.errors import CarlascError
 from carlasc.running import open_cluster, run_all
-from carlasc.running.engines import LazyClient
+from carlasc.running.spreading import LazyClient
 
 pytestmark = pytest.mark.needs("distributed")
 

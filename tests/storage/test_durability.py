@@ -12,7 +12,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, StorageError
 from carlasc.storage import durability, layout
 from carlasc.storage.files import to_json, write_atomic, write_many
-from carlasc.storage.folders.folder import FolderWriter
+from carlasc.storage.folder import FolderWriter
 
 SPEC = GridSpec.published("cartesian")
 

@@ -20,7 +20,7 @@ import carlasc
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import FromGrid
 from carlasc.storage import FolderSink, Sink, Source
-from carlasc.storage.folders.folder import FolderWriter
+from carlasc.storage.folder import FolderWriter
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packing import pack
 from carlasc.storage.unpacking import unpack

@@ -15,7 +15,7 @@ from helpers.datasets.sequences import files_of, grid, params, write_dataset
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from storage.test_zipped import write_zip
+from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc

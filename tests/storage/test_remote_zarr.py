@@ -18,14 +18,13 @@ from helpers.servers.object_store import (
     options_for,
     s3_server,
 )
-from storage.test_shared_writing import FRAMES, PATH, arrays_of, start_sink, write_block
+from storage.test_block_tables import FRAMES, PATH, arrays_of, start_sink, write_block
 
 import carlasc
 from carlasc import Run
 from carlasc.errors import ConflictError
 from carlasc.storage.packing import pack
-from carlasc.storage.remote import RemoteTarget, target_of
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target, target_of
 from carlasc.storage.unpacking import unpack
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink

@@ -195,7 +195,7 @@ def test_wedges_of_a_cylindrical_grid_are_at_their_positions(browser, tmp_path):
 
 @pytest.mark.slow
 def test_points_alone_are_drawn(browser, tmp_path):
-    from carlasc.storage.folders.folder import FolderSink
+    from carlasc.storage.folder import FolderSink
 
     writer = FolderSink(tmp_path).sequence("scan")
     cloud = np.random.default_rng(0).normal(0, (9, 9, 1, 0), (5000, 4)).astype(np.float32)

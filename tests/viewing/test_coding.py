@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
+from helpers.readers.page_arrays import unpack_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.viewing.page.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays, unpack_arrays
+from carlasc.viewing.page.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),

@@ -3,8 +3,8 @@ import sys
 import pytest
 
 from carlasc.errors import DependencyError
-from carlasc.viewing.window import libraries
-from carlasc.viewing.window.libraries import import_open3d, missing_library
+from carlasc.viewing import libraries
+from carlasc.viewing.libraries import import_open3d, missing_library
 
 
 @pytest.mark.parametrize(

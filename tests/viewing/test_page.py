@@ -4,13 +4,13 @@ import re
 
 import numpy as np
 import pytest
+from helpers.readers.page_arrays import unpack_arrays
 from helpers.scenes.road_blocks import write_blocks
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.storage import open as open_source
 from carlasc.viewing import Scene, view
-from carlasc.viewing.page.coding import unpack_arrays
 
 
 def read_page(path):
@@ -111,7 +111,7 @@ def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     from helpers.scenes.box_street import Street
 
     from carlasc.core.geometry import translation
-    from carlasc.storage.folders.folder import FolderSink
+    from carlasc.storage.folder import FolderSink
 
     rng = np.random.default_rng(0)
     points, labels = Street.random().scan(translation((0, 0, 1.8)), rng, channels=64, columns=2031)

@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers.readers.page_arrays import unpack_arrays
 from helpers.readers.pixels import BLUE, RED
 from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
 
@@ -14,7 +15,6 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import open as open_source
 from carlasc.viewing import Scene, view
-from carlasc.viewing.page.coding import unpack_arrays
 from carlasc.viewing.page.contents import open_content
 
 

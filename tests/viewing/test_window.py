@@ -18,8 +18,8 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, DependencyError
 from carlasc.storage import FolderSink
 from carlasc.viewing import Scene, Window
-from carlasc.viewing.window.libraries import import_open3d
-from carlasc.viewing.window.window import KEYS, help_lines
+from carlasc.viewing.libraries import import_open3d
+from carlasc.viewing.window import KEYS, help_lines
 
 STEPS = """
 import json, sys
@@ -112,7 +112,7 @@ def open_window(monkeypatch):
     """Opens a window whose Open3D only records what it is told; returns the window and a function that presses keys."""
     monkeypatch.setenv("DISPLAY", ":0")
     o3d = MagicMock()
-    monkeypatch.setattr("carlasc.viewing.window.window.import_open3d", lambda: o3d)
+    monkeypatch.setattr("carlasc.viewing.window.import_open3d", lambda: o3d)
 
     def start(*arguments, **options):
         said = []
@@ -183,7 +183,7 @@ def test_playing_goes_to_the_next_frame_when_it_is_due_and_starts_again_after_th
     blocks, open_window, monkeypatch
 ):
     clock = [100.0]
-    monkeypatch.setattr("carlasc.viewing.window.window.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("carlasc.viewing.window.time.monotonic", lambda: clock[0])
     window, press, said = open_window(blocks)
     press(" ")
     positions = []
@@ -200,7 +200,7 @@ def test_playing_goes_to_the_next_frame_when_it_is_due_and_starts_again_after_th
 def test_without_a_screen_the_window_says_what_to_do(blocks, monkeypatch):
     if sys.platform != "linux":
         pytest.skip("screens are named by DISPLAY on Linux only")
-    monkeypatch.setattr("carlasc.viewing.window.window.import_open3d", MagicMock())
+    monkeypatch.setattr("carlasc.viewing.window.import_open3d", MagicMock())
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(DependencyError, match=r"window: expected a screen, found no DISPLAY: .*`out=\"page.html\"`"):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.captures.carla.sensors import ActorNumbers, SensorRig
-from carlasc.captures.carla.server import Server
+from carlasc.captures.carla.server import Server, ServerOptions
 from carlasc.captures.raw import Capture, SensorRecording
 from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, check_traffic, sensor_offsets
 from carlasc.captures.writing import CaptureWriter, TimesLog
@@ -60,10 +60,7 @@ class _ServerSettings:
 def record(
     out: str | os.PathLike[str],
     *,
-    host: str = "127.0.0.1",
-    port: int = 2000,
-    traffic_port: int = 8000,
-    timeout_s: float = 60.0,
+    server: ServerOptions = ServerOptions(),  # noqa: B008 (frozen)
     town: str = "Town01",
     count: int = 2000,
     sensors: int = 20,
@@ -83,10 +80,7 @@ def record(
 
     Args:
         out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
-        host: host of the server.
-        port: RPC port of the server.
-        traffic_port: port of the traffic manager.
-        timeout_s: longest time that the server may take to answer, seconds.
+        server: where the CARLA server is, and how long it may take to answer.
         town: map to drive in, such as "Town01" or "Town10HD".
         count: number of frames, 0.1 s apart.
         sensors: number of LiDARs. The first is the ego sensor.
@@ -114,26 +108,26 @@ def record(
     if bev:
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0
-    with Server(host, port, timeout_s, carla) as server:
-        settings = _ServerSettings(town, traffic, sensors, seed, bev, server.version, lidar or Lidar())
+    with Server(server, carla) as connection:
+        settings = _ServerSettings(town, traffic, sensors, seed, bev, connection.version, lidar or Lidar())
         writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc capture")
         complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev)}
         missing = set(range(count)) - (complete & writer.timed_frames(sensors))
         if not missing:
-            return RecordResult(writer.out, count, 0, sensors, 0, 0, server.version)
+            return RecordResult(writer.out, count, 0, sensors, 0, 0, connection.version)
 
         rng = np.random.default_rng(seed)
         offsets = sensor_offsets(sensors, rng)
-        server.load_town(town)
-        server.set_up_traffic(traffic_port, seed)
-        actors = spawn_actors(server, TRAFFIC[traffic], traffic_port, rng)
-        rig = SensorRig(server, actors.ego, offsets, settings.lidar, bev, seed)
+        connection.load_town(town)
+        connection.set_up_traffic(server.traffic_port, seed)
+        actors = spawn_actors(connection, TRAFFIC[traffic], server.traffic_port, rng)
+        rig = SensorRig(connection, actors.ego, offsets, settings.lidar, bev, seed)
         spawned = (int(actor.id) for actor in (actors.ego, *actors.vehicles, *actors.walkers))
-        numbers = ActorNumbers([*server.initial_actors, *spawned])
+        numbers = ActorNumbers([*connection.initial_actors, *spawned])
         writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))  # the town is known to exist now
         with TimesLog(writer) as log:
             for frame in range(max(missing) + 1):
-                recordings, times_s, picture = rig.measure(server.tick(), frame, numbers)
+                recordings, times_s, picture = rig.measure(connection.tick(), frame, numbers)
                 if frame in missing:
                     _write_frame(writer, frame, recordings, picture)
                     log.add(frame, times_s)  # last: a frame without times is not complete
@@ -142,7 +136,9 @@ def record(
                     _check_replay(writer, frame, recordings[0])
                 if progress is not None:
                     progress(frame + 1, count)
-    return RecordResult(writer.out, count, written, sensors, len(actors.vehicles), len(actors.walkers), server.version)
+    return RecordResult(
+        writer.out, count, written, sensors, len(actors.vehicles), len(actors.walkers), connection.version
+    )
 
 
 def _write_frame(writer: CaptureWriter, frame: int, recordings: list[SensorRecording], picture: bytes | None) -> None:

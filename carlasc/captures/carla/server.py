@@ -45,6 +45,23 @@ class SemanticSweep:
     elapsed_s: float
 
 
+@dataclass(frozen=True)
+class ServerOptions:
+    """Where a CARLA server is, and how long it may take.
+
+    Attributes:
+        host: host of the server.
+        port: RPC port of the server.
+        traffic_port: port of the traffic manager.
+        timeout_s: longest time that the server may take to answer, seconds.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 2000
+    traffic_port: int = 8000
+    timeout_s: float = 60.0
+
+
 class Server:
     """A connection to a CARLA server, used in a `with` block. At its end the server is as it was before.
 
@@ -56,13 +73,11 @@ class Server:
         initial_actors: ids of the actors of the town before any was spawned, in ascending order.
     """
 
-    def __init__(self, host: str, port: int, timeout_s: float, carla: Any = None) -> None:
+    def __init__(self, options: ServerOptions, carla: Any = None) -> None:
         """Connect.
 
         Args:
-            host: host of the server.
-            port: its RPC port.
-            timeout_s: longest time that it may take to answer, seconds.
+            options: where the server is.
             carla: module of the client. None: the package `carla`.
 
         Raises:
@@ -70,10 +85,10 @@ class Server:
             ServerError: no server answers, or its version cannot be read.
         """
         self.carla = carla if carla is not None else import_extra("carla", "carla")
-        self.where, self.timeout_s = f"CARLA at {host}:{port}", timeout_s
+        self.where, self.timeout_s = f"CARLA at {options.host}:{options.port}", options.timeout_s
         self._cleanup = ExitStack()
-        self._client = self.carla.Client(host, port)
-        self._client.set_timeout(timeout_s)
+        self._client = self.carla.Client(options.host, options.port)
+        self._client.set_timeout(options.timeout_s)
         with self._waiting_for("its version"):
             self.version = str(self._client.get_server_version())
         self.initial_actors: tuple[int, ...] = ()

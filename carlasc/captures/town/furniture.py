@@ -139,17 +139,6 @@ def kiosk() -> Mesh:
     return builder.build()
 
 
-def bus_shelter() -> Mesh:
-    """Return a bus shelter that is open towards the street."""
-    builder = MeshBuilder()
-    builder.boxes(STATIC, (0, 0.55, 0), (3.6, 0.06, 2.3))
-    for x in (-1.8, 1.8):
-        builder.boxes(STATIC, (x, 0.1, 0), (0.06, 0.95, 2.3))
-    builder.boxes(STATIC, (0, 0, 2.3), (3.9, 1.4, 0.1))
-    builder.boxes(STATIC, (0, 0.3, 0.42), (2.4, 0.35, 0.05))
-    return builder.build()
-
-
 def fence(length_m: float, height_m: float = 1.3) -> Mesh:
     """Return a fence along x with its middle at the origin: posts, rails, and slats with gaps that some rays pass."""
     builder = MeshBuilder()

@@ -15,10 +15,10 @@ from carlasc.captures.town.simulated import SimulatedCapture
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.tables import CARLA
 from carlasc.errors import import_extra
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.storage.remote import check_shared
+from carlasc.storage.transport.targets import check_shared
 
 SETTINGS_FILE = "simulation.json"
 

@@ -35,10 +35,10 @@ from carlasc.motion import (
     tracks_from_boxes,
 )
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.folders.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence
 
 VERSION = 1
 """Version of the estimate of motion. It changes only when the same input gives other tracks."""

@@ -33,7 +33,7 @@ from carlasc.groundtruth.reporting.actors import Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD

@@ -17,7 +17,7 @@ from carlasc.inspection.cards.licenses import license_given
 from carlasc.inspection.cards.places import place_of
 from carlasc.inspection.cards.readme import readme
 from carlasc.inspection.cards.tables import tables_of
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source
 from carlasc.storage.files import parse_json, write_output
 from carlasc.storage.parquet.parquet_source import ParquetSource

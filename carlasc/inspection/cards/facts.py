@@ -12,7 +12,7 @@ from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
 from carlasc.inspection.overview import GridOverview, Overview, info
 from carlasc.inspection.statistics import Histogram, Statistics, stats
-from carlasc.running.options import Run
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.packed.stores import PackedSource
 from carlasc.storage.protocol import Sequence, Source

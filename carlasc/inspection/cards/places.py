@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from carlasc.errors import ArgumentError
-from carlasc.storage.folders.trees import RemoteTree, is_url
 from carlasc.storage.protocol import Source
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import is_url
 
 _BLOCK = 1 << 22  # bytes that are read at a time for a checksum
 _HUB = "https://huggingface.co/datasets/"

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError, import_extra, reading
 from carlasc.storage.arrays import check_ratio
 from carlasc.storage.files import parse_json_value
-from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import Tree
 
 _BLOSC = 32001  # the filter's registered number
 _GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # those of the filters that HDF5 brings

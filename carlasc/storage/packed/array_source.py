@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import check_size
-from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import SEQUENCE, FieldLayout, document_node, field_node
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.stores import PackedSequence, PackedSource
 from carlasc.storage.protocol import Sequence
+from carlasc.storage.transport.trees import Tree
 
 _T = TypeVar("_T")
 

@@ -25,7 +25,7 @@ from carlasc.errors import CarlascError, FormatError, describe, import_extra
 from carlasc.running import count_cores
 from carlasc.running.interrupts import postponed_interrupts
 from carlasc.storage.arrays import check_size
-from carlasc.storage.folders.trees import Tree
+from carlasc.storage.transport.trees import Tree
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
-from carlasc.storage.folders.names import leads_outside
+from carlasc.storage.files import leads_outside
 from carlasc.storage.packed.output import unfinished_error
 from carlasc.storage.protocol import Sequence, Source, identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink

@@ -23,11 +23,12 @@ from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import LocalTree, RemoteTree, Tree
 from carlasc.storage.packed.output import TABLES_MARK
 from carlasc.storage.packed.stores import PackedSequence, PackedSource
 from carlasc.storage.parquet.table_columns import column_types, join_columns
 from carlasc.storage.protocol import Sequence
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import LocalTree, Tree
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
 NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables

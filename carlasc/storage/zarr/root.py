@@ -9,7 +9,7 @@ from carlasc.storage.durability import rename
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.packed.output import remove, replaced
 from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.shards import METADATA, group_metadata
 
 _TRIES = 5  # other processes may begin, finish and replace the same store meanwhile

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
-from carlasc.storage.folders.trees import Tree
 from carlasc.storage.packed.array_layout import FieldLayout
 from carlasc.storage.packed.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
 from carlasc.storage.packed.columns import Column
+from carlasc.storage.transport.trees import Tree
 
 METADATA = "zarr.json"
 _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFFLE}

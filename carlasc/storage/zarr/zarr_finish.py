@@ -5,6 +5,7 @@ Everything is derived from the objects that exist, so that finishing may be inte
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,7 +26,7 @@ from carlasc.storage.packed.array_layout import (
 )
 from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.stores import STORE, VERSION, check_names
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.zarr.block_tables import block_of, parse_table
 from carlasc.storage.zarr.root import read_root, remove_replaced
 from carlasc.storage.zarr.shards import METADATA, array_metadata, column_metadata, encode_chunk, group_metadata
@@ -73,21 +74,26 @@ class StoreNodes:
             self.files[f"{node}/c/{'/'.join('0' * values.ndim)}"] = data
 
 
-def finish(target: Target, *, incomplete: bool = False) -> FinishedStore:
-    """Finish a store: write what it holds, by which it can be opened. A finished store is brought up to date.
+def finish(out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **storage_options: Any) -> FinishedStore:
+    """Write the metadata of a zarr store by which it can be opened: of what several commands have written to it.
+
+    The last part of a run does so by itself. This is for stores of which a part failed, or was never run. A finished store is brought up
+    to date.
 
     Args:
-        target: where the store is.
-        incomplete: finish although frames are missing that a run has announced.
+        out: the store: a path, or a URL of an object store.
+        incomplete: finish it although frames are missing that a run has announced.
+        **storage_options: options of fsspec for a URL.
 
     Returns:
-        What it holds.
+        What the store holds, and what is missing.
 
     Raises:
         ConflictError: announced frames are missing, and `incomplete` is not given.
         FormatError: something in it is damaged.
-        MissingDataError: there is no store of version 2.
+        MissingDataError: there is no zarr store of the present version.
     """
+    target = target_of(out, **storage_options)
     if isinstance(target, LocalTarget):
         remove_stale(target.folder, deep=True)
     paths = sorted(target.paths())

@@ -21,7 +21,7 @@ from carlasc.storage.packed.chunks import in_threads
 from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of
 from carlasc.storage.protocol import identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
-from carlasc.storage.targets import LocalTarget, Target
+from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame
 from carlasc.storage.zarr.root import StoreRoot, existing_options
 from carlasc.storage.zarr.shards import METADATA, group_metadata

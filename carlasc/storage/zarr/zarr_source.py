@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage.files import parse_json
-from carlasc.storage.folders.trees import RemoteTree, Tree
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import Tree
 from carlasc.storage.zarr.shards import METADATA, ZarrArray
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
-from carlasc.running.options import Run
 from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
 from carlasc.viewing.colors import merge_legends

@@ -137,10 +137,19 @@ def lookup_of(mapping: Mapping[int, int]) -> NDArray[np.int32]:
 def classes_of(
     labels: NDArray[np.unsignedinteger], lookup: NDArray[np.int32], table: ClassTable, where: str
 ) -> NDArray[np.int32]:
-    """Return labels as classes of another data set, by a table that `lookup_of` made.
+    """Return labels as classes of another data set.
+
+    Args:
+        labels: class ids, of any shape.
+        lookup: the table that `lookup_of` made.
+        table: class table of the ids.
+        where: the file or field, for errors.
+
+    Returns:
+        Classes in the shape of the labels.
 
     Raises:
-        FormatError: a label has no class; `where` is the file or field named in the message.
+        FormatError: a label has no class.
     """
     beyond = len(lookup) - 1
     found: NDArray[np.int32] = lookup[labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)]

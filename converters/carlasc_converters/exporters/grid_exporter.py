@@ -154,7 +154,13 @@ def choose_grid(
 
 
 def number_folders(names: Sequence[str], prefix: str, digits: int) -> dict[str, str]:
-    """Return a number of so many digits for each name: that of names which end in the prefix and a number, and the next free one of others."""
+    """Return a number for each name: that of names which end in the prefix and a number, and the next free one of others.
+
+    Args:
+        names: names of sequences.
+        prefix: what stands before the number.
+        digits: number of its digits.
+    """
     numbers = {name: match[1] for name in names if (match := re.search(rf"{prefix}(\d{{{digits}}})$", name))}
     free = (f"{number:0{digits}d}" for number in range(10_000) if f"{number:0{digits}d}" not in numbers.values())
     return {name: numbers.get(name) or next(free) for name in names}
@@ -184,7 +190,16 @@ def read_points(sequence: storage.Sequence, frame: int) -> NDArray[np.float32]:
 
 
 def scan_occupancy(sequence: storage.Sequence, points: NDArray[np.float32], spec: GridSpec) -> NDArray[np.bool_]:
-    """Return the voxels that hold a point of a scan: (X, Y, Z) of a grid in right-handed axes, as the points."""
+    """Return the voxels that hold a point of a scan.
+
+    Args:
+        sequence: says which ranges are used.
+        points: (N, 4) points and remission, right-handed.
+        spec: geometry of the grid, right-handed.
+
+    Returns:
+        (X, Y, Z) bool.
+    """
     occupancy = np.zeros(spec.num_voxels, np.bool_)
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
     low, high = sequence.metadata.min_range_m or 0.0, sequence.metadata.max_range_m or np.inf

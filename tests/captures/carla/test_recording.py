@@ -16,7 +16,7 @@ from helpers.servers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 
 from carlasc.captures import Capture, Lidar, ServerError, record
 from carlasc.captures.carla.sensors import ActorNumbers
-from carlasc.captures.carla.server import DETECTION, Server, decode_sweep
+from carlasc.captures.carla.server import DETECTION, Server, ServerOptions, decode_sweep
 from carlasc.captures.settings import sensor_offsets
 from carlasc.cli import app
 from carlasc.core.geometry import transform_points
@@ -26,9 +26,9 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, Dependenc
 ROAD, VEHICLE, WALKER = (CARLA.id_of(name) for name in ("Road", "Vehicle", "Pedestrian"))
 
 
-def call(out, server, **options):
-    chosen = {"count": 3, "sensors": 4, "town": "Town01", "traffic": "light", "timeout_s": 5.0, "bev": False} | options
-    return record(out, carla=server, **chosen)
+def call(out, server, timeout_s=5.0, **options):
+    chosen = {"count": 3, "sensors": 4, "town": "Town01", "traffic": "light", "bev": False} | options
+    return record(out, server=ServerOptions(timeout_s=timeout_s), carla=server, **chosen)
 
 
 @pytest.fixture(params=["0.9.13", "0.9.14", "0.9.16-dirty"])
@@ -162,7 +162,7 @@ def test_actors_are_numbered_in_the_order_in_which_they_were_spawned():
 
 
 def test_a_measurement_of_another_tick_is_skipped_or_refused():
-    with Server("127.0.0.1", 2000, 0.1, FakeServer()) as server:
+    with Server(ServerOptions("127.0.0.1", 2000, timeout_s=0.1), FakeServer()) as server:
         arrived = queue.Queue()
         for tick in (4, 5, 7):
             arrived.put(SimpleNamespace(frame=tick))
@@ -380,7 +380,7 @@ def test_bytes_and_poses_of_the_official_package_are_decoded():
     ("text", "numbers"), [("0.9.13", (0, 9, 13)), ("0.9.15-dirty", (0, 9, 15)), ("0.10.0", (0, 10, 0))]
 )
 def test_versions_are_read(text, numbers):
-    assert Server("127.0.0.1", 2000, 1.0, FakeServer(text)).version_numbers == numbers
+    assert Server(ServerOptions("127.0.0.1", 2000, timeout_s=1.0), FakeServer(text)).version_numbers == numbers
 
 
 def test_without_a_server_the_command_says_so_in_one_line(tmp_path):

@@ -12,7 +12,7 @@ from carlasc.core.geometry import relative_to, rotation_z, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 
 
 def bend(frames: int, step_m: float = 0.8, yaw_rad: float = 0.02) -> NDArray[np.float64]:

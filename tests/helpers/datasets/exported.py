@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 
 PATH = "Val/Town07_Light/cartesian"
 SPEC = GridSpec("cartesian", (80, 64, 30), (-8.0, -6.4, -2.8), (8.0, 6.4, 3.2))

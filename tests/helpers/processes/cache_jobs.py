@@ -1,4 +1,4 @@
-"""What processes do that share a cache: they are started, and killed, by the tests of `carlasc.storage.caching`."""
+"""What processes do that share a cache: they are started, and killed, by the tests of `carlasc.storage.transport.caching`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import resource
 from pathlib import Path
 from typing import Any
 
-from carlasc.storage import caching
-from carlasc.storage.caching import Cache, CachedTree
-from carlasc.storage.folders.trees import RemoteTree
+from carlasc.storage.transport import caching
+from carlasc.storage.transport.caching import Cache, CachedTree
+from carlasc.storage.transport.remote_tree import RemoteTree
 
 PIECE = 1000  # bytes of a request, so that small files are fetched in several
 

@@ -12,7 +12,7 @@ from carlasc.core.geometry import invert, relative_to, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import write_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from carlasc.storage.metadata import Metadata
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

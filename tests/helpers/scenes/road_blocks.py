@@ -13,7 +13,7 @@ from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 
 ROAD = 7
 

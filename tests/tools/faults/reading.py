@@ -198,9 +198,8 @@ def load_runs(root: Path, attempt: Attempt) -> None:
 
 def unpack_download(root: Path, attempt: Attempt) -> None:
     """Unpack a downloaded zip, and read what was unpacked before."""
-    from carlasc.storage.downloads.archives import Archive
-    from carlasc.storage.downloads.extraction import extract_zip, extracted_size
-    from carlasc.storage.downloads.fetching import _extracted_before
+    from carlasc.storage.downloading import Archive, _extracted_before
+    from carlasc.storage.extraction import extract_zip, extracted_size
 
     archive = root / "val_cartesian.zip"
     with tempfile.TemporaryDirectory(dir=root.parent) as out:

@@ -13,7 +13,7 @@ from helpers.scenes.lidar_frames import street_frame
 from carlasc import GridSpec, Scene, view
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from measuring.figures import Figure
 from measuring.sizes import Size
 

@@ -11,7 +11,7 @@ import carlasc
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z
 from carlasc.core.scans import Scan
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
 from carlasc.viewing.rendering.actor_boxes import box_edges, tight_boxes
 

@@ -8,7 +8,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.folders.folder import FolderSink
+from carlasc.storage.folder import FolderSink
 from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
 from carlasc.viewing.rendering.drawings import evidence_legend
 

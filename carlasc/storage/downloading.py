@@ -1,0 +1,287 @@
+"""`download`: fetches the published zips and, if asked to, extracts them.
+
+`ARCHIVES` is the table of the published zips (see the format page, `docs/format.md#layout`).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeGuard
+
+from carlasc.errors import ArgumentError, ConflictError, FormatError
+from carlasc.storage.durability import make_folder, remove_file
+from carlasc.storage.extraction import check_space, extract_zip, extracted_size
+from carlasc.storage.files import parse_json, remove_stale, write_json, writing
+from carlasc.storage.transport.fetching import FileFetch
+
+Progress = Callable[[int, int], None]
+
+
+_S3 = "https://curly-dataset-public.s3.us-east-2.amazonaws.com/CARLA"
+SEQUENCES = "sequences"
+
+
+@dataclass(frozen=True)
+class Archive:
+    """One zip.
+
+    Attributes:
+        name: file name.
+        what: "sequences" (scans, poses, coarse Cartesian grids), or grids alone: "fine", "cylindrical".
+        split: "train", "val", "test"; None if it holds all of them.
+        url: its URL.
+        gigabytes: its approximate size.
+    """
+
+    name: str
+    what: str
+    split: str | None
+    url: str
+    gigabytes: float
+
+    @property
+    def folder(self) -> str:
+        """Folder that it is extracted to, inside the one that the user chose.
+
+        The grids' zips have folders of their own: in them, the grids have the same names as the coarse grids of the sequences.
+        """
+        return "." if self.what == SEQUENCES else self.name.removesuffix(".zip")
+
+
+ARCHIVES = (
+    Archive("train_cartesian_13.zip", SEQUENCES, "train", f"{_S3}/train_cartesian_13.zip", 40.3),
+    Archive("train_cartesian_46.zip", SEQUENCES, "train", f"{_S3}/train_cartesian_46.zip", 39.7),
+    Archive("val_cartesian.zip", SEQUENCES, "val", f"{_S3}/val_cartesian.zip", 14.9),
+    Archive("test_cartesian.zip", SEQUENCES, "test", f"{_S3}/test_cartesian.zip", 14.6),
+    Archive("eval_fine.zip", "fine", None, f"{_S3}/eval_fine.zip", 4.3),
+    Archive(
+        "eval_cylindrical.zip",
+        "cylindrical",
+        None,
+        "https://www.dropbox.com/s/eb074zjfilri1ka/eval_cylindrical.zip?dl=1",
+        3.8,
+    ),
+)
+
+
+def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
+    """Return the zips of some splits, or of some grids.
+
+    Args:
+        splits: "train", "val", "test" or "all", in any case; none for grids, whose zips hold all splits.
+        what: "sequences", "fine" or "cylindrical".
+
+    Raises:
+        ArgumentError: `splits` or `what` is unknown, or a split is given for grids.
+    """
+    kinds = tuple(dict.fromkeys(archive.what for archive in ARCHIVES))
+    if what not in kinds:
+        raise ArgumentError("what", expected=f"one of {', '.join(kinds)}", found=repr(what))
+    known = tuple(dict.fromkeys(archive.split for archive in ARCHIVES if archive.split))
+    wanted = {split.lower() for split in splits}
+    if unknown := wanted - {*known, "all"}:
+        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found=", ".join(sorted(unknown)))
+    if what != SEQUENCES and wanted - {"all"}:
+        raise ArgumentError(
+            "split",
+            expected=f"none with {what} grids",
+            found=", ".join(sorted(wanted)),
+            advice="leave it out: one zip holds the grids of all splits",
+        )
+    if what == SEQUENCES and not wanted:
+        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found="none")
+    return tuple(
+        archive
+        for archive in ARCHIVES
+        if archive.what == what and (archive.split is None or archive.split in wanted or "all" in wanted)
+    )
+
+
+@dataclass(frozen=True)
+class Downloaded:
+    """What `download` did with one zip.
+
+    Attributes:
+        name: its file name.
+        path: where the zip is; None if it was extracted and removed.
+        size: its bytes; None if the server does not say.
+        fetched: bytes that were fetched in this run.
+        folder: where it was extracted to; None if it was not.
+        files: number of files that it was extracted to.
+    """
+
+    name: str
+    path: str | None
+    size: int | None
+    fetched: int
+    folder: str | None = None
+    files: int = 0
+
+
+@dataclass(frozen=True)
+class DownloadResult:
+    """What `download` did.
+
+    Attributes:
+        archives: the zips.
+        elapsed_s: seconds that it took.
+    """
+
+    archives: tuple[Downloaded, ...]
+    elapsed_s: float
+
+
+def download(
+    out: str | os.PathLike[str],
+    *,
+    split: str | Sequence[str] = (),
+    what: str = SEQUENCES,
+    extract: bool = False,
+    keep: bool = False,
+    base_url: str | None = None,
+    connections: int = 4,
+    progress: Progress | None = None,
+) -> DownloadResult:
+    """Fetch the published zips of one or more splits, or of the other grids. Called again, it continues where it stopped.
+
+    A zip need not be extracted: `carlasc.open` reads it in place.
+
+    Args:
+        out: folder that the zips are written to.
+        split: "train" (two zips), "val", "test", "all", or several of them; none for grids, whose zips hold all splits.
+        what: "sequences" (scans, poses, coarse grids), or only "fine" or "cylindrical" grids.
+        extract: extract each zip into `out` (grids into a folder of their own there), then remove it.
+        keep: with `extract`, keep the zip too.
+        base_url: fetch from `<base_url>/<name>`, a mirror.
+        connections: number of blocks of a zip that are fetched at once.
+        progress: called with the bytes done and their total, zip by zip: first those fetched, then those extracted.
+
+    Returns:
+        What was fetched, and where it is.
+
+    Raises:
+        ArgumentError: `split`, `what`, `keep` or `connections` make no sense.
+        MissingDataError: the server does not have the file.
+        ConflictError: another file has the name of a zip.
+        FormatError: what the server sends is not a zip, or keeps changing.
+        StorageError: there is not enough free space.
+        CarlascError: the server cannot be reached; what was fetched stays, and the next call continues with it.
+    """
+    began = time.perf_counter()
+    if connections < 1:
+        raise ArgumentError("connections", expected="1 or more", found=str(connections))
+    if keep and not extract:
+        raise ArgumentError("keep", expected="`extract=True` with it", found="it alone", advice="zips are kept anyway")
+    archives = choose_archives([split] if isinstance(split, str) else split, what)
+    folder = Path(out)
+    with writing(folder):
+        make_folder(folder)
+        remove_stale(folder)
+    done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
+    pending = [archive for archive in archives if done.get(archive) is None]
+    fetches = {archive: FileFetch(_url(archive, base_url), folder / archive.name, connections) for archive in pending}
+    _check_space(folder, fetches, extract)
+    results = []
+    for archive in archives:
+        before = done.get(archive)
+        if before is not None:
+            if not keep:
+                _remove_left(folder / archive.name, before.size)
+            results.append(before)
+            continue
+        fetch = fetches[archive]
+        fetched = _fetch(folder / archive.name, fetch, progress, 2e9 * archive.gigabytes)
+        result = Downloaded(archive.name, str(folder / archive.name), fetch.file.size, fetched)
+        results.append(_extract(result, folder, archive, keep, progress) if extract else result)
+    return DownloadResult(tuple(results), time.perf_counter() - began)
+
+
+def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float) -> int:
+    """Fetch a zip of at most `most` bytes unless it exists; returns the number of bytes fetched."""
+    size = fetch.file.size
+    if path.exists():
+        if size is not None and path.stat().st_size != size:
+            raise ConflictError(
+                path,
+                expected=f"nothing, or the zip of {size} bytes",
+                found=f"{path.stat().st_size} bytes",
+                advice="move it away, or choose another folder",
+            )
+        fetch.discard_record()  # of a run that was ended before it could
+        return 0
+    count = 0
+
+    def advance(number: int) -> None:
+        nonlocal count
+        count += number
+        if progress is not None:
+            progress(count, fetch.file.size or count)
+
+    resumed = fetch.run(advance, most)
+    return path.stat().st_size - resumed
+
+
+def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, progress: Progress | None) -> Downloaded:
+    path, target = folder / archive.name, folder / archive.folder
+    total, count = extracted_size(path), 0
+
+    def advance(number: int) -> None:
+        nonlocal count
+        count += number
+        if progress is not None:
+            progress(count, total)
+
+    files = extract_zip(path, target, advance)
+    if not keep:  # record that it was extracted: the next run would fetch it again
+        write_json(_record(folder, archive), {"size": path.stat().st_size, "files": files})
+        with writing(path):
+            remove_file(path)
+    kept = str(path) if keep else None
+    return Downloaded(result.name, kept, result.size, result.fetched, str(target), files)
+
+
+def _remove_left(path: Path, size: int | None) -> None:
+    """Remove a zip that was extracted, if the run that did so was ended before it could."""
+    if path.is_file() and path.stat().st_size == size:
+        with writing(path):
+            remove_file(path)
+
+
+def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
+    record = _record(folder, archive)
+    if not record.is_file():
+        return None
+    try:
+        values = parse_json(record.read_bytes(), str(record))
+    except FormatError:
+        return None  # what a power failure can leave: the zip is fetched again
+    size, files = values.get("size"), values.get("files")
+    if not (_is_count(size) and _is_count(files)):
+        found = f"{size!r} and {files!r}"
+        raise FormatError(record, expected="whole numbers as size and files", found=found, advice="remove it")
+    return Downloaded(archive.name, None, size, 0, str(folder / archive.folder), files)
+
+
+def _is_count(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _record(folder: Path, archive: Archive) -> Path:
+    return folder / f"{archive.name}.unpacked.json"
+
+
+def _check_space(folder: Path, fetches: dict[Archive, FileFetch], extract: bool) -> None:
+    """Check the free space for all bytes to fetch; the extracted files of a zip take about as much again."""
+    needed = 0
+    for archive, fetch in fetches.items():
+        needed += 0 if (folder / archive.name).exists() else fetch.remaining()
+        needed += (fetch.file.size or 0) if extract else 0
+    check_space(folder, needed, "for the zips and the files in them" if extract else "for the zips")
+
+
+def _url(archive: Archive, base_url: str | None) -> str:
+    return archive.url if base_url is None else f"{base_url.rstrip('/')}/{archive.name}"

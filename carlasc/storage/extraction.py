@@ -1,0 +1,138 @@
+"""Extracting a zip into a folder: no file outside of it, each file whole, and continued after an interruption."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+import zipfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import IO, BinaryIO
+
+from carlasc.errors import ConflictError, FormatError, StorageError, reading
+from carlasc.storage.arrays import check_ratio
+from carlasc.storage.files import leads_outside, remove_stale, write_many
+
+_BLOCK = 1 << 20  # bytes that are read at once
+_TOGETHER = 32  # files that are synced together
+
+
+def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> int:
+    """Extract all files of a zip, except those that an earlier run has extracted.
+
+    Args:
+        archive: the zip.
+        folder: where its files are written.
+        advance: called with the number of bytes of each file.
+
+    Returns:
+        The number of files in the zip.
+
+    Raises:
+        FormatError: the zip is damaged, or a name in it leads out of the folder; nothing is extracted in the latter case.
+        ConflictError: another file of the same name exists.
+        StorageError: the disk is full, or the folder cannot be written to.
+    """
+    with _opened(archive) as opened:
+        with _reading(archive):  # zipfile has no answer for a member without a name
+            members = [member for member in opened.infolist() if not member.is_dir()]
+        for member in members:
+            check_member(member, archive)
+        check_ratio(sum(member.file_size for member in members), archive.stat().st_size, str(archive))
+        missing = [member for member in members if not _extracted(member, folder / member.filename)]
+        check_space(folder, sum(member.file_size for member in missing), f"to extract {archive.name}")
+        advance(sum(member.file_size for member in members) - sum(member.file_size for member in missing))
+        for parent in {(folder / member.filename).parent for member in missing}:
+            remove_stale(parent)
+        for start in range(0, len(missing), _TOGETHER):
+            batch = missing[start : start + _TOGETHER]
+            write_many({folder / member.filename: partial(_copy, opened, member, archive) for member in batch})
+            advance(sum(member.file_size for member in batch))
+    return len(members)
+
+
+def extracted_size(archive: Path) -> int:
+    """Return the bytes of the files in a zip.
+
+    Raises:
+        FormatError: it is not a zip.
+    """
+    with _opened(archive) as opened:
+        return sum(member.file_size for member in opened.infolist())
+
+
+def _opened(archive: Path) -> zipfile.ZipFile:
+    with _reading(archive):
+        return zipfile.ZipFile(archive)
+
+
+def _reading(archive: Path) -> AbstractContextManager[None]:
+    return reading(archive, "a whole zip", "fetch it again")
+
+
+def _copy(opened: zipfile.ZipFile, member: zipfile.ZipInfo, archive: Path, target: BinaryIO) -> None:
+    with _reading(archive):
+        source = opened.open(member)
+    with source:
+        while block := _read(source, archive):
+            target.write(block)  # what fails here is the disk, not the zip
+    if target.tell() != member.file_size:
+        raise FormatError(
+            f"{archive}: {member.filename}",
+            expected=f"{member.file_size} bytes",
+            found=str(target.tell()),
+            advice="the zip is damaged: fetch it again",
+        )
+
+
+def _read(source: IO[bytes], archive: Path) -> bytes:
+    with _reading(archive):
+        return source.read(_BLOCK)
+
+
+def check_member(member: zipfile.ZipInfo, archive: Path) -> None:
+    """Refuse links, names that lead out of the folder, and what unpacks to far more than it takes.
+
+    Raises:
+        FormatError: names the member.
+    """
+    name = member.orig_filename  # as written in the zip: zipfile corrects some names by itself
+    if leads_outside(name):
+        raise FormatError(archive, expected="names inside the folder", found=repr(name), advice="nothing was extracted")
+    if stat.S_ISLNK(member.external_attr >> 16):
+        raise FormatError(archive, expected="files", found=f"the link {name!r}", advice="nothing was extracted")
+    check_ratio(member.file_size, member.compress_size, f"{archive}: {name}")
+
+
+def check_space(folder: Path, needed: int, purpose: str) -> None:
+    """Check that a disk has enough free space, before anything is written.
+
+    Raises:
+        StorageError: it has not.
+    """
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    if needed > free:
+        raise StorageError(
+            folder,
+            expected=f"{needed / 1e9:.1f} GB of free space {purpose}",
+            found=f"{free / 1e9:.1f} GB",
+            advice="free some space, or choose another disk",
+        )
+
+
+def _extracted(member: zipfile.ZipInfo, path: Path) -> bool:
+    if not path.exists():
+        return False
+    if path.is_file() and path.stat().st_size == member.file_size:
+        return True  # files are renamed into place, so one of the right size is whole
+    if path.is_file() and path.stat().st_size == 0:
+        return False  # what a power failure can leave
+    raise ConflictError(
+        path,
+        expected=f"nothing, or the zip's file of {member.file_size} bytes",
+        found="another file",
+        advice="choose another folder",
+    )

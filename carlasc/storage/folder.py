@@ -1,0 +1,249 @@
+"""The published layout in a folder: reading and writing, one file per frame and field. It is written to object stores too."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage import layout
+from carlasc.storage.files import parse_json, remove_stale
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.published import PublishedSequence, PublishedSource
+from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.transport.targets import LocalTarget, Target, target_of
+from carlasc.storage.transport.trees import LocalTree
+
+_ZIP_END, _ZIP_END_BYTES = b"PK\x05\x06", 22  # of the record that ends a zip without a comment, as NumPy writes them
+
+
+class FolderSource(PublishedSource):
+    """A folder of any level: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
+
+    def __init__(self, source: str | os.PathLike[str]) -> None:
+        """Remember the folder; it is listed when its sequences are asked for.
+
+        Raises:
+            MissingDataError: the folder does not exist.
+        """
+        self.folder = Path(source)
+        super().__init__(LocalTree(source))
+        if not self.folder.is_dir():
+            raise MissingDataError(
+                self.folder, expected="a folder", found="a file" if self.folder.exists() else "nothing"
+            )
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences found up to four levels down, by path.
+
+        Raises:
+            MissingDataError: no sequence was found; says what was looked for.
+        """
+        return {path: FolderSequence(self.folder, path) for path in super().sequences()}
+
+
+class FolderSequence(PublishedSequence):
+    """One local `<coordinates>` folder: its fields are memory-mapped.
+
+    Attributes:
+        folder: the folder.
+    """
+
+    def __init__(self, source: Path, path: str = "") -> None:
+        self.folder = source / path
+        super().__init__(LocalTree(source), path)
+
+    def _full_path(self) -> str:
+        return str(self.folder.absolute())  # so that "." inside a sequence has a name too
+
+
+class FolderSink(Sink):
+    """Writes the published layout into a folder, on this machine or in an object store.
+
+    Attributes:
+        target: where files are written.
+    """
+
+    is_readable = True
+
+    def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
+        """Take a folder, or the URL of one with options of fsspec; nothing is written yet.
+
+        Raises:
+            ArgumentError: nothing can be written to the URL.
+            DependencyError: the URL needs a package that is not installed.
+        """
+        self.target = target_of(out, **storage_options)
+        self.location = self.target.location
+
+    def sequence(self, path: str) -> FolderWriter:
+        """Start or continue a sequence's folder; the unfinished files of a run that was killed are removed."""
+        target = self.target.below(path)
+        if isinstance(target, LocalTarget):
+            remove_stale(target.folder)
+        return FolderWriter(target)
+
+    def source(self) -> Source:
+        """Return the folder."""
+        return (
+            FolderSource(self.target.folder)
+            if isinstance(self.target, LocalTarget)
+            else PublishedSource(self.target.tree)
+        )
+
+
+class FolderWriter(SequenceWriter):
+    """Writes one `<coordinates>` folder, each file whole; it can be pickled into workers.
+
+    Attributes:
+        target: the folder.
+    """
+
+    concurrent = True
+
+    def __init__(self, folder: str | os.PathLike[str] | Target) -> None:
+        self.target = target_of(folder)
+        self.location = self.target.location
+        self._whole = WholeFiles(self.location) if isinstance(self.target, LocalTarget) else None
+
+    def has(self, field: str, frame: int) -> bool:
+        """Whether the file exists and is whole, as far as its size says. In an object store, its folder is listed once."""
+        if self._whole is not None:
+            return self._whole.has(field, frame)
+        return self.target.tree.is_file(layout.field_named(field).file(frame))
+
+    def refresh(self) -> None:
+        """Forget the listings of folders in an object store."""
+        self.target.tree.refresh()
+
+    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+        """Write one file."""
+        self.target.put(*self._file(field, frame, array))
+
+    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+        """Write the files of several frames side by side, but the last one of each frame after its others."""
+        files = [
+            [self._file(field, frame, array) for field, array in fields.items()] for frame, fields in frames.items()
+        ]
+        self.target.put_many(
+            dict(file for parts in files for file in parts[:-1]), dict(parts[-1] for parts in files if parts)
+        )
+
+    def _file(self, field: str, frame: int, array: NDArray[Any]) -> tuple[str, bytes | memoryview]:
+        entry = layout.field_named(field)
+        path = entry.file(frame)
+        return path, entry.encode(array, self.target.tree.where(path))
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Return the array of a file that exists."""
+        entry = layout.field_named(field)
+        path = entry.file(frame)
+        return entry.decode(self.target.tree.read(path), self.target.tree.where(path))
+
+    def remove_grid(self, grid: str) -> None:
+        """Remove the report and the frames of a grid, then its params.json; other files in its folder stay."""
+        self.target.remove(layout.report_file(grid))
+        parts = [layout.field_named(f"{grid}/{part}").suffix for part in layout.GRID_FIELDS]
+        names = [
+            name for name in self.target.tree.entries(grid) if any(layout.frame_of(name, s) is not None for s in parts)
+        ]
+        self.target.remove_many(f"{grid}/{name}" for name in names)
+        self.target.remove(layout.params_file(grid))
+        if self._whole is not None:
+            self._whole.forget(grid)
+
+    def write_document(self, name: str, data: bytes) -> None:
+        """Write a text file."""
+        self.target.put(name, data)
+
+    def create_document(self, name: str, data: bytes) -> bool:
+        """Write a text file unless it exists. An empty one is replaced."""
+        if data and self._read(name) == b"":
+            self.target.remove(name)
+        return self.target.put(name, data, create=True)
+
+    def read_document(self, name: str) -> bytes | None:
+        """Return a text file's bytes, None if it does not exist, or is empty: a power failure can leave that, a run cannot."""
+        return self._read(name) or None
+
+    def _read(self, name: str) -> bytes | None:
+        try:
+            return bytes(self.target.tree.read(name))
+        except MissingDataError:
+            return None
+
+
+class WholeFiles:
+    """Whether the files of frames in one `<coordinates>` folder are whole, as far as their sizes say; it can be pickled.
+
+    A power failure can leave empty and short files. Files that are written durably (see `carlasc.storage.durability`) are whole as soon as they exist.
+    Others, and those of older versions, are checked by their sizes, which costs little more than to ask whether they exist.
+
+    Args:
+        folder: the folder.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
+        self._cells: dict[str, int] = {}  # of grids whose params.json has been read
+
+    def has(self, name: str, frame: int) -> bool:
+        """Whether the file of a field exists, and is neither empty nor of a length that it cannot have.
+
+        Files of a grid have a length that params.json tells. Files with a row per point must have as many rows as the points, which have as many as
+        the labels. A table of votes must end as a zip does. An empty file is valid for boxes, of which there may be none, and for a scan whose points
+        and labels are both empty.
+        """
+        entry = layout.field_named(name)
+        size = self._size(entry, frame)
+        if size is None:
+            return False
+        if entry.kind == "boxes":
+            return True
+        if entry.per == "voxel":
+            cells = self._cells_of(entry.folder)
+            return size > 0 if cells is None else size == cells * np.dtype(entry.dtype).itemsize
+        if entry.kind == "votes":
+            return self._ends_as_zip(entry.file(frame), size)
+        if entry.per == "point":
+            other = layout.SCAN_FIELDS["labels" if name == "points" else "points"]
+            rows, beside = size / _row(entry), self._size(other, frame)
+            return rows.is_integer() and (beside is None or beside / _row(other) == rows)
+        return size > 0
+
+    def forget(self, grid: str) -> None:
+        """Forget the size of a grid that is replaced."""
+        self._cells.pop(grid, None)
+
+    def _size(self, entry: layout.Field, frame: int) -> int | None:
+        try:
+            return os.stat(f"{self._folder}/{entry.file(frame)}").st_size
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+
+    def _ends_as_zip(self, path: str, size: int) -> bool:
+        with open(f"{self._folder}/{path}", "rb", buffering=0) as file:
+            return os.pread(file.fileno(), len(_ZIP_END), max(0, size - _ZIP_END_BYTES)) == _ZIP_END
+
+    def _cells_of(self, grid: str) -> int | None:
+        """Return the number of voxels of a grid; None if nothing says it."""
+        if grid not in self._cells:
+            where = f"{self._folder}/{layout.params_file(grid)}"
+            try:
+                with open(where, "rb") as file:
+                    spec = GridSpec.from_params(parse_json(file.read(), where), where)
+            except (FileNotFoundError, FormatError):
+                return None
+            self._cells[grid] = math.prod(spec.size)
+        return self._cells[grid]
+
+
+def _row(entry: layout.Field) -> int:
+    return np.dtype(entry.dtype).itemsize * (entry.columns or 1)

@@ -1,0 +1,189 @@
+"""The published layout in any tree of files: its sequences and their fields, one file per frame and field."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.frames import compact, expand
+from carlasc.errors import MissingDataError
+from carlasc.storage import layout
+from carlasc.storage.protocol import Sequence, Source, identity_of
+from carlasc.storage.transport.trees import Tree
+
+_DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them, as some zips have it
+_CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")
+
+
+class PublishedSource(Source):
+    """The published layout in a tree: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
+
+    def __init__(self, tree: Tree) -> None:
+        self.tree = tree
+        self.location = tree.location
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences found up to four levels down, by path.
+
+        Raises:
+            MissingDataError: no sequence was found; says what was looked for, and what was found instead.
+        """
+        paths = sorted(_find_sequences(self.tree, "", _DEPTH))
+        if not paths:
+            raise self._nothing_found()
+        return {path: PublishedSequence(self.tree, path) for path in paths}
+
+    def _nothing_found(self) -> MissingDataError:
+        entries, expected = self.tree.entries(), "a sequence or a folder above it"
+        if layout.PARAMS in entries or any(_is_frame(name) for name in entries):
+            found, advice = "the files of one field", "give the folder above this one"
+        elif stores := sorted(name for name in entries if name.endswith(_CONTAINERS)):
+            found, advice = ", ".join(stores[:4]), "give one of these"
+        elif entries.get("raw"):
+            found, advice = "a raw capture", "make grids of it first (carlasc regrid)"
+        else:
+            expected = "a data set, a split, a sequence or its cartesian/ or cylindrical/ folder"
+            found = f"none of {', '.join(sorted(_marks()))} within four levels of folders"
+            advice = "give the folder that holds Train, Val and Test, or one inside it"
+        return MissingDataError(self.location, expected=expected, found=found, advice=advice)
+
+
+class PublishedSequence(Sequence):
+    """One `<coordinates>` folder."""
+
+    tree: Tree
+
+    def __init__(self, tree: Tree, path: str = "") -> None:
+        self.tree = tree
+        self.path = path
+        self.location = tree.where(path)
+        self._prefix = f"{path}/" if path else ""
+        self.split, self.name, self.coordinates = identity_of(self._full_path())
+
+    def _full_path(self) -> str:
+        return self.location
+
+    @cached_property
+    def _listing(self) -> dict[str, layout.Field]:
+        """The fields whose folders exist: lists the sequence's folder, and asks for one file in each grid's."""
+        folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
+        fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
+        for grid in sorted(folders - layout.scan_folders()):
+            if self.tree.is_file(self._prefix + layout.params_file(grid)):
+                fields |= {f"{grid}/{part}": layout.field_named(f"{grid}/{part}") for part in layout.GRID_FIELDS}
+        return fields
+
+    @cached_property
+    def _frames(self) -> dict[str, NDArray[np.int64]]:
+        return {}
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields with at least one frame."""
+        return frozenset(name for name in self._listing if len(self.frames(name)))
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field; its folder is listed once."""
+        if field not in self._frames:
+            self._list_folder_of(field)
+        return self._frames[field]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"_frames": {name: compact(found) for name, found in self._frames.items()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _frames={name: expand(found) for name, found in state["_frames"].items()})
+
+    def _list_folder_of(self, field: str) -> None:
+        if field not in self._listing:
+            self._frames[field] = np.empty(0, np.int64)
+            return
+        folder = self._listing[field].folder
+        names = self.tree.entries(self._prefix + folder)
+        for sibling in (f for f in self._listing.values() if f.folder == folder):  # a grid's fields share one
+            numbers = [number for name in names if (number := layout.frame_of(name, sibling.suffix)) is not None]
+            self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one file; a local one is memory-mapped: the array is read-only, and its bytes are read when they are used."""
+        entry = self._entry(field)
+        path = self._prefix + entry.file(frame)
+        shape = self._shape(entry)
+        return entry.decode(self.tree.read(path, entry.size_of(shape)), self.tree.where(path), shape)
+
+    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
+        """Read several files; all at once from a remote tree."""
+        entry = self._entry(field)
+        paths = [self._prefix + entry.file(frame) for frame in frames]
+        shape = self._shape(entry)
+        files = zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True)
+        return [entry.decode(data, self.tree.where(path), shape) for path, data in files]
+
+    def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
+        """Return the file of each frame."""
+        return [self._prefix + self._entry(field).file(frame) for frame in frames]
+
+    def _entry(self, field: str) -> layout.Field:
+        if field not in self._listing:
+            raise MissingDataError(
+                self.location, expected=f"the field {field}", found=", ".join(sorted(self.fields())) or "none"
+            )
+        return self._listing[field]
+
+    def _shape(self, entry: layout.Field) -> tuple[int, int, int] | None:
+        return self.grids[entry.folder].size if entry.per in ("voxel", "vote") else None
+
+    def documents(self) -> tuple[str, ...]:
+        """Return the names of the text files."""
+        texts = (layout.POSES, layout.TIMES, layout.METADATA)
+        names = [name for name in texts if self.tree.is_file(self._prefix + name)]
+        grids = sorted({field.folder for name, field in self._listing.items() if "/" in name})
+        reports = [
+            layout.report_file(grid) for grid in grids if self.tree.is_file(self._prefix + layout.report_file(grid))
+        ]
+        return (*names, *(layout.params_file(grid) for grid in grids), *reports)
+
+    def read_document(self, name: str) -> bytes:
+        """Return a text file's bytes."""
+        return bytes(self.tree.read(self._prefix + name))
+
+    def unknown_files(self) -> tuple[str, ...]:
+        """Return the files and folders of the sequence that the layout does not know; names of folders end in "/"."""
+        known = {field.folder for field in self._listing.values()}
+        texts = {layout.POSES, layout.TIMES, layout.METADATA}
+        entries = self.tree.entries(self.path)
+        unknown = [
+            f"{name}/" if is_folder else name for name, is_folder in entries.items() if name not in known | texts
+        ]
+        for folder in sorted(known):
+            suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}
+            for name in self.tree.entries(self._prefix + folder):
+                frames = [number for suffix in suffixes if (number := layout.frame_of(name, suffix)) is not None]
+                if not frames and not (name in (layout.PARAMS, layout.REPORT) and folder not in layout.scan_folders()):
+                    unknown.append(f"{folder}/{name}")
+        return tuple(sorted(unknown))
+
+
+def _marks() -> frozenset[str]:
+    """Return the names that make a folder the `<coordinates>` folder of a sequence."""
+    return layout.scan_folders() | {layout.EVALUATION, layout.POSES}
+
+
+def _find_sequences(tree: Tree, path: str, depth: int) -> Iterator[str]:
+    children = {name: is_folder for name, is_folder in tree.entries(path).items() if not name.startswith(".")}
+    if _marks() & set(children) or any(name.startswith(f"{layout.EVALUATION}_") for name in children):
+        yield path
+        return
+    if depth == 0:
+        return
+    for name, is_folder in children.items():
+        if is_folder and name != "raw":  # a capture (carlasc.captures.raw) is not a sequence of the layout
+            yield from _find_sequences(tree, f"{path}/{name}" if path else name, depth - 1)
+
+
+def _is_frame(name: str) -> bool:
+    suffixes = {field.suffix for field in layout.SCAN_FIELDS.values()} | {".label", ".bin"}
+    return any(layout.frame_of(name, suffix) is not None for suffix in suffixes)

@@ -1,0 +1,370 @@
+"""Files of a remote store, kept in a folder of this machine: each file is fetched once, whatever number of processes read it.
+
+A file in the folder is named after its URL and its version, which is made of its size and of what the server says of its content
+(ETag, time of the last change). Its time of modification is when it was last compared with the remote file, its time of access is
+when it was last used. Both are set by this module.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import stat
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from carlasc.errors import ArgumentError, MissingDataError, StorageError
+from carlasc.storage.durability import sync_file
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.trees import LocalTree, Tree
+
+_PIECE = 4 << 20  # bytes of a range that is requested
+_AT_ONCE = 4  # ranges of a file that are requested side by side: they are in memory together
+_LARGEST_SHARE = 4  # a file of more than this part of the cache is read without it
+_PART, _LOCK = ".part", ".lock"
+_TOUCH_S = 0.5  # how exactly the time of the last use is known
+_FULL_S = 60.0  # how long nothing is fetched after the disk was full
+
+
+@dataclass(frozen=True)
+class Cache:
+    """A folder for files of remote stores. Several stores, and all processes of a machine, may share it.
+
+    Files are removed when the folder would become larger than `max_bytes`: those that were not used for the longest time first. A
+    process that is killed leaves nothing that is taken for a whole file. Locks are those of the operating system (`flock`), so the
+    folder should be on a local disk.
+
+    Attributes:
+        folder: the folder; it is created when a store is opened.
+        max_bytes: largest size of all files in it together.
+
+    Raises:
+        ArgumentError: `max_bytes` is not positive.
+    """
+
+    folder: str | os.PathLike[str]
+    max_bytes: int = 64 << 30
+
+    def __post_init__(self) -> None:
+        if self.max_bytes <= 0:
+            raise ArgumentError("max_bytes", expected="a number of bytes above 0", found=str(self.max_bytes))
+
+    def create(self) -> None:
+        """Create the folder.
+
+        Raises:
+            StorageError: it cannot be created or written to.
+        """
+        try:
+            Path(self.folder).mkdir(parents=True, exist_ok=True)
+            with _locked(Path(self.folder) / _LOCK, wait=False):
+                pass
+        except OSError as error:
+            raise StorageError(
+                self.folder,
+                problem=f"cannot be used as a cache: {error.strerror or error}",
+                advice="choose another folder",
+            ) from error
+
+    def path(self, name: str) -> Path:
+        """Return where a file is kept."""
+        return Path(self.folder) / name[:2] / name
+
+    def find(self, key: str, since: float) -> str | None:
+        """Return the name of the file with a key that was compared with the remote file after a time; None if there is none."""
+        with suppress(FileNotFoundError), os.scandir(Path(self.folder) / key[:2]) as entries:
+            for entry in entries:
+                if entry.name.startswith(f"{key}-") and not entry.name.endswith(_PART):
+                    with suppress(FileNotFoundError):  # removed meanwhile
+                        found = entry.stat()
+                        if found.st_mtime >= since and found.st_size == _size_of(entry.name):
+                            return entry.name
+        return None
+
+    def add(self, name: str, fill: Callable[[int], None], *, wait: bool = True) -> bool:
+        """Add a file unless it exists. One process fills it, the others wait for it.
+
+        Args:
+            name: name of the file, which ends in its size.
+            fill: writes the content to a descriptor.
+            wait: wait for a process that is filling it.
+
+        Returns:
+            Whether the file is there. It is not if another process is filling it and `wait` is not given, or if files that are being
+            filled leave no room for it.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        path = self.path(name)
+        part = path.with_name(f"{name}{_PART}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while not _is_whole(path):
+            with _locked(part, wait) as descriptor:  # the file being filled is its own lock
+                if descriptor is None:
+                    return False
+                if not _is_at(part, descriptor):
+                    continue  # the process before has renamed it, or removed it
+                try:
+                    if not _is_whole(path):
+                        if not self._make_room(descriptor, _size_of(name)):
+                            return False
+                        fill(descriptor)
+                        sync_file(descriptor)  # it has its full size already: after a power failure it would hold zeros
+                        part.rename(path)
+                finally:
+                    if _is_at(part, descriptor):
+                        part.unlink()
+        return True
+
+    def touch(self, name: str, *, compared: bool = False) -> bool:
+        """Note that a file is used, and that it was `compared` with the remote file; return whether it is still there."""
+        path, now = self.path(name), time.time_ns()
+        try:
+            os.utime(path, ns=(now, now if compared else path.stat().st_mtime_ns))
+        except FileNotFoundError:
+            return False  # removed to make room
+        except OSError:  # written by another user: its times stay as they are
+            return True
+        return True
+
+    def _make_room(self, descriptor: int, size: int) -> bool:
+        """Give an empty file its size, after as many of the oldest files were removed as needed; return whether there is room."""
+        folder = Path(self.folder)
+        with _locked(folder / _LOCK):
+            os.truncate(descriptor, 0)  # what a killed process left
+            files = sorted(_files(folder))
+            excess = sum(length for _, length, _ in files) + size - self.max_bytes
+            for _, length, path in files:
+                if excess <= 0:
+                    break
+                if _remove(path):
+                    excess -= length
+            if excess <= 0:
+                os.truncate(descriptor, size)  # other processes count it from now on
+            return excess <= 0
+
+
+class CachedTree(Tree):
+    """A remote tree whose files are read from a cache, whole files at a time.
+
+    A file is compared with the remote one once after the store was opened, by one process of the machine: changes after that are
+    not noticed. Where a file is too large for the cache, or the disk is full, its ranges are read from the server.
+    """
+
+    def __init__(self, remote: RemoteTree, cache: Cache) -> None:
+        """Create the folder of the cache; nothing is requested yet.
+
+        Raises:
+            StorageError: the folder cannot be created or written to.
+        """
+        cache.create()
+        self.remote = remote
+        self.cache = cache
+        self.location = remote.location
+        self._opened = time.time()
+        self._forget()
+
+    def _forget(self) -> None:
+        self._names: dict[str, str] = {}  # path -> name in the cache
+        self._used: dict[str, float] = {}  # name -> when this process last said that it uses it
+        self._too_large: set[str] = set()
+        self._full_until = 0.0
+
+    def entries(self, folder: str = "") -> Mapping[str, bool]:
+        """List the remote folder."""
+        return self.remote.entries(folder)
+
+    def is_file(self, path: str) -> bool:
+        """Whether the file exists."""
+        return path in self._names or self.remote.is_file(path)
+
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
+        """Map the cached file into memory."""
+        cached = self._from_cache(path, lambda tree, name: tree.read(name))
+        return self.remote.read(path) if cached is None else cached
+
+    def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
+        """Read the range of the cached file."""
+        cached = self._from_cache(path, lambda tree, name: tree.read_range(name, start, end))
+        return self.remote.read_range(path, start, end) if cached is None else cached
+
+    def fetch(self, path: str, *, wait: bool = True) -> bool:
+        """Bring a file into the cache, or say that it will be used.
+
+        Args:
+            path: the file.
+            wait: wait for another process that is fetching it.
+
+        Returns:
+            Whether it is in the cache.
+
+        Raises:
+            CarlascError: the file does not exist, or the server does not answer.
+        """
+        for _ in range(2):
+            name = self._find(path, wait)
+            if name is None or self.cache.touch(name):
+                return name is not None
+            self._names.pop(path, None)  # removed to make room: fetched again
+        return False
+
+    def _from_cache(self, path: str, read: Callable[[LocalTree, str], bytes | memoryview]) -> bytes | memoryview | None:
+        for _ in range(2):
+            name = self._find(path)
+            if name is None:
+                return None
+            place = self.cache.path(name)
+            try:
+                data = read(_CacheFolder(place.parent, self.where(path)), name)
+            except MissingDataError:
+                self._names.pop(path, None)  # removed to make room: fetched again
+                continue
+            if time.monotonic() - self._used.get(name, -_TOUCH_S) >= _TOUCH_S:
+                self._used[name] = time.monotonic()
+                self.cache.touch(name)
+            return data
+        return None
+
+    def _find(self, path: str, wait: bool = True) -> str | None:
+        """Return the name of a file in the cache, where it is put if need be; None if it must be read without the cache."""
+        if (name := self._names.get(path)) is not None:
+            return name
+        if path in self._too_large:
+            return None
+        key = self._key(path)
+        name = self.cache.find(key, self._opened)
+        if name is None:
+            size, version = self.remote.version(path)
+            if size > self.cache.max_bytes // _LARGEST_SHARE:
+                self._too_large.add(path)
+                return None
+            name = f"{key}-{_digest(version)[:16]}-{size}"
+            if not self._add(path, name, wait):
+                return None
+            self.cache.touch(name, compared=True)
+        self._names[path] = name
+        return name
+
+    def _add(self, path: str, name: str, wait: bool) -> bool:
+        if time.monotonic() < self._full_until:
+            return _is_whole(self.cache.path(name))
+        try:
+            return self.cache.add(name, partial(self._fill, path, _size_of(name)), wait=wait)
+        except OSError:  # the disk is full: what is asked for is read from the server
+            self._full_until = time.monotonic() + _FULL_S
+            return False
+
+    def _fill(self, path: str, size: int, descriptor: int) -> None:
+        starts = range(0, size, _PIECE)
+        for first in range(0, len(starts), _AT_ONCE):
+            pieces = [(path, start, min(start + _PIECE, size)) for start in starts[first : first + _AT_ONCE]]
+            for (_, start, _), data in zip(pieces, self.remote.read_ranges(pieces), strict=True):
+                _write(descriptor, data, start)
+
+    def _key(self, path: str) -> str:
+        options = self.remote.requests.options
+        endpoint = options.get("endpoint_url") or dict(options.get("client_kwargs") or {}).get("endpoint_url") or ""
+        return _digest(f"{endpoint}\n{self.location}\n{path}")[:32]
+
+    def __getstate__(self) -> dict[str, Any]:
+        own = ("_names", "_used", "_too_large", "_full_until")
+        return {name: value for name, value in self.__dict__.items() if name not in own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+
+class _CacheFolder(LocalTree):
+    """A folder of the cache. Its errors name the remote file."""
+
+    def __init__(self, root: Path, named: str) -> None:
+        super().__init__(root)
+        self._named = named
+
+    def where(self, path: str) -> str:
+        return f"{self._named} (its copy {path})"
+
+
+@contextmanager
+def _locked(path: Path, wait: bool = True) -> Iterator[int | None]:
+    """Open a file, which is created, and hold its lock; None if it is held by another and `wait` is not given.
+
+    The operating system releases the lock of a process that ends in any way. The lock is released before the file is closed, because
+    a forked process may have inherited the descriptor.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield None
+            return
+        try:
+            yield descriptor
+        finally:
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+    finally:
+        os.close(descriptor)
+
+
+def _size_of(name: str) -> int:
+    """Return the size of a whole file, which its name ends in."""
+    return int(name.rpartition("-")[2])
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file exists and has the size that its name says: a machine that loses power may leave a shorter one."""
+    try:
+        return path.stat().st_size == _size_of(path.name)
+    except FileNotFoundError:
+        return False
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Whether an open file is still the one at a path."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def _files(folder: Path) -> Iterator[tuple[int, int, Path]]:
+    """Yield the last use, the size and the path of each file in the cache."""
+    for place in folder.iterdir():
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(place) as entries:
+            for entry in entries:
+                with suppress(FileNotFoundError):  # renamed meanwhile
+                    found = entry.stat()
+                    if stat.S_ISREG(found.st_mode):
+                        yield found.st_atime_ns, found.st_size, Path(entry.path)
+
+
+def _remove(path: Path) -> bool:
+    """Remove a file, but not one that a process is filling; return whether it is gone."""
+    if path.suffix != _PART:
+        path.unlink(missing_ok=True)
+        return True
+    with _locked(path, wait=False) as descriptor:
+        if descriptor is None:
+            return False
+        path.unlink(missing_ok=True)
+        return True
+
+
+def _write(descriptor: int, data: bytes | memoryview, start: int) -> None:
+    view = memoryview(data)
+    while view:
+        written = os.pwrite(descriptor, view, start)
+        view, start = view[written:], start + written
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,166 @@
+"""What the errors of requests mean: whether a request may succeed later, and what is said of it where it does not.
+
+fsspec passes on the errors of the libraries below it, which share no type. `TEMPORARY` names the public classes of those by which a connection failed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from typing import NoReturn
+
+from carlasc.errors import CarlascError, MissingDataError, StorageError
+
+TEMPORARY: Mapping[str, tuple[str, ...]] = {
+    "aiohttp": ("ClientConnectionError", "ClientPayloadError"),
+    "aiohttp.http_exceptions": ("HttpProcessingError",),
+    "botocore.exceptions": ("ConnectionError", "HTTPClientError", "FlexibleChecksumError", "IncompleteReadError"),
+    "botocore.parsers": ("ResponseParserError",),
+    "requests.exceptions": ("ConnectionError", "ChunkedEncodingError"),
+    "http.client": ("IncompleteRead",),
+    "httpx": ("TransportError",),
+    "httpx2": ("TransportError",),
+}
+"""Errors of the connection by module. Those of a module that no code has imported cannot have been raised."""
+
+_BUSY = frozenset({408, 409, 425, 429})  # of the statuses below 500, those of requests that may succeed later
+_BUSY_CODES = frozenset({"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"})
+
+
+class WrongAnswerError(Exception):
+    """A server sent something other than what was asked for: it is asked again."""
+
+
+def is_temporary(error: BaseException) -> bool:
+    """Whether a request that failed with an error may succeed when it is sent again."""
+    if is_offline(error):
+        return False
+    if _is_of_connection(error):
+        return True
+    status, code = _status_and_code(error)
+    if code in _BUSY_CODES or status in _BUSY:
+        return True
+    if status is not None:
+        return status >= 500 and status != 501  # not implemented
+    return isinstance(error, WrongAnswerError | TimeoutError | ConnectionError)
+
+
+def is_offline(error: BaseException) -> bool:
+    """Whether the Hub was not asked, because the environment variable HF_HUB_OFFLINE forbids it."""
+    return type(error).__name__ == "OfflineModeIsEnabled"
+
+
+def exists_error(error: object) -> bool:
+    """Whether a create-only put failed because the file exists."""
+    return isinstance(error, FileExistsError) or (
+        isinstance(error, BaseException) and _status_and_code(error)[0] == 412
+    )
+
+
+def ends_before(error: BaseException) -> bool:
+    """Whether a request failed because its range starts behind the end of the file."""
+    return _status_and_code(error)[0] == 416
+
+
+def bucket_is_missing(error: BaseException) -> bool:
+    """Whether the bucket of an S3 URL does not exist."""
+    return _status_and_code(error)[1] == "NoSuchBucket"
+
+
+def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn:
+    """Raise the error of a request as one line that holds no credentials.
+
+    The messages of other libraries are left out: they may hold a URL's signature or a key. For the same reason, the error has no cause.
+
+    Args:
+        where: the file, without credentials.
+        error: what the request raised.
+        writing: whether the file was to be written.
+
+    Raises:
+        MissingDataError: the file or the bucket does not exist.
+        StorageError: it cannot be written (where `writing`).
+        CarlascError: anything else.
+    """
+    if isinstance(error, CarlascError):
+        raise error
+    status, code = _status_and_code(error)
+    kind: type[CarlascError] = StorageError if writing else CarlascError
+    verb = "cannot be written" if writing else "cannot be read"
+    if code == "NoSuchBucket":
+        raise (StorageError if writing else MissingDataError)(
+            where, expected="a bucket that exists", found="no such bucket", advice="check its name, or create it"
+        ) from None
+    if isinstance(error, FileNotFoundError) and not writing:
+        raise MissingDataError(where, expected="a file", found="nothing") from None
+    if isinstance(error, PermissionError) or status in (401, 403):
+        raise kind(
+            where,
+            problem=f"{verb}: access was refused ({code or status or 'no permission'})",
+            advice="check the credentials and what they are permitted to do",
+        ) from None
+    if "Credential" in type(error).__name__:
+        raise kind(
+            where,
+            problem=f"{verb}: no credentials were found",
+            advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a public bucket",
+        ) from None
+    if is_offline(error):
+        raise kind(where, problem=f"{verb}: HF_HUB_OFFLINE is set", advice="unset it to use the network") from None
+    if is_temporary(error):
+        raise kind(
+            where,
+            problem=f"{verb}: the server failed at each attempt, last with {describe_failure(error)}",
+            advice="try again later",
+        ) from None
+    raise kind(where, problem=f"{verb}: {describe_failure(error)}") from None
+
+
+def describe_failure(error: BaseException) -> str:
+    """Return what an error of a request says without credentials: a status, a code or the name of its class."""
+    status, code = _status_and_code(error)
+    if isinstance(error, WrongAnswerError):
+        return str(error)
+    parts = [str(status) if status else "", code if code != str(status) else ""]
+    if text := " ".join(part for part in parts if part):
+        return text
+    reason = getattr(error, "strerror", None)
+    name = type(error).__name__
+    return f"{name} ({reason})" if isinstance(reason, str) and type(error).__module__ == "builtins" else name
+
+
+def _is_of_connection(error: BaseException) -> bool:
+    """Whether an error, or one that it was raised from, is of the connection: aiohttp gives an answer that is no HTTP a status of its own."""
+    kinds = [
+        getattr(sys.modules[module], name, ())
+        for module, names in TEMPORARY.items()
+        if module in sys.modules
+        for name in names
+    ]
+    return any(isinstance(cause, kind) for cause in _causes(error) for kind in kinds)
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    found: BaseException | None = error
+    for _ in range(5):
+        if found is None:
+            return
+        yield found
+        found = found.__cause__
+
+
+def _status_and_code(error: BaseException) -> tuple[int | None, str]:
+    """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), where it has them."""
+    for cause in (
+        () if _is_of_connection(error) else _causes(error)
+    ):  # aiohttp's errors of payloads have a "code" of their own
+        answer = getattr(cause, "response", None)
+        if isinstance(answer, Mapping):  # botocore
+            status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode")
+            code = str(answer.get("Error", {}).get("Code", ""))
+            return (status if isinstance(status, int) else None), code
+        for holder, name in ((cause, "status"), (cause, "code"), (answer, "status_code")):
+            found = getattr(holder, name, None)
+            if isinstance(found, int) and 100 <= found < 600:
+                return found, ""
+    return None, ""

@@ -1,0 +1,273 @@
+"""Where stores are written: a folder on this machine or in an object store. Every file is written whole, or not at all."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.running.spreading import Run
+from carlasc.storage.files import leads_outside, write_atomic, write_many
+from carlasc.storage.transport.failures import exists_error, fail
+from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.requests import Request
+from carlasc.storage.transport.servers import HUB
+from carlasc.storage.transport.trees import LocalTree, Tree, is_url
+
+_EXCLUSIVE = frozenset(
+    {"s3", "s3a", "gs", "gcs", "memory"}
+)  # schemes whose file systems put an object only if it is new
+_MARK = "carlasc-writer"
+_MOST_REMOVED = 1000  # objects in one request: the limit of S3
+
+
+class Target(ABC):
+    """A folder of files that is written to. Paths in it are relative, their parts joined by "/". It can be pickled.
+
+    Attributes:
+        location: its name in errors: a folder or a URL.
+        tree: reads what was written.
+    """
+
+    location: str
+    tree: Tree
+
+    @abstractmethod
+    def below(self, folder: str) -> Target:
+        """Return a folder in this one.
+
+        Raises:
+            FormatError: the path leads out of the folder.
+        """
+
+    @abstractmethod
+    def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
+        """Write a whole file, with the folders that it needs.
+
+        Args:
+            path: the file; an existing one is replaced unless `create` is given.
+            data: its bytes.
+            create: write only if the file does not exist. Of several processes that do so at once, exactly one succeeds.
+
+        Returns:
+            False if `create` is given and the file exists; True otherwise.
+
+        Raises:
+            FormatError: the path leads out of the folder.
+            StorageError: it cannot be written; nothing is left behind.
+        """
+
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write several files: those of a group side by side, and each group after those before it."""
+        for group in groups:
+            for path, data in group.items():
+                self.put(path, data)
+
+    @abstractmethod
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """Yield the paths of all files below a folder, in any order; none if it does not exist."""
+
+    @abstractmethod
+    def remove(self, path: str) -> None:
+        """Remove a file, or a folder with all files below it, if it exists."""
+
+    def remove_many(self, paths: Iterable[str]) -> None:
+        """Remove several files, if they exist; object stores do so with few requests."""
+        for path in paths:
+            self.remove(path)
+
+
+class LocalTarget(Target):
+    """A folder on this machine."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self.location = str(self.folder)
+        self.tree = LocalTree(self.folder)
+
+    def below(self, folder: str) -> LocalTarget:
+        """Return a folder in this one."""
+        return LocalTarget(self._inside(folder))
+
+    def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
+        """Write a file under a temporary name, then rename it, or link it where only a new file is wanted."""
+        return write_atomic(self._inside(path), data, create=create)
+
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write several files, which are synced together."""
+        write_many(*({self._inside(path): data for path, data in group.items()} for group in groups))
+
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """Walk the folders; the temporary files of writers are left out."""
+        for root, _, names in os.walk(self._inside(folder) if folder else self.folder):
+            for name in names:
+                if not name.startswith("."):
+                    yield (Path(root) / name).relative_to(self.folder).as_posix()
+
+    def remove(self, path: str) -> None:
+        """Remove a file or a folder."""
+        place = self._inside(path)
+        if place.is_dir() and not place.is_symlink():
+            shutil.rmtree(place)
+        else:
+            place.unlink(missing_ok=True)
+
+    def _inside(self, path: str) -> Path:
+        if leads_outside(path):
+            raise FormatError(path, expected=f"a path inside {self.folder}", found="one that leads elsewhere")
+        return self.folder / path
+
+
+class RemoteTarget(Target):
+    """A folder in an object store: a prefix of the keys of a bucket.
+
+    An object store shows an object only when all its bytes have arrived, so an upload is whole or absent. Folders need not be made.
+
+    Attributes:
+        exclusive: whether the store has a create-only put. S3 has one ("If-None-Match: *") and so has Google Cloud Storage. In other
+            stores, `put` with `create` first asks whether the file exists: two processes that do so at once may both succeed.
+    """
+
+    tree: RemoteTree
+
+    def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
+        """Take a folder's URL, and fsspec's storage options; nothing is requested yet.
+
+        Raises:
+            ArgumentError: nothing can be written there, as with http and the Hugging Face Hub.
+            DependencyError: the URL needs a package that is not installed.
+        """
+        self.tree = RemoteTree(url, options)
+        self.location = self.tree.location
+        if url.startswith("http"):
+            raise ArgumentError(
+                self.location,
+                expected="a folder, or a URL of an object store",
+                found="a web server, which is only read",
+            )
+        if self.tree.requests.scheme == HUB:
+            raise ArgumentError(
+                self.location,
+                expected="a folder, or a URL of an object store",
+                found="the Hugging Face Hub, where each file would be a commit",
+                advice="write it here, then upload it with `hf upload-large-folder`",
+            )
+        self.exclusive = url.partition("://")[0] in _EXCLUSIVE
+
+    def below(self, folder: str) -> RemoteTarget:
+        """Return a folder in this one."""
+        target = copy.copy(self)
+        target.tree = self.tree.below(self._checked(folder))
+        target.location = target.tree.location
+        return target
+
+    def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
+        """Write an object with one request.
+
+        A create-only put whose answer is lost is sent again, and then finds the object that it made itself. In S3, each object made
+        so has a mark by which its writer recognises it; in other stores, such a put is reported as one that came too late.
+        """
+        request = self._request(path, data)
+        if create and not self.exclusive and self.tree.size(path) is not None:
+            return False
+        if not (create and self.exclusive):
+            self._send({path: data}, [request])
+            return True
+        mark = os.urandom(16).hex()
+        options = {"mode": "create"} | ({"Metadata": {_MARK: mark}} if self.tree.requests.is_s3 else {})
+        (answer,) = self.tree.requests.send([replace(request, options=options)])
+        if isinstance(answer, Exception):
+            if not exists_error(answer):
+                fail(self.tree.where(path), answer, writing=True)
+            if not self._has_mark(path, mark):
+                return False
+        self.tree.note(path, len(data))
+        return True
+
+    def _has_mark(self, path: str, mark: str) -> bool:
+        if not self.tree.requests.is_s3:
+            return False
+        (found,) = self.tree.requests.send([Request("metadata", self.tree.url(path))])
+        if isinstance(found, FileNotFoundError):
+            return False  # it was removed meanwhile
+        if isinstance(found, Exception):
+            fail(self.tree.where(path), found, writing=True)
+        return found.get(_MARK) == mark
+
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write the objects of each group side by side."""
+        for group in groups:
+            self._send(group, [self._request(path, data) for path, data in group.items()])
+
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """List all objects below the folder: 1000 with each request."""
+        return self.tree.paths(self._checked(folder))
+
+    def remove(self, path: str) -> None:
+        """Remove the object of this name, and all objects below it."""
+        self.remove_many(self.paths(path))
+
+    def remove_many(self, paths: Iterable[str]) -> None:
+        """Remove objects, in S3 1000 with each request; those that do not exist are left out."""
+        found = [self._checked(path) for path in paths]
+        urls = [self.tree.url(name) for name in found]
+        if self.tree.requests.is_s3:
+            batches = [urls[start : start + _MOST_REMOVED] for start in range(0, len(urls), _MOST_REMOVED)]
+            requests = [Request("rm", batch) for batch in batches]
+        else:
+            requests = [Request("rm_file", url) for url in urls]
+        for answer in self.tree.requests.send(requests):
+            if isinstance(answer, Exception) and not isinstance(answer, FileNotFoundError):
+                fail(self.location, answer, writing=True)
+        for name in found:
+            self.tree.note(name, None)
+
+    def _request(self, path: str, data: bytes | memoryview) -> Request:
+        return Request("pipe_file", self.tree.url(self._checked(path)), data=bytes(data))
+
+    def _send(self, files: Mapping[str, bytes | memoryview], requests: list[Request]) -> None:
+        answers = self.tree.requests.send(requests)
+        for path, answer in zip(files, answers, strict=True):
+            if isinstance(answer, Exception):
+                fail(self.tree.where(path), answer, writing=True)
+        for path, data in files.items():
+            self.tree.note(path, len(data))
+
+    def _checked(self, path: str) -> str:
+        if leads_outside(path):
+            raise FormatError(path, expected=f"a path inside {self.location}", found="one that leads elsewhere")
+        return path
+
+
+def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> Target:
+    """Return the folder to write to at a path or a URL; a Target is returned unchanged. Nothing is written yet.
+
+    Args:
+        out: a folder, or the URL of one in an object store.
+        **storage_options: options of fsspec for the URL.
+
+    Raises:
+        ArgumentError: nothing can be written to the URL.
+        DependencyError: the URL needs a package that is not installed.
+    """
+    if isinstance(out, Target):
+        return out
+    text = os.fspath(out)
+    return RemoteTarget(text, storage_options) if is_url(text) else LocalTarget(text.removeprefix("file://"))
+
+
+def check_shared(location: str, run: Run) -> None:
+    """Check that all processes of a run can use a place: `memory://` exists in one process only.
+
+    Raises:
+        ArgumentError: they cannot.
+    """
+    if location.startswith("memory://") and not run.is_alone:
+        found = "an executor" if run.executor is not None else str(run.processes)
+        raise ArgumentError("workers", expected=f"1 with {location}, which exists in one process only", found=found)

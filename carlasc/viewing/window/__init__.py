@@ -1,1 +1,0 @@
-"""A window on the desktop."""

@@ -1,0 +1,17 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from carlasc.errors import StorageError
+from carlasc.storage.packed.output import PatientFile
+
+
+def test_a_file_that_cannot_be_created_can_be_closed_as_python_does_when_it_forgets_it(tmp_path: Path) -> None:
+    (tmp_path / "folder").write_bytes(b"a file")
+    file = PatientFile.__new__(PatientFile)
+    with pytest.raises(StorageError, match="cannot be written"):
+        file.__init__(tmp_path / "folder" / "x.h5", tmp_path / "x.h5")  # type: ignore[misc]
+    file.close()
+    assert file.closed
