@@ -49,18 +49,13 @@ class ScanMotion:
 
     Attributes:
         frame: frame number.
-        segments: actors that may move.
+        segments: actors that may move, with at most `_SIGHTING_POINTS` points each; `members` are complete.
         standing: standing points of classes that may move.
     """
 
     frame: int
     segments: tuple[Segment, ...]
     standing: Standing
-
-    def thinned(self) -> ScanMotion:
-        """Return the same actors with at most `_SIGHTING_POINTS` points each; `members` stay complete."""
-        segments = (replace(s, points=thin(s.points, _SIGHTING_POINTS)) for s in self.segments)
-        return replace(self, segments=tuple(segments))
 
 
 class ScanFeed:
@@ -279,7 +274,8 @@ class ScanFeed:
             speed = self.options.motion.min_speed_m_s
             found = segment_by_flow(frame, scan, pose, min_speed_m_s=speed)
             standing = standing_points(frame, scan, pose, self.classes.movable, min_speed_m_s=speed)
-        return ScanMotion(frame, tuple(found), standing)
+        thinned = [replace(segment, points=thin(segment.points, _SIGHTING_POINTS)) for segment in found]
+        return ScanMotion(frame, tuple(thinned), standing)
 
     def _voting_points(self, frame: int) -> Scan:
         """Read a scan without the points that do not vote: unlabelled, too near or too far. Points with one origin are together."""
