@@ -32,6 +32,7 @@ from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans
 from .groundtruth import Voting as Voting
 from .groundtruth import regrid as regrid
+from .inspection import CardDetails as CardDetails
 from .inspection import card as card
 from .inspection import doctor as doctor
 from .inspection import info as info

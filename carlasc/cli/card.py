@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import typer
 
@@ -44,12 +44,12 @@ class DetailFlags(Flags):
         str | None, typer.Option(metavar="YYYY-MM-DD", help="Date of the publication; today if not given.")
     ] = None
 
-    def details(self) -> dict[str, Any]:
+    def details(self) -> carlasc.CardDetails:
         """Return what the card says of them."""
         if self.citation is not None and not self.citation.is_file():
             raise MissingDataError(self.citation, expected="a BibTeX file", found="nothing")
         citation = None if self.citation is None else self.citation.read_text(errors="replace")
-        return {**vars(self), "authors": self.authors or (), "citation": citation}
+        return carlasc.CardDetails(**{**vars(self), "authors": self.authors or (), "citation": citation})
 
 
 def card(
@@ -79,7 +79,7 @@ def card(
     """
     about = details.details()
     with work.spread("Counting", usual=1) as run:
-        result = carlasc.card(source, out, **about, pictures=pictures, every=every, overwrite=overwrite, run=run)
+        result = carlasc.card(source, out, about=about, pictures=pictures, every=every, overwrite=overwrite, run=run)
     if as_json:
         print_json(result.to_dict())
     else:

@@ -12,7 +12,7 @@ from carlasc.cli.common import Json, console, echo, file_option, line, place_arg
 from carlasc.cli.flags import WorkFlags
 
 if TYPE_CHECKING:
-    from carlasc.groundtruth.reporting.actors import Actor
+    from carlasc.groundtruth.reporting.facts import ActorTrack
     from carlasc.inspection.reports import ReportResult
 
 _SHOWN = 12
@@ -72,7 +72,7 @@ def _print(result: ReportResult, *, everything: bool) -> None:
             _print_actors(one.actors, everything=everything)
 
 
-def _print_actors(actors: tuple[Actor, ...], *, everything: bool) -> None:
+def _print_actors(actors: tuple[ActorTrack, ...], *, everything: bool) -> None:
     from carlasc.cli.tables import print_table
 
     shown = actors if everything else actors[:_SHOWN]

@@ -21,7 +21,7 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromScans, Observe, Voting
-from carlasc.groundtruth.reporting.actors import Residual
+from carlasc.groundtruth.reporting.facts import Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.running.spreading import Run

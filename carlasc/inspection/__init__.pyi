@@ -1,5 +1,6 @@
 from .cards.card import CardResult as CardResult
 from .cards.card import card as card
+from .cards.facts import CardDetails as CardDetails
 from .findings import Finding as Finding
 from .findings import ValidationResult as ValidationResult
 from .heldout import EVERY as EVERY

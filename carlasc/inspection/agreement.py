@@ -1,4 +1,4 @@
-"""The agreement of scans with a grid: how many points lie in voxels of their class, and which known mistake explains a low share.
+"""The agreement of scans with a grid: how many points lie in voxels of their class, which known mistake explains a low share, and how much of the ground lies below the grid.
 
 The share of labelled points that fall in voxels of their class is measured for the data as they are, for points whose axes are changed in
 the ways that are common mistakes, and for the grid shifted by one cell in each direction. Only points in known voxels count, so that a grid
@@ -7,12 +7,140 @@ with unknown voxels is not rated lower than a full one.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import Triple
+from carlasc.core.compiling import cached
 from carlasc.core.grids import Grid, GridSpec
+from carlasc.inspection.findings import Finding
+from carlasc.storage.protocol import Sequence
+
+KNOWN, RIGHT, OCCUPIED = 0, 1, 2
+"""Columns of what `Voxels.count` returns."""
+
+
+class Voxels:
+    """The voxels of a grid, in the types that the compiled loop takes."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._spec = grid.spec
+        self._labels = np.ascontiguousarray(grid.labels, np.uint32).reshape(-1)
+        self._known = np.ascontiguousarray(grid.known).reshape(-1)
+
+    def count(
+        self, points: NDArray[np.floating], labels: NDArray[np.integer], shifts: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Count points by what their voxels hold, in grids whose labels are `shifts` cells too far along the axes.
+
+        The azimuth of a full turn is periodic. A point whose voxel is outside a shifted grid counts as it does in the grid as it is, and
+        a point outside that one does not count.
+
+        Args:
+            points: (N, 3) metres.
+            labels: (N,) class ids.
+            shifts: (S, 3) cells.
+
+        Returns:
+            (S, 3) numbers of points in known voxels, in known voxels of their class, and in known voxels of any class but free.
+        """
+        spec = self._spec
+        lower, upper = spec.lower, spec.upper
+        x, y, z = spec.voxel_size.tolist()
+        full_turn = spec.coordinates == "cylindrical" and upper[1] - lower[1] > 2 * math.pi - 1e-3
+        counted = np.zeros((len(shifts), 3), np.int64)
+        axes = np.ascontiguousarray(spec.to_axes(points), np.float64)
+        classes = labels.astype(np.int64)
+        _count(axes, classes, shifts, spec.size, lower, upper, (x, y, z), full_turn, self._labels, self._known, counted)
+        return counted
+
+
+@cached
+def _count(
+    axes: NDArray[np.float64],
+    labels: NDArray[np.int64],
+    shifts: NDArray[np.int64],
+    size: tuple[int, int, int],
+    lower: Triple,
+    upper: Triple,
+    voxel_size: Triple,
+    full_turn: bool,
+    voxels: NDArray[np.uint32],
+    known: NDArray[np.bool_],
+    counted: NDArray[np.int64],
+) -> None:
+    """Add points to `counted`. They are given on the axes of the grid, and their cells are those of `GridSpec.index`."""
+    depth, width, height = size
+    for point in range(len(axes)):
+        first, second, third = axes[point, 0], axes[point, 1], axes[point, 2]
+        if not (lower[0] <= first < upper[0] and lower[1] <= second < upper[1] and lower[2] <= third < upper[2]):
+            continue
+        i = min(int((first - lower[0]) / voxel_size[0]), depth - 1)
+        j = min(int((second - lower[1]) / voxel_size[1]), width - 1)
+        k = min(int((third - lower[2]) / voxel_size[2]), height - 1)
+        for s in range(len(shifts)):
+            x, y, z = i + shifts[s, 0], j + shifts[s, 1], k + shifts[s, 2]
+            if full_turn:
+                y %= width
+            if not (0 <= x < depth and 0 <= y < width and 0 <= z < height):
+                x, y, z = i, j, k
+            voxel = (x * width + y) * height + z
+            if known[voxel]:
+                counted[s, 0] += 1
+                counted[s, 1] += voxels[voxel] == labels[point]
+                counted[s, 2] += voxels[voxel] != 0
+
+
+# Of the ground points within a grid's other bounds. It is 0.0 % on the simulated drives, on flat ground, and 2.6 % on average (6.6 % in one
+# frame) on a real drive whose road falls off, both with the published bounds; 48 % on one with a sensor 0.2 m too high for them.
+_SHARE = 0.1
+_LOWEST = 0.02  # this share of the ground may be below the bound that is advised
+
+
+@dataclass
+class GroundBelow:
+    """Counts, frame by frame, the ground points below a grid.
+
+    Attributes:
+        spec: geometry of the grid.
+    """
+
+    spec: GridSpec
+    _heights: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def add(self, ground: NDArray[np.float32]) -> None:
+        """Add a frame's ground points (N, 3), metres, finite. Those outside of the grid's other bounds do not count."""
+        axes, lower, upper = self.spec.to_axes(ground), np.array(self.spec.lower), np.array(self.spec.upper)
+        first, second = ((axes[:, a] >= lower[a]) & (axes[:, a] < upper[a]) for a in (0, 1))
+        inside = first & second
+        self._heights.append(ground[inside, 2])
+
+    @property
+    def share(self) -> float:
+        """Mean share of a frame's ground points that are below the grid; NaN without ground points."""
+        shares = [float((z < self.spec.lower[2]).mean()) for z in self._heights if len(z)]
+        return float(np.mean(shares)) if shares else math.nan
+
+    def findings(self, sequence: Sequence, grid: str) -> Iterator[Finding]:
+        """Yield a warning if a considerable share of the ground is below the grid; the bounds that it advises have the same height."""
+        if not self.share > _SHARE:
+            return
+        z0, z1 = self.spec.lower[2], self.spec.upper[2]
+        lowest = math.floor(10 * float(np.quantile(np.concatenate(self._heights), _LOWEST))) / 10 - 0.1
+        bounds = [value for pair in zip(self.spec.lower[:2], self.spec.upper[:2], strict=True) for value in pair]
+        if self.spec.coordinates == "cylindrical":
+            bounds[2:] = np.degrees(bounds[2:]).tolist()
+        text = ",".join(f"{value:.6g}" for value in (*bounds, lowest, lowest + z1 - z0))
+        found = f"{self.share:.0%} of the points on the ground below it, which are in no voxel"
+        advice = f"make the grid again with lower bounds: `carlasc regrid --bounds={text}`"
+        expected = f"the ground above the lower bound of the grid, z = {z0:g} m"
+        where = f"{sequence.location}/{grid}"
+        yield Finding("warning", "ground-below-grid", sequence.path, where, expected, found, advice)
+
 
 _MIN_POINTS = 100
 _MAX_POINTS = 20_000
@@ -80,8 +208,6 @@ class GridEvidence:
             labels: (N,) class ids; points with id 0 are unlabelled and left out. None compares with any class but free.
             grid: the grid of this frame, with geometry `spec`.
         """
-        from carlasc.inspection.lookups import KNOWN, OCCUPIED, RIGHT, Voxels
-
         if labels is None:  # a voxel of any class but free is right
             labels, chosen, right = np.zeros(len(points), np.uint8), np.arange(len(points)), OCCUPIED
         else:

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, transform_points, translation
-from carlasc.inspection.matching import match
-from carlasc.inspection.misfit import Misfit, explain_misfit
-from carlasc.inspection.overlap import VOXEL_M, occupancy, overlap
+from carlasc.inspection.misfit import Misfit, explain_misfit, match
+from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 
 Poses: TypeAlias = NDArray[np.float64]
 

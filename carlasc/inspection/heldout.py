@@ -77,7 +77,7 @@ class HoldoutResult:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _HeldOutFrame:
     """One frame to measure. It pickles into a worker."""
 
     path: str
@@ -125,7 +125,7 @@ def holdout(
         raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
     plan = GridPlan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
     inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
-    drives = [_Drive.of(sequence, every) for sequence in inputs]
+    drives = [_HeldOutDrive.of(sequence, every) for sequence in inputs]
     steps = RunProgress(run.progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
     tasks = [task for drive in drives for task in drive.tasks(run, steps)]
     scores: dict[str, HeldOutScores] = {}
@@ -144,7 +144,7 @@ def holdout(
 
 
 @dataclass(frozen=True)
-class _Drive:
+class _HeldOutDrive:
     """One sequence: which scans are left out, and at which of their frames the rays are followed."""
 
     inputs: ScanSequence
@@ -152,7 +152,7 @@ class _Drive:
     frames: tuple[int, ...]
 
     @classmethod
-    def of(cls, inputs: ScanSequence, every: int) -> _Drive:
+    def of(cls, inputs: ScanSequence, every: int) -> _HeldOutDrive:
         """Choose the scans to leave out."""
         whole = inputs.feed
         hidden = whole.frames[every // 2 :: every].tolist() or whole.frames[-1:].tolist()
@@ -170,7 +170,7 @@ class _Drive:
         """Number of scans that the pass that finds the actors reads."""
         return self.feed.reads
 
-    def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_Task]:
+    def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
         """Find the actors in the scans that are left, and return a task for each frame to measure."""
         feed, inputs = self.feed, self.inputs
         actors = MovingActors()
@@ -178,12 +178,12 @@ class _Drive:
             actors = find_actors(feed, run, steps)
         first, last = feed.options.window
         return [
-            _Task(inputs.path, feed, actors.between(f + first, f + last), inputs.feed.sequence, f, inputs.plan)
+            _HeldOutFrame(inputs.path, feed, actors.between(f + first, f + last), inputs.feed.sequence, f, inputs.plan)
             for f in self.frames
         ]
 
 
-def _run_task(task: _Task) -> HeldOutScores | str:
+def _run_task(task: _HeldOutFrame) -> HeldOutScores | str:
     """Measure one frame, in a worker; return why it failed if it did."""
     try:
         return _measure(task)
@@ -191,12 +191,12 @@ def _run_task(task: _Task) -> HeldOutScores | str:
         return str(error)
 
 
-def _fail(task: _Task, message: str) -> str:
+def _fail(task: _HeldOutFrame, message: str) -> str:
     """Return the result of a frame that no worker could measure."""
     return message
 
 
-def _measure(task: _Task) -> HeldOutScores:
+def _measure(task: _HeldOutFrame) -> HeldOutScores:
     feed = task.feed
     window = [other for other in feed.window_of(task.frame) if other != task.frame]
     if not window:

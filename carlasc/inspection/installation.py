@@ -18,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import carlasc
+from carlasc.core.versions import carlasc_version
 from carlasc.errors import ArgumentError, DependencyError, StorageError, describe, import_extra
 from carlasc.running import count_cores
 from carlasc.running.pools import ONE_THREAD
@@ -27,6 +27,7 @@ from carlasc.storage.durability import is_durable
 FOR_DEVELOPERS = ("all", "dev", "docs", "faults", "study")
 """Extras that are not listed: `all` is the others, and the rest is for those who work on the package."""
 
+_PACKAGE = Path(__file__).parents[1]  # the folder of carlasc
 _FEATURES = "sse4.2 avx avx2 fma bmi2 avx512f avx512bw avx512vl neon asimd sve sve2".split()
 _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[\w,-]*\])?(?:>=([\w.]+))?(?:\s*;\s*extra == ['\"]([\w-]+)['\"])?")
 _VARIABLES = re.compile("|".join([*ONE_THREAD, "NUMBA_.*", "CARLASC_.*"]))
@@ -204,10 +205,10 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
                 f"Numba cannot compile or keep compiled code ({describe(error)}); NUMBA_CACHE_DIR=FOLDER says where"
             )
     return Installation(
-        version=carlasc.__version__,
+        version=carlasc_version(),
         python=f"{platform.python_version()} ({platform.python_implementation()})",
         system=platform.platform(),
-        folder=without_names(str(Path(carlasc.__file__).parent)),
+        folder=without_names(str(_PACKAGE)),
         packages=needed,
         extras=extras,
         processor=_look_at_processor(numba_loads),
@@ -361,7 +362,7 @@ def _look_at_compiled_code() -> CompiledCode:
     numba.njit(_next)(1)  # type: ignore[type-var]
     compile_s = time.perf_counter() - start
     folder = Path(loop.stats.cache_path)
-    root = Path(carlasc.__file__).parent if folder.name == "__pycache__" else folder.parent
+    root = _PACKAGE if folder.name == "__pycache__" else folder.parent
     sizes = [path.stat().st_size for path in root.rglob("*.nb[ic]")]
     nearest = next(parent for parent in (folder, *folder.parents) if parent.exists())
     return CompiledCode(without_names(str(root)), os.access(nearest, os.W_OK), len(sizes), sum(sizes), compile_s)

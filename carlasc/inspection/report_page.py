@@ -8,19 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.reporting.actors import Actor
+from carlasc.groundtruth.reporting.facts import ActorTrack
 from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
 from carlasc.inspection.reports import ReportResult
+from carlasc.inspection.texts import fill
 from carlasc.storage.files import write_output
 from carlasc.storage.resuming import RECORD
 
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 62em; padding: 0 1em; color: #1c2733; }
-h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2.2em; border-bottom: 1px solid #c9d2db; } h3 { font-size: 1em; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; } td, th { padding: .15em .8em .15em 0; text-align: left; }
-th { font-weight: 600; } td.n, th.n { text-align: right; } svg { display: block; margin: .5em 0; max-width: 100%; }
-.note { color: #5b6875; } code { font-size: .9em; } details { margin: .6em 0; }
-"""
 _BAR, _ROW = "#3566a8", 18  # colour of a bar, and the height of a row in pixels
 
 
@@ -34,15 +28,9 @@ def write_report_page(result: ReportResult, out: str | Path) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    parts = [_section(name, report) for name, report in result.reports.items()]
     title = f"Ground truth of {escape(result.location)}"
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
-        f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>\n"
-        f"{''.join(parts)}</body></html>\n"
-    )
-    write_output(Path(out), page.encode())
+    grids = "".join(_section(name, report) for name, report in result.reports.items())
+    write_output(Path(out), fill("report.html", title=title, grids=grids).encode())
 
 
 def describe(report: Report) -> list[tuple[str, str]]:
@@ -73,7 +61,7 @@ def describe(report: Report) -> list[tuple[str, str]]:
     return rows
 
 
-def _count(actors: Sequence[Actor]) -> str:
+def _count(actors: Sequence[ActorTrack]) -> str:
     if not actors:
         return "none that moves"
     labels = [actor.label for actor in actors]
@@ -93,33 +81,33 @@ def _held_out(values: Mapping[str, Any]) -> str:
 
 
 def _section(name: str, report: Report) -> str:
-    coverage = report.coverage
-    classes = sorted(((label, count) for label, count in coverage.classes.items()), key=lambda pair: -pair[1])
-    spec = GridSpec.from_params(report.settings, name)
-    size = " x ".join(map(str, spec.size))
-    parts = [
-        f"<h2>{escape(name)}</h2>",
-        f'<p class="note">{spec.coordinates} grid of {size} voxels</p>',
-        _table([], [[label, text] for label, text in describe(report)]),
-        "<h3>Known voxels by class</h3>",
-        '<p class="note">The length of a bar is the square root of the share.</p>',
-        _bars([(label, count / max(coverage.known, 1)) for label, count in classes]),
-    ]
-    if coverage.votes:
-        bins = [(_bin_name(power), count / max(coverage.known, 1)) for power, count in enumerate(coverage.votes)]
-        parts += ["<h3>Known voxels by their number of votes</h3>", _bars(bins)]
-    if report.holdout is not None and report.holdout["by_distance"]:
-        parts += ["<h3>Held-out rays</h3>", _held_out_table(report.holdout)]
-    if report.actors:
-        parts += [
-            "<h3>Moving actors, and the frames in which they are seen</h3>",
-            _timeline(report.actors, report.frames),
-        ]
-        parts.append(_actor_table(report.actors))
+    coverage, known = report.coverage, max(report.coverage.known, 1)
+    classes = sorted(((label, count / known) for label, count in coverage.classes.items()), key=lambda pair: -pair[1])
+    votes = [(_bin_name(power), count / known) for power, count in enumerate(coverage.votes)]
+    spec, held_out, actors = GridSpec.from_params(report.settings, name), report.holdout, report.actors
     digests = [[field, digest.all] for field, digest in report.digests.items()]
     digests += [[field, digest.digest] for field, digest in report.documents.items()]
-    parts.append(f"<details><summary>Digests (BLAKE2b)</summary>{_table(['file', 'digest'], digests)}</details>")
-    return "\n".join(parts)
+    return fill(
+        "report-grid.html",
+        name=escape(name),
+        coordinates=spec.coordinates,
+        size=" x ".join(map(str, spec.size)),
+        figures=_table([], [[label, text] for label, text in describe(report)]),
+        classes=_bars(classes),
+        votes=_part("Known voxels by their number of votes", _bars(votes)) if votes else "",
+        held_out=_part("Held-out rays", _held_out_table(held_out)) if held_out and held_out["by_distance"] else "",
+        actors=_part(
+            "Moving actors, and the frames in which they are seen",
+            f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}",
+        )
+        if actors
+        else "",
+        digests=_table(["file", "digest"], digests),
+    )
+
+
+def _part(title: str, content: str) -> str:
+    return f"<h3>{title}</h3>\n{content}\n"
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[object]], *, figures: bool = False) -> str:
@@ -146,7 +134,7 @@ def _bars(rows: Sequence[tuple[str, float]]) -> str:
     return _svg(720, len(rows) * _ROW, lines)
 
 
-def _timeline(actors: Sequence[Actor], frames: Sequence[int]) -> str:
+def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
     """Return one line per actor, from its first to its last sighting; it is the paler the more frames in between do not show it."""
     first = min([*(actor.first for actor in actors), *frames[:1]])
     last = max([*(actor.last for actor in actors), *frames[-1:]])
@@ -172,7 +160,7 @@ def _svg(width: int, height: int, lines: Sequence[str]) -> str:
     )
 
 
-def _actor_table(actors: Sequence[Actor]) -> str:
+def _actor_table(actors: Sequence[ActorTrack]) -> str:
     header = [
         "class",
         "instance",

@@ -92,7 +92,7 @@ def report(
     if save:
         for _, sequence, name in grids:
             _check_writable(sequence, name)
-    makers = [_Maker(sequence, name) for _, sequence, name in grids]
+    makers = [_ReportMaker(sequence, name) for _, sequence, name in grids]
     existing = {} if remake else {row: maker.existing() for row, maker in enumerate(makers)}
     reports = {row: one for row, one in existing.items() if one is not None}
     missing = [row for row in range(len(makers)) if row not in reports]
@@ -115,7 +115,7 @@ def report(
 _Measured = FrameFacts | FrameFailure
 
 
-def _measure_all(makers: list[_Maker], run: Run) -> list[list[_Measured]]:
+def _measure_all(makers: list[_ReportMaker], run: Run) -> list[list[_Measured]]:
     """Return what was measured of the frames of each report."""
     steps = RunProgress(run.progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
     for maker in makers:
@@ -131,7 +131,7 @@ def _measure_all(makers: list[_Maker], run: Run) -> list[list[_Measured]]:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _ReportedFrame:
     """One frame to measure. It pickles into a worker."""
 
     sequence: Sequence
@@ -141,7 +141,7 @@ class _Frame:
     plan: GridPlan | None  # to make it again without a tenth of the scans
 
 
-class _Maker:
+class _ReportMaker:
     """Makes the report of one grid of one sequence."""
 
     def __init__(self, sequence: Sequence, grid: str) -> None:
@@ -170,12 +170,12 @@ class _Maker:
         except (CarlascError, OSError):  # measuring the frame reports the scan
             self.inputs = None
 
-    def tasks(self) -> list[_Frame]:
+    def tasks(self) -> list[_ReportedFrame]:
         """Return the frames to measure."""
         light, sampled = without_caches(self.sequence), sample_frames(self.frames)
         scans = set() if self.inputs is None else set(self.inputs.feed.frames.tolist())
         return [
-            _Frame(
+            _ReportedFrame(
                 light,
                 self.grid,
                 number,
@@ -202,7 +202,7 @@ class _Maker:
             return None
         every = max(EVERY, len(self.inputs.feed.frames) // _MOST_LEFT_OUT)
         result = leave_out(
-            _Single(self.sequence),
+            _SingleSequence(self.sequence),
             spec,
             observe=self.inputs.options,
             voting=self.inputs.plan.voting,
@@ -212,7 +212,7 @@ class _Maker:
         return None if result.total is None else result.total.to_dict()
 
 
-class _Single(Source):
+class _SingleSequence(Source):
     """One sequence of a source, as a source."""
 
     def __init__(self, sequence: Sequence) -> None:
@@ -255,7 +255,7 @@ def _options_of(record: Mapping[str, Any]) -> FromScans:
     return FromScans(**given)
 
 
-def _measure(task: _Frame) -> FrameFacts | FrameFailure:
+def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
     """Measure one frame; return why it failed if it did."""
     sequence, number, grid = task.sequence, task.number, task.grid
     names = (*layout.SCAN_FIELDS, *(f"{grid}/{part}" for part in layout.GRID_FIELDS))
@@ -271,7 +271,7 @@ def _measure(task: _Frame) -> FrameFacts | FrameFailure:
         return FrameFailure(sequence.location, number, str(error))
 
 
-def _fail(task: _Frame, message: str) -> FrameFailure:
+def _fail(task: _ReportedFrame, message: str) -> FrameFailure:
     """Return the result of a frame that no worker could measure."""
     return FrameFailure(task.sequence.location, task.number, message)
 

@@ -1,11 +1,11 @@
-"""Checking a data set for everything that is known to go wrong, and naming the likely cause."""
+"""Checking a data set for everything that is known to go wrong, and naming the likely cause; also whether the files of a grid are still those that its report was made from."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,12 @@ from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.groundtruth.heights import ground_of
-from carlasc.inspection.agreement import GridDiagnosis, GridEvidence
+from carlasc.groundtruth.reporting.facts import digest_of
+from carlasc.groundtruth.reporting.report import Report, short
+from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
-from carlasc.inspection.bounds import GroundBelow
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
-from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.misfit import describe_misfit
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
@@ -28,6 +28,93 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
+
+_ADVICE = "make the report again with `carlasc report --remake --save`, or the grid with `carlasc regrid --overwrite`"
+
+
+class Freshness:
+    """Compares the files of a sequence with the reports beside its grids.
+
+    Args:
+        sequence: the sequence; grids without a report are left out.
+    """
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence = sequence
+        self.reports: dict[str, Report] = {}
+        self._damaged: list[Finding] = []
+        self._rows: dict[str, dict[int, int]] = {}
+        self._compared: dict[str, int] = {}
+        self._changed: dict[tuple[str, str], list[int]] = {}  # frames by grid and field
+        for name in sequence.documents():
+            grid, _, file = name.rpartition("/")
+            if file == layout.REPORT:
+                self._read(grid, name)
+
+    def _read(self, grid: str, name: str) -> None:
+        where = f"{self.sequence.location}/{name}"
+        try:
+            report = Report.from_json(self.sequence.read_document(name), where)
+        except CarlascError as error:
+            finding = Finding.from_error("report", self.sequence.path, where, error, _ADVICE)
+            self._damaged.append(replace(finding, severity="warning"))
+            return
+        self.reports[grid] = report
+        self._rows[grid] = {frame: row for row, frame in enumerate(report.frames)}
+
+    def compare(self, frame: int) -> None:
+        """Compare the files of one frame. Files that cannot be read are skipped: other checks report them."""
+        seen: dict[str, str | None] = {}
+        for grid, report in self.reports.items():
+            row = self._rows[grid].get(frame)
+            if row is None:
+                continue
+            self._compared[grid] = self._compared.get(grid, 0) + 1
+            for field, digests in report.digests.items():
+                if field not in seen:
+                    seen[field] = self._digest(field, frame)
+                if seen[field] is not None and seen[field] != (digests.of(row) or ""):
+                    self._changed.setdefault((grid, field), []).append(frame)
+
+    def _digest(self, field: str, frame: int) -> str | None:
+        """Return the digest of a field of a frame, "" if it does not exist; None if it cannot be read."""
+        if frame not in self.sequence.frames(field):
+            return ""
+        try:
+            return short(digest_of(field, self.sequence.read(field, frame)))
+        except (CarlascError, OSError):
+            return None
+
+    def findings(self) -> Iterator[Finding]:
+        """Yield what differs from the reports."""
+        yield from self._damaged
+        for grid, report in self.reports.items():
+            yield from self._settings(grid, report)
+            frames = self._compared.get(grid, 0)
+            for (own, field), changed in self._changed.items():
+                if own == grid:
+                    what = f"{len(changed)} of {frames} compared frames changed since, the first is {changed[0]}"
+                    yield self._finding(grid, f"the {field} that its report was made from", what)
+
+    def _settings(self, grid: str, report: Report) -> Iterator[Finding]:
+        if report.settings != self.sequence.params(grid):
+            yield self._finding(grid, "the settings in its report", "another params.json")
+        for name, digest in report.documents.items():
+            if name == layout.params_file(grid):
+                continue
+            exists = name in self.sequence.documents()
+            if not exists or not digest.matches(self.sequence.read_document(name)):
+                found = f"a {name} that changed since" if exists else f"no {name}"
+                yield self._finding(grid, f"the {name} that its report was made from", found)
+        missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
+        if missing:
+            finding = self._finding(grid, "a report of all frames", f"{len(missing)} frames that it does not cover")
+            yield replace(finding, severity="note")
+
+    def _finding(self, grid: str, expected: str, found: str) -> Finding:
+        where = f"{self.sequence.location}/{grid}"
+        return Finding("warning", "report", self.sequence.path, where, expected, found, _ADVICE)
+
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
 _POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error
@@ -88,7 +175,7 @@ def validate(
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _CheckedFrames:
     """Which frames of a sequence are checked, and how thoroughly."""
 
     sequence: Sequence
@@ -101,12 +188,12 @@ class _Plan:
         return len(self.opened) + len(self.read) + 1
 
 
-def _plan(sequence: Sequence, every: int | None) -> _Plan:
+def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
     found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
     frames = tuple(found.tolist())
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
     # opening a local file is cheap; a frame of a packed store has to be decoded, and cannot have a wrong size
-    return _Plan(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
+    return _CheckedFrames(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
 
 
 def _fields(sequence: Sequence) -> list[str]:
@@ -119,13 +206,13 @@ def _fields(sequence: Sequence) -> list[str]:
 _Examined = tuple[list[Finding], SequenceReport]
 
 
-def _fail(plan: _Plan, message: str) -> _Examined:
+def _fail(plan: _CheckedFrames, message: str) -> _Examined:
     """Return the result of a sequence that no worker could check."""
     finding = Finding("error", "check", plan.sequence.path, plan.sequence.location, "a check that ends", message, "")
     return [finding], SequenceReport(plan.sequence.path, len(plan.frames), 0, {}, None)
 
 
-def _examine(plan: _Plan, step: Callable[[], None] = lambda: None) -> _Examined:
+def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _Examined:
     """Run all checks of a sequence; `step` is called after each of its steps."""
     found: list[Finding] = []
     sequence = plan.sequence

@@ -19,8 +19,7 @@ from carlasc.errors import FormatError
 from carlasc.groundtruth import FromGrid, FromScans, Voting, regrid
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
-from carlasc.groundtruth.reporting.actors import Residual, actors_of
-from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, digest_of, sample_frames
+from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, Residual, actors_of, digest_of, sample_frames
 from carlasc.groundtruth.reporting.report import FileDigest, Report
 from carlasc.storage import FolderSink, layout
 

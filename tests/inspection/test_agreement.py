@@ -2,15 +2,145 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from carlasc.core.geometry import rotation_z
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.inspection.agreement import GridEvidence
+from carlasc.inspection.agreement import KNOWN, OCCUPIED, RIGHT, GridEvidence, GroundBelow, Voxels
 from carlasc.inspection.alignment import choose_pairs, diagnose_poses
+from carlasc.inspection.validation import validate
+from carlasc.storage import FolderSink, FolderSource, layout
+from carlasc.testing.drives import SimulatedDrive
+
+PI32 = float(np.float32(np.pi))
+SPECS = {
+    "cartesian": GridSpec("cartesian", (6, 5, 3), (-3.0, -2.5, -1.0), (3.0, 2.5, 0.7)),
+    "a full turn": GridSpec("cylindrical", (4, 9, 3), (1.0, -PI32, -1.0), (5.0, PI32, 0.7)),
+    "a part of a turn": GridSpec("cylindrical", (4, 9, 3), (0.0, 2.0, -1.0), (5.0, 4.5, 0.7)),
+    "one cell": GridSpec("cartesian", (1, 1, 1), (-3.0, -2.5, -1.0), (3.0, 2.5, 0.7)),
+}
+SHIFTS = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)])
+
+
+def plain_count(grid, points, labels, shifts):
+    """Place the points, move their cells, and look each up; those that leave the grid stay where they are."""
+    spec = grid.spec
+    cells, inside = spec.index(spec.to_axes(points))
+    cells, labels = cells[inside], labels[inside]
+    counted = []
+    for shift in shifts:
+        moved = cells + shift
+        if spec == SPECS["a full turn"]:
+            moved[:, 1] %= spec.size[1]
+        outside = ((moved < 0) | (moved >= spec.size)).any(axis=1)
+        moved[outside] = cells[outside]
+        known, voxels = grid.known[tuple(moved.T)], grid.labels[tuple(moved.T)]
+        counted.append([known.sum(), (known & (voxels == labels)).sum(), (known & (voxels != 0)).sum()])
+    return np.array(counted)
+
+
+@given(
+    st.sampled_from(sorted(SPECS)),
+    st.sampled_from([np.float32, np.float64]),
+    st.sampled_from([np.uint8, np.uint32, np.int64]),
+    st.sampled_from([np.uint8, np.uint16, np.uint32]),
+    st.booleans(),
+    st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=60, deadline=None)
+def test_points_are_counted_as_in_plain_numpy(name, real, whole, narrow, with_counts, seed):
+    spec, rng = SPECS[name], np.random.default_rng(seed)
+    labels = rng.integers(0, 4, spec.size).astype(narrow)
+    grid = Grid(spec, labels, rng.integers(0, 2, spec.size).astype(np.float32) if with_counts else None)
+    points = rng.uniform(-6, 6, (200, 3)) * (1, 1, 0.3)
+    points[::3] = np.round(points[::3] * 2) / 2  # on faces and edges
+    points[:4, 0] = (math.nan, math.inf, -math.inf, 1e300)
+    with np.errstate(over="ignore", invalid="ignore"):
+        points, classes = points.astype(real), rng.integers(0, 4, 200).astype(whole)
+        found = Voxels(grid).count(points, classes, SHIFTS)
+        np.testing.assert_array_equal(found, plain_count(grid, points, classes, SHIFTS))
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_points_in_the_middle_of_voxels_are_found_where_the_grid_has_them(name):
+    spec = SPECS[name]
+    labels = np.random.default_rng(0).integers(0, 5, spec.size).astype(np.uint8)
+    points = spec.from_axes(spec.centers()).reshape(-1, 3)
+    counted = Voxels(Grid(spec, labels)).count(points, labels.reshape(-1), SHIFTS[:1])
+    assert counted[0, KNOWN] == counted[0, RIGHT] == spec.num_voxels
+    assert counted[0, OCCUPIED] == np.count_nonzero(labels)
+
+
+def test_grids_in_any_order_in_memory_count_alike():
+    spec, rng = SPECS["cartesian"], np.random.default_rng(1)
+    labels, counts = rng.integers(0, 4, spec.size).astype(np.uint32), rng.integers(0, 2, spec.size)
+    points = spec.centers().reshape(-1, 3)
+    args = (points, labels.reshape(-1), SHIFTS)
+    expected = Voxels(Grid(spec, labels, counts)).count(*args)
+    found = Voxels(Grid(spec, np.asfortranarray(labels), counts[::-1, ::-1].copy()[::-1, ::-1])).count(*args)
+    np.testing.assert_array_equal(found, expected)
+
+
+ROUND_ROAD = GridSpec("cylindrical", (10, 24, 6), (0.0, -math.pi, -2.0), (10.0, math.pi, 1.0))
+ROAD = 7
+
+
+def write_drive(folder, spec, labelled=False):
+    """Write a drive whose road is at z = -1.73, and grids in which everything is unknown."""
+    drive, writer = SimulatedDrive(frames=3), FolderSink(folder).sequence("cartesian")
+    writer.write_document(layout.params_file("evaluation"), json.dumps(spec.to_params()).encode())
+    writer.write_document(layout.POSES, layout.encode_poses(drive.world_T_vehicle(drive.times)))
+    for frame in range(drive.frames):
+        scan = drive.scan(frame)
+        writer.write("points", frame, scan.points)
+        if labelled:
+            writer.write("labels", frame, np.where(scan.kinds == 1, ROAD, 1).astype(np.uint32))
+        writer.write("evaluation/labels", frame, np.zeros(spec.size, np.uint32))
+        writer.write("evaluation/counts", frame, np.zeros(spec.size, np.float32))
+    return folder
+
+
+@pytest.mark.parametrize("labelled", [False, True])
+def test_a_road_below_the_grid_is_reported_with_bounds_that_hold_it(tmp_path, labelled):
+    high = GridSpec("cartesian", (32, 32, 8), (-16.0, -16.0, -1.5), (16.0, 16.0, 1.5))
+    (finding,) = [f for f in validate(write_drive(tmp_path, high, labelled)).findings if f.check == "ground-below-grid"]
+    assert finding.severity == "warning"
+    assert int(finding.found.split("%")[0]) > 95
+    bounds = finding.advice.split("--bounds=")[1].rstrip("`")
+    x0, x1, y0, y1, z0, z1 = map(float, bounds.split(","))
+    assert (x0, x1, y0, y1) == (-16, 16, -16, 16)
+    assert z1 - z0 == pytest.approx(3.0)
+    assert -2.1 < z0 < -1.73
+
+
+def test_a_road_in_the_grid_is_not_reported(tmp_path):
+    result = validate(write_drive(tmp_path, GridSpec.published()))
+    assert not [finding for finding in result.findings if finding.check == "ground-below-grid"]
+
+
+@pytest.mark.parametrize(("below", "reported"), [(9, False), (11, True)])
+def test_it_is_reported_from_a_tenth_of_the_ground(tmp_path, below, reported):
+    evidence = GroundBelow(ROUND_ROAD)
+    z = np.where(np.arange(100) < below, -2.1, -1.9)
+    evidence.add(np.column_stack([np.full(100, 5.0), np.zeros(100), z]).astype(np.float32))
+    evidence.add(np.array([[11.0, 0, -5]], np.float32))  # beyond the radius of the grid
+    FolderSink(tmp_path).sequence("cylindrical").write("points", 0, np.ones((1, 4), np.float32))
+    (sequence,) = FolderSource(tmp_path).sequences().values()
+    findings = list(evidence.findings(sequence, "evaluation"))
+    assert evidence.share == pytest.approx(below / 100)
+    assert bool(findings) is reported
+    assert not reported or "--bounds=0,10,-180,180,-2.2,0.8`" in findings[0].advice
+
+
+def test_no_ground_is_no_share():
+    assert math.isnan(GroundBelow(ROUND_ROAD).share)
+
 
 SPEC = GridSpec("cartesian", (20, 20, 6), (-10.0, -10.0, -3.0), (10.0, 10.0, 3.0))
 ROUND = GridSpec("cylindrical", (10, 24, 6), (0.0, -math.pi, -3.0), (10.0, math.pi, 3.0))

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import warnings
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc import Run
+from carlasc import CardDetails, Run
 from carlasc.captures.settings import Lidar
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
@@ -32,6 +33,12 @@ from carlasc.testing.data import SCANS, WHOLE
 
 TOWN = "Train/Demo/cartesian"
 SAID: dict[str, Any] = {"license": "cc-by-4.0", "published": "2026-11-22"}
+
+
+def write_card(source: Any, out: Path | None = None, **given: Any) -> carlasc.inspection.CardResult:
+    """Write a card; what the author says of the data is given beside the other arguments."""
+    details = {field.name: given.pop(field.name) for field in fields(CardDetails) if field.name in given}
+    return carlasc.card(source, out, about=CardDetails(**details), **given)
 
 
 def front_matter(folder: Path) -> dict[str, Any]:
@@ -71,7 +78,7 @@ def tables(town: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The town as a Parquet store, with its card."""
     store = tmp_path_factory.mktemp("packed") / "town.parquet"
     carlasc.pack(town, store)
-    carlasc.card(store, pictures=False, authors=["Town Lab"], contact="town@example.org", **SAID)
+    write_card(store, pictures=False, authors=["Town Lab"], contact="town@example.org", **SAID)
     return store
 
 
@@ -195,7 +202,7 @@ def test_sequences_with_other_columns_and_several_splits_are_opened(
 ) -> None:
     store = tmp_path / "x.parquet"
     carlasc.pack(write_dataset(tmp_path / "data"), store)
-    carlasc.card(store, **SAID, pictures=False)
+    write_card(store, **SAID, pictures=False)
     names = {config["config_name"]: config["data_files"] for config in front_matter(store)["configs"]}
     frames = [name for name in names if name.startswith("frames")]
     assert len(frames) > 1  # one sequence has no poses, one no scans
@@ -217,7 +224,7 @@ def test_other_stores_are_valid_and_say_how_they_are_opened(
     elif kind != "folder":
         source = tmp_path / f"x.{kind}"
         carlasc.pack(published, source)
-    result = carlasc.card(source, **SAID, pictures=False)
+    result = write_card(source, **SAID, pictures=False)
     assert result.folder == (published if kind == "folder" else tmp_path)
     found = front_matter(result.folder)
     assert "configs" not in found and found["viewer"] is False
@@ -241,7 +248,7 @@ def test_the_patterns_of_a_folder_find_its_files(kind: str, tmp_path: Path) -> N
         carlasc.pack(root, tmp_path / "x.zarr")
         root = tmp_path
     names = set(files_of(root)) if kind == "folder" else {name for name in files_of(root) if name.startswith("x.zarr")}
-    carlasc.card(root if kind == "folder" else root / "x.zarr", **SAID, pictures=False)
+    write_card(root if kind == "folder" else root / "x.zarr", **SAID, pictures=False)
     sets = [file for file in croissant(root)["distribution"] if file["@type"] == "cr:FileSet"]
     for one in sets:
         assert any(fnmatch(name, pattern) for name in names for pattern in one["includes"]), one
@@ -251,7 +258,7 @@ def test_the_patterns_of_a_folder_find_its_files(kind: str, tmp_path: Path) -> N
 
 def test_counts_and_classes_are_those_of_stats(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
-    carlasc.card(root, **SAID, pictures=False)
+    write_card(root, **SAID, pictures=False)
     counted = carlasc.stats(root, remap=None).to_dict()["total"]["points"]
     (records,) = [one["data"] for one in croissant(root)["recordSet"] if one["@id"] == "classes-carla"]
     for row in records:
@@ -263,7 +270,7 @@ def test_counts_and_classes_are_those_of_stats(tmp_path: Path) -> None:
 def test_pictures_are_drawn_and_shown(town: Path, tmp_path: Path) -> None:
     for package in ("embreex", "PIL"):
         pytest.importorskip(package)
-    result = carlasc.card(town, tmp_path / "card", **SAID)
+    result = write_card(town, tmp_path / "card", **SAID)
     assert [path.relative_to(tmp_path / "card").as_posix() for path in result.files] == [
         "README.md", "croissant.json", "images/grid.png", "images/scan.png",
     ]  # fmt: skip
@@ -275,13 +282,13 @@ def test_a_card_without_the_packages_that_draw_says_so(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "PIL.Image", None)
-    result = carlasc.card(town, tmp_path / "card", **SAID)
+    result = write_card(town, tmp_path / "card", **SAID)
     assert len(result.files) == 2
     assert all("carlasc[render]" in note for note in result.notes) and result.notes
 
 
 def test_a_non_commercial_set_stays_so_and_each_source_keeps_its_licence(mixed: Path) -> None:
-    result = carlasc.card(mixed, license="cc0-1.0", pictures=False, published="2026-11-22")
+    result = write_card(mixed, license="cc0-1.0", pictures=False, published="2026-11-22")
     assert result.licenses == ("CC BY-NC-SA 4.0", "CC BY 4.0", "CC0 1.0")  # the strictest first
     assert front_matter(mixed)["license"] == ["cc-by-nc-sa-4.0", "cc-by-4.0", "cc0-1.0"]
     assert croissant(mixed)["license"][0] == "https://creativecommons.org/licenses/by-nc-sa/4.0/"
@@ -302,7 +309,7 @@ def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(tmp_path: Path
     with pytest.raises(
         CarlascError, match=r"found CC BY-(NC-)?ND \d\.0 of set of Val, which forbids that: publish how"
     ):
-        carlasc.card(root, **SAID, pictures=False)
+        write_card(root, **SAID, pictures=False)
     assert not (root / "README.md").exists()
 
 
@@ -310,18 +317,18 @@ def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(tmp_path: Path
 def test_a_licence_in_the_data_that_nobody_knows_is_one_line(tmp_path: Path, license_: object) -> None:
     root = licensed(write_dataset(tmp_path / "data"), {WHOLE: license_})
     with pytest.raises(FormatError, match=r"carlasc\.json: expected the name of a licence, .* look it up"):
-        carlasc.card(root, **SAID, pictures=False)
+        write_card(root, **SAID, pictures=False)
 
 
 def test_an_unknown_licence_names_those_that_are_near(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     with pytest.raises(ArgumentError, match=r"license: expected .*cc-by-sa-4\.0.*, found 'cc-by-sa-5\.0'"):
-        carlasc.card(root, license="cc-by-sa-5.0", pictures=False)
+        write_card(root, license="cc-by-sa-5.0", pictures=False)
 
 
 def test_a_licence_of_your_own_is_named_by_its_address(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = write_dataset(tmp_path / "data")
-    carlasc.card(root, license="https://lab.example/terms", published="2026-11-22", pictures=False)
+    write_card(root, license="https://lab.example/terms", published="2026-11-22", pictures=False)
     found = front_matter(root)
     assert (found["license"], found["license_link"]) == ("other", "https://lab.example/terms")
     assert re.fullmatch(r"[a-z0-9.-]+", found["license_name"])
@@ -335,24 +342,24 @@ def test_simulated_data_need_a_licence_from_their_author(tmp_path: Path) -> None
     assert "--license: expected the licence under which you publish these data" in result.stderr
     licensed(root, {WHOLE: None, SCANS: None})
     with pytest.raises(ArgumentError, match="expected the licence of set of Tra and set of Val"):
-        carlasc.card(root, pictures=False)
+        write_card(root, pictures=False)
 
 
 def test_a_given_licence_does_not_replace_that_of_the_source(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "CC BY-NC-SA 3.0"))
     with pytest.raises(ArgumentError, match=r"license: expected CC BY-NC-SA 3\.0, which holds .*, found MIT"):
-        carlasc.card(root, license="mit", pictures=False)
-    assert carlasc.card(root, pictures=False).licenses == ("CC BY-NC-SA 3.0",)
+        write_card(root, license="mit", pictures=False)
+    assert write_card(root, pictures=False).licenses == ("CC BY-NC-SA 3.0",)
 
 
 def test_an_existing_readme_is_not_replaced_unasked(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (root / "README.md").write_text("mine")
     with pytest.raises(ConflictError, match=r"README\.md: exists already: .*`overwrite=True`"):
-        carlasc.card(root, **SAID, pictures=False)
+        write_card(root, **SAID, pictures=False)
     assert (root / "README.md").read_text() == "mine"
-    carlasc.card(root, **SAID, pictures=False, overwrite=True)
+    write_card(root, **SAID, pictures=False, overwrite=True)
     assert (root / "README.md").read_text().startswith("---\n")
 
 
@@ -361,21 +368,21 @@ def test_an_existing_picture_is_found_before_anything_is_counted(tmp_path: Path)
     (root / "images").mkdir()
     (root / "images" / "grid.png").write_bytes(b"mine")
     with pytest.raises(ConflictError, match=r"grid\.png: exists already"):
-        carlasc.card(root, **SAID, run=Run(1, progress=lambda done, total: pytest.fail("counted")))
+        write_card(root, **SAID, run=Run(1, progress=lambda done, total: pytest.fail("counted")))
     assert not (root / "README.md").exists()
 
 
 def test_a_run_that_was_killed_is_finished_by_the_next(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
-    carlasc.card(root, **SAID, pictures=False)
+    write_card(root, **SAID, pictures=False)
     whole = (root / "README.md").read_bytes()
     (root / "README.md").unlink()  # the last file
-    carlasc.card(root, **SAID, pictures=False)
+    write_card(root, **SAID, pictures=False)
     assert (root / "README.md").read_bytes() == whole
     (root / "README.md").unlink()
     (root / "croissant.json").write_text('{"name": "mine"}')
     with pytest.raises(ConflictError, match=r"croissant\.json: exists already"):
-        carlasc.card(root, **SAID, pictures=False)
+        write_card(root, **SAID, pictures=False)
 
 
 def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -383,8 +390,8 @@ def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, capl
     source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")
     fsspec.filesystem("memory").pipe("/cards/x.zip", source.read_bytes())
     with pytest.raises(ArgumentError, match=r"out: expected a folder for the card of memory://cards/x\.zip"):
-        carlasc.card("memory://cards/x.zip", **SAID, pictures=False)
-    carlasc.card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
+        write_card("memory://cards/x.zip", **SAID, pictures=False)
+    write_card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
     (file,) = [file for file in croissant(tmp_path / "card")["distribution"] if file["@type"] == "cr:FileObject"]
     assert (file["contentUrl"], file["encodingFormat"]) == ("x.zip", "application/zip")
     assert file["sha256"] == hashlib.sha256(source.read_bytes()).hexdigest()
@@ -396,7 +403,7 @@ def test_a_source_without_sequences_is_one_line(town: Path, tmp_path: Path) -> N
     (tmp_path / "empty").mkdir()
     for source in (tmp_path / "empty", town / "Train" / "Demo" / "raw"):
         with pytest.raises((MissingDataError, ArgumentError)) as caught:
-            carlasc.card(source, **SAID)
+            write_card(source, **SAID)
         assert "\n" not in str(caught.value)
         assert not (source / "README.md").exists()
 
@@ -417,7 +424,7 @@ def test_wrong_arguments_are_one_line(tmp_path: Path, given: dict[str, Any], exp
     if "out" in given:
         given = {"out": root / given["out"]}
     with pytest.raises(ArgumentError, match=re.escape(expected)):
-        carlasc.card(root, **{**SAID, "overwrite": True, "pictures": False, **given})
+        write_card(root, **{**SAID, "overwrite": True, "pictures": False, **given})
 
 
 def test_names_in_the_data_make_no_markup(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -429,7 +436,7 @@ def test_names_in_the_data_make_no_markup(tmp_path: Path, caplog: pytest.LogCapt
     (root / WHOLE / "carlasc.json").write_text(
         json.dumps({"format": 2, "classes": table | colors, "sensor": "[x](http://evil)"})
     )
-    carlasc.card(root, **SAID, name="x: [1] # `y`\n---", pictures=False)
+    write_card(root, **SAID, name="x: [1] # `y`\n---", pictures=False)
     text = (root / "README.md").read_text()
     assert "<script>" not in text and "\n# b" not in text and "[x](http://evil)" not in text
     assert front_matter(root)["pretty_name"] == "x: [1] # `y`\n---"
@@ -440,7 +447,7 @@ def test_names_in_the_data_make_no_markup(tmp_path: Path, caplog: pytest.LogCapt
 def test_a_published_store_is_addressed_at_the_hub(
     tables: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    carlasc.card(tables, tmp_path / "card", url="https://huggingface.co/datasets/lab/town", pictures=False, **SAID)
+    write_card(tables, tmp_path / "card", url="https://huggingface.co/datasets/lab/town", pictures=False, **SAID)
     content = croissant(tmp_path / "card")
     address = f"https://huggingface.co/datasets/lab/town/resolve/main/town.parquet/{TOWN}/points.parquet"
     assert address in [file.get("contentUrl") for file in content["distribution"]]
@@ -462,7 +469,7 @@ def test_a_grid_that_cannot_be_described_is_not_left_out(tmp_path: Path) -> None
     root = write_dataset(tmp_path / "data")
     (root / WHOLE / "evaluation" / "params.json").write_text("{}")
     with pytest.raises(FormatError, match=r"params\.json") as caught:
-        carlasc.card(root, **SAID, pictures=False)
+        write_card(root, **SAID, pictures=False)
     assert "\n" not in str(caught.value)
     assert not (root / "README.md").exists()
 
@@ -488,7 +495,7 @@ def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
     carlasc.convert(
         "kitti", tmp_path / "kitti", tmp_path / "out", poses=PoseOptions(source="file"), grids=None, run=Run(workers=1)
     )
-    assert carlasc.card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == ("CC BY-NC-SA 3.0",)
+    assert write_card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == ("CC BY-NC-SA 3.0",)
     text, content = (tmp_path / "out" / "README.md").read_text(), croissant(tmp_path / "out")
     assert front_matter(tmp_path / "out")["license"] == "cc-by-nc-sa-3.0"
     assert "- kitti kitti: J. Behley et al., SemanticKITTI, ICCV 2019" in text
@@ -503,11 +510,11 @@ def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
 def test_data_that_were_converted_from_another_simulator_are_synthetic(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "MIT"))
-    carlasc.card(root, pictures=False)
+    write_card(root, pictures=False)
     assert croissant(root)["rai:hasSyntheticData"] is False
     file = root / WHOLE / "carlasc.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"simulated": True}))
-    carlasc.card(root, pictures=False, overwrite=True)
+    write_card(root, pictures=False, overwrite=True)
     assert croissant(root)["rai:hasSyntheticData"] is True
 
 
@@ -518,17 +525,17 @@ def test_rounded_coordinates_are_said(town: Path, tmp_path: Path) -> None:
 
     with ParquetSink(tmp_path / "x.parquet", PackOptions(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
         writer.write("points", 0, np.ones((3, 4), np.float32))
-    carlasc.card(tmp_path / "x.parquet", **SAID, pictures=False)
+    write_card(tmp_path / "x.parquet", **SAID, pictures=False)
     text = (tmp_path / "x.parquet" / "README.md").read_text()
     assert "`x`, `y` and `z` are whole numbers of 2 mm." in text
     assert "Coordinates of points are rounded to steps of 2 mm." in text
 
 
 def test_every_text_of_responsibility_is_filled_for_converted_data_too(mixed: Path) -> None:
-    from carlasc.inspection.cards.facts import Details, gather
+    from carlasc.inspection.cards.facts import gather
     from carlasc.inspection.cards.licenses import find_license
 
     facts = gather(carlasc.open(mixed), find_license("mit"), 1, Run(workers=1))
-    told = responsibility(facts, Details("x"))
+    told = responsibility(facts, CardDetails("x"))
     assert all(value not in ("", []) for value in told.values())
     assert told["dataCollectionType"] == ["Software Collection", "Secondary Data analysis"]

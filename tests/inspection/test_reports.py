@@ -15,8 +15,8 @@ from carlasc import GridSpec, Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.groundtruth import FromScans, regrid
 from carlasc.inspection import report, validate, write_report_page
-from carlasc.inspection.freshness import Freshness
 from carlasc.inspection.reports import ReportResult
+from carlasc.inspection.validation import Freshness
 from carlasc.storage import FolderSink, layout
 
 FRAMES = 7

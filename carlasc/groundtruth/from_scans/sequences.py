@@ -29,7 +29,7 @@ from carlasc.groundtruth.inputs import (
     scan_fields,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting.actors import Residual
+from carlasc.groundtruth.reporting.facts import Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.plain import from_plain
+from carlasc.core.versions import carlasc_version
 from carlasc.errors import FormatError, reading
-from carlasc.groundtruth.reporting.actors import Actor, actors_of
-from carlasc.groundtruth.reporting.facts import FrameFacts, digest_of_bytes
+from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, actors_of, digest_of_bytes
 from carlasc.storage.files import parse_json, to_json
 
 REPORT_FORMAT = 1
@@ -120,7 +120,7 @@ class FileDigest:
         return self.of(data[: self.size]) == self
 
 
-class _Rays(TypedDict):
+class _HeldOutRays(TypedDict):
     """What the rays of left-out scans found in a grid; see `carlasc.inspection.RayShares`."""
 
     returns: int
@@ -143,9 +143,9 @@ class _Swept(TypedDict):
 class _HeldOut(TypedDict):
     """Held-out scores as JSON has them."""
 
-    rays: _Rays
-    by_class: Mapping[str, _Rays]
-    by_distance: Mapping[str, _Rays]
+    rays: _HeldOutRays
+    by_class: Mapping[str, _HeldOutRays]
+    by_distance: Mapping[str, _HeldOutRays]
     swept: _Swept
 
 
@@ -172,7 +172,7 @@ class Report:
     settings: Mapping[str, Any]
     coverage: Coverage
     convergence: Convergence | None
-    actors: tuple[Actor, ...] | None
+    actors: tuple[ActorTrack, ...] | None
     inferred_share: float | None
     holdout: Mapping[str, Any] | None
     digests: Mapping[str, Digests]
@@ -276,7 +276,7 @@ class Report:
                 settings=from_plain(values["settings"], Mapping[str, Any], "settings"),
                 coverage=from_plain(values["coverage"], Coverage, "coverage"),
                 convergence=from_plain(values["convergence"], Convergence | None, "convergence"),
-                actors=from_plain(values["actors"], tuple[Actor, ...] | None, "actors"),
+                actors=from_plain(values["actors"], tuple[ActorTrack, ...] | None, "actors"),
                 inferred_share=from_plain(values["inferred_share"], float | None, "inferred_share"),
                 holdout=from_plain(values["holdout"], _HeldOut | None, "holdout"),
                 digests={**inputs, **outputs},
@@ -337,10 +337,8 @@ def _digests(rows: list[FrameFacts], name: str) -> Digests:
 def _versions() -> dict[str, str]:
     import numba
 
-    from carlasc import __version__
-
     return {
-        "carlasc": __version__,
+        "carlasc": carlasc_version(),
         "numpy": np.__version__,
         "numba": numba.__version__,
         "python": platform.python_version(),
@@ -365,5 +363,5 @@ def _frames(spans: Any) -> tuple[int, ...]:
     return tuple(frame for span in ranges for frame in span)
 
 
-def _plain(actor: Actor) -> dict[str, Any]:
+def _plain(actor: ActorTrack) -> dict[str, Any]:
     return {**asdict(actor), "size_m": list(actor.size_m), "seen_m": list(actor.seen_m)}

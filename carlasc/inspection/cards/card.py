@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import datetime
 import os
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
 from carlasc.inspection.cards.croissant import WRITER, croissant
-from carlasc.inspection.cards.facts import Details, Facts, gather
+from carlasc.inspection.cards.facts import CardDetails, Facts, gather
 from carlasc.inspection.cards.licenses import license_given
-from carlasc.inspection.cards.places import place_of
+from carlasc.inspection.cards.places import place_of, tables_of
 from carlasc.inspection.cards.readme import readme
-from carlasc.inspection.cards.tables import tables_of
+from carlasc.inspection.texts import say
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source
 from carlasc.storage.files import parse_json, write_output
@@ -66,15 +64,7 @@ def card(
     source: str | os.PathLike[str] | Source,
     out: str | os.PathLike[str] | None = None,
     *,
-    name: str | None = None,
-    description: str | None = None,
-    authors: Sequence[str] = (),
-    license: str | None = None,
-    citation: str | None = None,
-    url: str | None = None,
-    contact: str | None = None,
-    version: str = "1.0.0",
-    published: str | None = None,
+    about: CardDetails = CardDetails(),  # noqa: B008 (frozen)
     pictures: bool = True,
     every: int = 1,
     overwrite: bool = False,
@@ -88,16 +78,7 @@ def card(
         source: a path or URL that `carlasc.open` knows, or a Source at such a place.
         out: folder of the card, the root of what is published. None: the data themselves, if they are a folder or a Parquet store;
             otherwise the folder that they are in.
-        name: name of the data set; None takes that of the source.
-        description: what it is, in a sentence or two; None makes one from the data.
-        authors: names of the people or groups that publish it.
-        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the address of its text. The licence of data that were
-            converted holds for what was made from them, whatever is given here.
-        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is named in any case.
-        url: address of the page where the data are published, such as "https://huggingface.co/datasets/ORG/NAME".
-        contact: whom to ask.
-        version: version of the data.
-        published: date of the publication, YYYY-MM-DD; None takes today.
+        about: what the data cannot say: their name, authors, licence, and how to cite them.
         pictures: whether a grid and a scan are drawn, which needs the extra `render`.
         every: count the classes of every N-th frame.
         overwrite: whether an existing card is replaced.
@@ -114,20 +95,23 @@ def card(
         ConflictError: a card exists, and `overwrite` is not given.
         StorageError: the folder cannot be written to.
     """
-    stated = None if license is None else license_given(license)
-    day = published or datetime.datetime.now(datetime.UTC).date().isoformat()
-    _check(version, day, url)
+    stated = None if about.license is None else license_given(about.license)
     opened = as_source(source)
-    place, folder = place_of(opened if isinstance(source, Source) else source, None if out is None else Path(out), url)
+    given = opened if isinstance(source, Source) else source
+    place, folder = place_of(given, None if out is None else Path(out), about.url)
     overwrite = _check_free(folder, overwrite, pictures)
     facts = gather(opened, stated, every, run)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
-    details = Details(name or place.title, description, tuple(authors), version, day, url, contact, citation)
-    told = description or _describe(facts)
-    write_output(folder / CROISSANT, croissant(facts, details, place, tables, told))
+    details = replace(
+        about,
+        name=about.name or place.title,
+        description=about.description or _describe(facts),
+        published=about.published or datetime.datetime.now(datetime.UTC).date().isoformat(),
+    )
+    write_output(folder / CROISSANT, croissant(facts, details, place, tables))
     drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
     shown = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
-    write_output(folder / README, readme(facts, details, place, tables, told, shown))
+    write_output(folder / README, readme(facts, details, place, tables, shown))
     return CardResult(
         folder,
         (folder / README, folder / CROISSANT, *(path for path, _ in drawn)),
@@ -137,17 +121,6 @@ def card(
         tuple(notes),
         tuple(facts.failures),
     )
-
-
-def _check(version: str, day: str, url: str | None) -> None:
-    if not re.fullmatch(r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", version):
-        raise ArgumentError("version", expected="a version such as 1.0.0", found=repr(version))
-    try:
-        datetime.date.fromisoformat(day)
-    except ValueError:
-        raise ArgumentError("published", expected="a date YYYY-MM-DD", found=repr(day)) from None
-    if url is not None and not re.fullmatch(r"https?://[^\s\"'<>]+", url):
-        raise ArgumentError("url", expected="an address that begins with https://", found=repr(url))
 
 
 def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
@@ -181,15 +154,11 @@ def _describe(facts: Facts) -> str:
     """Return what the data set is, in two sentences."""
     grids = ", ".join(f"{grid.name} ({' x '.join(map(str, grid.size))})" for grid, _, _ in facts.grids[:3])
     what = f"with voxel grids of complete semantic scenes: {grids}" if grids else "without voxel grids"
-    made = " and ".join(
-        text
-        for text, holds in (
-            ("recorded in a simulator", facts.simulated),
-            (f"converted from {', '.join(facts.sources)}", bool(facts.sources)),
-        )
-        if holds
+    made = ["recorded in a simulator"] if facts.simulated else []
+    made += [f"converted from {', '.join(facts.sources)}"] if facts.sources else []
+    return say(
+        "summary", frames=f"{facts.frames:,}", sequences=facts.sequences_told, grids=what, made=" and ".join(made)
     )
-    return f"{facts.frames:,} LiDAR frames in {facts.sequences_told}, {what}. The data were {made}, and are in the layout of CarlaSC."
 
 
 def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from carlasc.inspection.cards.facts import MOTIONSC, Details, Facts, shares
-from carlasc.inspection.cards.places import Place
+from carlasc.inspection.cards.facts import CardDetails, Facts, shares
+from carlasc.inspection.cards.places import Place, PublishedTable, split_of
 from carlasc.inspection.cards.responsibility import collection, made, responsibility
-from carlasc.inspection.cards.tables import Table, split_of
+from carlasc.inspection.texts import read
 from carlasc.storage import layout
 
 Json = dict[str, Any]
@@ -22,35 +23,17 @@ CONFORMS_TO = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/crois
 KEYWORDS = ("LiDAR", "voxel grid", "semantic scene completion", "semantic mapping", "occupancy", "scene flow")
 _PARQUET = "application/x-parquet"
 _ENCODINGS = {".h5": "application/x-hdf5", ".hdf5": "application/x-hdf5", ".zip": "application/zip"}
-_CONTEXT: Json = {
-    "@language": "en", "@vocab": "https://schema.org/", "arrayShape": "cr:arrayShape", "citeAs": "cr:citeAs", "column": "cr:column",
-    "conformsTo": "dct:conformsTo", "containedIn": "cr:containedIn", "cr": "http://mlcommons.org/croissant/",
-    "rai": "http://mlcommons.org/croissant/RAI/", "prov": "http://www.w3.org/ns/prov#",
-    "data": {"@id": "cr:data", "@type": "@json"}, "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/", "description": {"@container": "@language"}, "equivalentProperty": "cr:equivalentProperty",
-    "examples": {"@id": "cr:examples", "@type": "@json"}, "extract": "cr:extract", "field": "cr:field", "fileProperty": "cr:fileProperty",
-    "fileObject": "cr:fileObject", "fileSet": "cr:fileSet", "format": "cr:format", "includes": "cr:includes", "isArray": "cr:isArray",
-    "isLiveDataset": "cr:isLiveDataset", "jsonPath": "cr:jsonPath", "key": "cr:key", "md5": "cr:md5",
-    "name": {"@container": "@language"}, "parentField": "cr:parentField", "path": "cr:path", "recordSet": "cr:recordSet",
-    "references": "cr:references", "regex": "cr:regex", "repeated": "cr:repeated", "replace": "cr:replace",
-    "samplingRate": "cr:samplingRate", "sc": "https://schema.org/", "separator": "cr:separator", "source": "cr:source",
-    "subField": "cr:subField", "transform": "cr:transform",
-}  # fmt: skip
-_TYPES = {  # of columns, by their names in pyarrow
-    "float": "cr:Float32", "double": "cr:Float64", "halffloat": "cr:Float16", "int32": "cr:Int32", "int64": "cr:Int64",
-    "uint8": "cr:UInt8", "uint16": "cr:UInt16", "uint32": "cr:UInt32", "string": "sc:Text", "binary": "sc:ImageObject", "bool": "sc:Boolean",
-}  # fmt: skip
 
 
-def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Table], description: str) -> bytes:
+def croissant(facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]) -> bytes:
     """Return the bytes of croissant.json."""
     licenses = [license_.url for license_ in facts.licenses]
     content: Json = {
-        "@context": _CONTEXT,
+        "@context": _vocabulary()["context"],
         "@type": "sc:Dataset",
         "conformsTo": list(CONFORMS_TO),
         "name": details.name,
-        "description": description,
+        "description": details.description,
         "license": licenses[0] if len(licenses) == 1 else licenses,
         "version": details.version,
         "datePublished": details.published,
@@ -74,10 +57,17 @@ def croissant(facts: Facts, details: Details, place: Place, tables: Sequence[Tab
     return (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
 
 
+@cache
+def _vocabulary() -> Json:
+    """Return the context of Croissant, its types by their names in pyarrow, and what columns mean."""
+    found: Json = json.loads(read("croissant.json"))
+    return found
+
+
 def _papers(facts: Facts) -> str:
     """Return what to cite: the papers of the sources, or that which introduced CarlaSC."""
     papers = list(dict.fromkeys(filter(None, facts.citations.values())))
-    return "; ".join(papers) if papers and not facts.simulated else MOTIONSC
+    return "; ".join(papers) if papers and not facts.simulated else read("motionsc.bib").strip()
 
 
 def _id(name: str) -> str:
@@ -89,7 +79,7 @@ def _activity(label: str, text: str) -> Json:
     return {"@type": "prov:Activity", "prov:label": label, "sc:description": text}
 
 
-def _files(facts: Facts, place: Place, tables: Sequence[Table]) -> Iterable[Json]:
+def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iterable[Json]:
     """Yield the files: each whole file with its checksum, and sets of files by their patterns."""
     inside: Json = {}
     if place.repository:
@@ -221,7 +211,7 @@ def _inline(name: str, meaning: str, fields: Sequence[tuple[str, str, str]], row
     }
 
 
-def _record_set(table: Table) -> Json:
+def _record_set(table: PublishedTable) -> Json:
     """Return the record set of a table: one field per column."""
     return {
         "@type": "cr:RecordSet",
@@ -233,7 +223,7 @@ def _record_set(table: Table) -> Json:
                 "@type": "cr:Field",
                 "@id": f"{_id(table.name)}/{_id(column)}",
                 "name": column,
-                "description": _COLUMNS.get(column, column),
+                "description": _vocabulary()["columns"].get(column, column),
                 **_type_of(type_),
                 "source": {"fileSet": {"@id": f"{_id(table.name)}-files"}, "extract": {"column": column}},
             }
@@ -242,25 +232,9 @@ def _record_set(table: Table) -> Json:
     }
 
 
-_COLUMNS = {
-    "sequence": "number of the sequence; the table `frames` has its path",
-    "path": "path of the sequence",
-    "frame": "number of the frame in its sequence",
-    "time_s": "time of the frame, seconds",
-    "pose": "first three rows of the pose of the sensor, row by row, metres",
-    "x": "forward, metres",
-    "y": "to the side, metres; to the right in left-handed axes",
-    "z": "up, metres",
-    "fourth": "remission, or zero",
-    "label": "number of the class",
-    "votes": "number of votes; 0 is unknown",
-    "jpeg": "a picture, as the bytes of a JPEG file",
-}
-
-
 def _type_of(type_: str) -> Json:
     """Return the type of a column; a list of fixed length is an array."""
     if type_.startswith("fixed_size_list"):
         length = type_.rpartition("[")[2].rstrip("]")
         return {"dataType": "cr:Float64", "isArray": True, "arrayShape": length}
-    return {"dataType": _TYPES.get(type_, "sc:Text")}
+    return {"dataType": _vocabulary()["types"].get(type_, "sc:Text")}

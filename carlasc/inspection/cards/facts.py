@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import datetime
+import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -15,44 +17,49 @@ from carlasc.inspection.statistics import Histogram, Statistics, stats
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.packed.stores import PackedSource
-from carlasc.storage.protocol import Sequence, Source
-
-MOTIONSC = """@article{wilson2022motionsc,
-  title = {MotionSC: Data Set and Network for Real-Time Semantic Mapping in Dynamic Environments},
-  author = {Wilson, Joey and Song, Jingyu and Fu, Yuewei and Zhang, Arthur and Capodieci, Andrew and Jayakumar, Paramsothy and Barton, Kira and Ghaffari, Maani},
-  journal = {IEEE Robotics and Automation Letters},
-  volume = {7},
-  number = {3},
-  pages = {8439--8446},
-  year = {2022},
-  doi = {10.1109/LRA.2022.3185484}
-}"""
-"""The paper that introduced CarlaSC, whose layout and classes the data have."""
+from carlasc.storage.protocol import Sequence as StoredSequence
+from carlasc.storage.protocol import Source
 
 
 @dataclass(frozen=True)
-class Details:
+class CardDetails:
     """What the data cannot say of themselves.
 
     Attributes:
-        name: name of the data set.
+        name: name of the data set; None takes that of the source.
         description: what it is, in a sentence or two; None makes one from the data.
         authors: names of the people or groups that publish it.
-        version: version of the data, such as "1.0.0".
-        published: date of the publication, YYYY-MM-DD.
-        url: address of the page where the data are published; None if it is not known yet.
+        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the address of its text. The licence of data that were
+            converted holds for what was made from them, whatever is given here.
+        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is named in any case.
+        url: address of the page where the data are published, such as "https://huggingface.co/datasets/ORG/NAME".
         contact: whom to ask, in words or as an address.
-        citation: how to cite the data (BibTeX); None for the paper that introduced CarlaSC.
+        version: version of the data.
+        published: date of the publication, YYYY-MM-DD; None takes today.
+
+    Raises:
+        ArgumentError: a version, a date or an address is not one.
     """
 
-    name: str
+    name: str | None = None
     description: str | None = None
-    authors: tuple[str, ...] = ()
-    version: str = "1.0.0"
-    published: str = ""
+    authors: Sequence[str] = ()
+    license: str | None = None
+    citation: str | None = None
     url: str | None = None
     contact: str | None = None
-    citation: str | None = None
+    version: str = "1.0.0"
+    published: str | None = None
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", self.version):
+            raise ArgumentError("version", expected="a version such as 1.0.0", found=repr(self.version))
+        try:
+            datetime.date.fromisoformat(self.published or "2000-01-01")
+        except ValueError:
+            raise ArgumentError("published", expected="a date YYYY-MM-DD", found=repr(self.published)) from None
+        if self.url is not None and not re.fullmatch(r"https?://[^\s\"'<>]+", self.url):
+            raise ArgumentError("url", expected="an address that begins with https://", found=repr(self.url))
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class Facts:
     """
 
     overview: Overview
-    sequences: Mapping[str, Sequence] = field(repr=False)
+    sequences: Mapping[str, StoredSequence] = field(repr=False)
     parts: tuple[LicensedPart, ...]
     statistics: tuple[Statistics, ...]
     every: int
@@ -205,18 +212,18 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
 class _Chosen(Source):
     """Some of the sequences of a source."""
 
-    def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
+    def __init__(self, location: str, sequences: Mapping[str, StoredSequence]) -> None:
         self.location, self.chosen = location, sequences
 
-    def sequences(self) -> Mapping[str, Sequence]:
+    def sequences(self) -> Mapping[str, StoredSequence]:
         return self.chosen
 
 
-def _count(location: str, sequences: Mapping[str, Sequence], every: int, run: Run) -> tuple[Statistics, ...]:
+def _count(location: str, sequences: Mapping[str, StoredSequence], every: int, run: Run) -> tuple[Statistics, ...]:
     """Count the classes, apart for each class table; sequences without labels are left out."""
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
-    tables: dict[str, dict[str, Sequence]] = {}
+    tables: dict[str, dict[str, StoredSequence]] = {}
     for path, sequence in sequences.items():
         if "labels" in sequence.fields() or any(name.endswith("/labels") for name in sequence.fields()):
             tables.setdefault(sequence.metadata.classes.name, {})[path] = sequence

@@ -6,8 +6,10 @@ import difflib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 
 from carlasc.errors import ArgumentError, CarlascError, FormatError
+from carlasc.inspection.texts import read_table
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
@@ -57,44 +59,18 @@ class License:
         return self.derivatives is not True, self.commercial is not True, self.share_alike is not False
 
 
-def _creative_commons() -> Iterable[License]:
-    """Yield the licences of Creative Commons with all versions that exist; the Hub has names for some."""
-    on_hub = {
-        "by": ("2.0", "2.5", "3.0", "4.0"),
-        "by-sa": ("3.0", "4.0"),
-        "by-nc": ("2.0", "3.0", "4.0"),
-        "by-nd": ("4.0",),
-        "by-nc-nd": ("3.0", "4.0"),
-        "by-nc-sa": ("2.0", "3.0", "4.0"),
-    }
-    for kind, known in on_hub.items():
+@cache
+def _licenses() -> dict[str, License]:
+    """Return the licences by name; of those of Creative Commons, all versions that exist."""
+    table = read_table("licenses.toml")
+    found = [License(**entry) for entry in table["license"]]
+    for kind, on_hub in table["creative_commons"].items():
         for version in ("1.0", "2.0", "2.5", "3.0", "4.0"):
-            yield License(
-                f"CC {kind.upper()} {version}",
-                f"https://creativecommons.org/licenses/{kind}/{version}/",
-                f"cc-{kind}-{version}" if version in known else _OTHER,
-                derivatives="nd" not in kind,
-                commercial="nc" not in kind,
-                share_alike="sa" in kind,
-            )
-
-
-_LICENSES = {
-    re.sub(r"[^a-z0-9.]+", "-", one.name.lower()): one
-    for one in (
-        *_creative_commons(),
-        License("CC0 1.0", "https://creativecommons.org/publicdomain/zero/1.0/", "cc0-1.0"),
-        License("PDDL 1.0", "https://opendatacommons.org/licenses/pddl/1-0/", "pddl"),
-        License("ODC-BY 1.0", "https://opendatacommons.org/licenses/by/1-0/", "odc-by"),
-        License("ODbL 1.0", "https://opendatacommons.org/licenses/odbl/1-0/", "odbl", share_alike=True),
-        License("CDLA-Permissive 2.0", "https://cdla.dev/permissive-2-0/", "cdla-permissive-2.0"),
-        License("CDLA-Sharing 1.0", "https://cdla.dev/sharing-1-0/", "cdla-sharing-1.0", share_alike=True),
-        License("MIT", "https://opensource.org/license/mit", "mit"),
-        License("Apache 2.0", "https://www.apache.org/licenses/LICENSE-2.0", "apache-2.0"),
-        License("BSD 3-Clause", "https://opensource.org/license/bsd-3-clause", "bsd-3-clause"),
-    )
-}
-_SHORT = {"pddl": "pddl-1.0", "odc-by": "odc-by-1.0", "odbl": "odbl-1.0", "cc0": "cc0-1.0", "cc-zero-1.0": "cc0-1.0"}
+            url = f"https://creativecommons.org/licenses/{kind}/{version}/"
+            hub = f"cc-{kind}-{version}" if version in on_hub else _OTHER
+            permits = ("nd" not in kind, "nc" not in kind, "sa" in kind)
+            found.append(License(f"CC {kind.upper()} {version}", url, hub, *permits))
+    return {re.sub(r"[^a-z0-9.]+", "-", one.name.lower()): one for one in found}
 
 
 def find_license(text: str) -> License | None:
@@ -102,13 +78,15 @@ def find_license(text: str) -> License | None:
     stripped = text.strip()
     if re.fullmatch(r"https?://[^\s\"'<>]+", stripped):
         if deed := re.match(r"https?://(?:www\.)?creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b", stripped):
-            return _LICENSES.get(f"cc-{deed[1]}-{deed[2]}")  # also where /deed.en, /legalcode or a country follows
+            return _licenses().get(f"cc-{deed[1]}-{deed[2]}")  # also where /deed.en, /legalcode or a country follows
         address = re.sub(r"^https?://(www\.)?", "", stripped).rstrip("/")
-        known = (one for one in _LICENSES.values() if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address)
+        known = (
+            one for one in _licenses().values() if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address
+        )
         return next(known, License(stripped, stripped, _OTHER, None, None, None))
     key = re.sub(r"\blicen[cs]e\b|\bv(?=\d)", "", stripped.lower().replace("creative commons", "cc"))
     key = re.sub(r"[^a-z0-9.]+", "-", key).strip("-")
-    return _LICENSES.get(_SHORT.get(key, key))
+    return _licenses().get(read_table("licenses.toml")["short"].get(key, key))
 
 
 def license_given(text: str) -> License:
@@ -119,7 +97,7 @@ def license_given(text: str) -> License:
     """
     found = find_license(text)
     if found is None:
-        near = difflib.get_close_matches(text.lower(), [one.hub for one in _LICENSES.values()], 3, 0.5)
+        near = difflib.get_close_matches(text.lower(), [one.hub for one in _licenses().values()], 3, 0.5)
         raise ArgumentError(
             "license",
             expected=f"the name of a licence, such as {', '.join(near or ['cc-by-4.0', 'cc-by-nc-sa-4.0', 'mit'])}",

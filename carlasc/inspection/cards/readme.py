@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from carlasc.errors import printable
-from carlasc.inspection.cards.facts import MOTIONSC, Details, Facts, shares
-from carlasc.inspection.cards.places import Place
+from carlasc.inspection.cards.facts import CardDetails, Facts, shares
+from carlasc.inspection.cards.places import Place, PublishedTable
 from carlasc.inspection.cards.responsibility import (
     annotation,
     biases,
@@ -21,8 +21,8 @@ from carlasc.inspection.cards.responsibility import (
     responsibility,
     uses,
 )
-from carlasc.inspection.cards.tables import Table
 from carlasc.inspection.overview import GridOverview, SequenceOverview
+from carlasc.inspection.texts import fill, read, say
 from carlasc.storage.layout import EVALUATION
 
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"), (10**7, "1M<n<10M"))
@@ -31,30 +31,39 @@ _MOST_SEQUENCES = 60  # rows of the table of sequences
 
 def readme(
     facts: Facts,
-    details: Details,
+    details: CardDetails,
     place: Place,
-    tables: Sequence[Table],
-    description: str,
+    tables: Sequence[PublishedTable],
     pictures: Sequence[tuple[str, str]],
 ) -> bytes:
-    """Return the bytes of README.md; `pictures` are (path below the folder of the card, what it shows)."""
-    sections = [
-        f"# {_text(details.name)}",
-        _text(description),
-        *(f"![{_text(caption)}]({path})" for path, caption in pictures),
-        _glance(facts, details),
-        "## Open it\n\n" + _opening(facts, place, tables),
-        "## Classes\n\n" + _classes(facts),
-        "## Splits and sequences\n\n" + _sequences(facts),
-        "## How it was made\n\n" + _making(facts),
-        "## Licence\n\n" + _licenses(facts),
-        "## Uses, limits and biases\n\n" + _limits(facts, details),
-        "## Citation\n\n" + _citation(facts, details),
-    ]
-    return (_front_matter(facts, details, place, tables) + "\n\n".join(sections) + "\n").encode()
+    """Return the bytes of README.md.
+
+    Args:
+        facts: what was read from the data.
+        details: what the data cannot say; with a name, a description and a date.
+        place: where the data lie.
+        tables: those of a Parquet store.
+        pictures: (path below the folder of the card, what it shows) of each.
+    """
+    opening = [_text(details.description or ""), *(f"![{_text(caption)}]({path})" for path, caption in pictures)]
+    text = fill(
+        "card.md",
+        front_matter=_front_matter(facts, details, place, tables),
+        name=_text(details.name or ""),
+        opening="\n\n".join(opening),
+        glance=_glance(facts, details),
+        reading=_opening(facts, place, tables),
+        classes=_classes(facts),
+        sequences=_sequences(facts),
+        making=_making(facts),
+        licenses=_licenses(facts),
+        limits=_limits(facts, details),
+        citation=_citation(facts, details),
+    )
+    return text.encode()
 
 
-def _front_matter(facts: Facts, details: Details, place: Place, tables: Sequence[Table]) -> str:
+def _front_matter(facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]) -> str:
     names = list(dict.fromkeys(license_.hub for license_ in facts.licenses))
     others = [license_ for license_ in facts.licenses if license_.hub == "other"]
     values: dict[str, Any] = {"license": names[0] if len(names) == 1 else names}
@@ -83,7 +92,7 @@ def _front_matter(facts: Facts, details: Details, place: Place, tables: Sequence
         ]
     else:
         values["viewer"] = False  # the Hub would show the pictures of the card as if they were the data
-    return f"---\n{_yaml(values)}---\n\n"
+    return _yaml(values)
 
 
 _SPLITS = ("train", "validation", "test")
@@ -120,7 +129,7 @@ def _yaml(value: Any, indent: str = "") -> str:
     return "".join(lines)
 
 
-def _glance(facts: Facts, details: Details) -> str:
+def _glance(facts: Facts, details: CardDetails) -> str:
     rows = [
         ["frames", f"{facts.frames:,} in {facts.sequences_told}"],
         ["splits", ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items())],
@@ -145,51 +154,37 @@ def _grid(grid: GridOverview) -> str:
     )
 
 
-def _opening(facts: Facts, place: Place, tables: Sequence[Table]) -> str:
+def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> str:
     name, first = place.name or ".", facts.overview.sequences[0]
     extra = {"zarr": "[zarr]", "hdf5": "[hdf5]", "parquet": "[parquet]"}.get(facts.overview.store, "")
     target = place.repository and f"hf://datasets/{place.repository.partition('/datasets/')[2]}" + (
         f"/{place.name}" if place.name else ""
     )
     text = [
-        f"With carlasc (`pip install 'carlasc{extra}'`), in the folder of this file:",
-        f"```python\nimport carlasc\n\nsequence = carlasc.open({json.dumps(name)}).sequences()[{json.dumps(first.path)}]\n"
-        f"{_first_read(first)}\n{_samples(facts, name)}```",
+        say("open_folder", extra=extra),
+        say(
+            "open_python",
+            name=json.dumps(name),
+            path=json.dumps(first.path),
+            reading=_first_read(first),
+            samples=_samples(facts, name),
+        ),
     ]
     if target:
-        text.append(f"Without a download: `carlasc.open({json.dumps(target)})`, with the extra `hub` too.")
+        text.append(say("open_hub", target=json.dumps(target)))
     if tables:
         config = next((table for table in tables if table.name == "points"), tables[0])
         split = json.dumps(sorted(config.files, key=_SPLITS.index)[0])
-        text.append("With [datasets](https://huggingface.co/docs/datasets), one row per point, voxel or frame:")
-        text.append(
-            f"```python\n{_data_set(place)}\n"
-            f"frames = load_dataset(data, split={split})\n"
-            f"one = load_dataset(data, {json.dumps(config.name)}, split={split},\n"
-            f'                   filters=[("sequence", "==", frames[0]["sequence"]), ("frame", "==", frames[0]["frame"])])\n'
-            'columns = one.with_format("numpy")[:]  # an array for each column\n```'
-        )
-        text.append(
-            "Rows are in the order of the scan's points, and of the grid's voxels (C order), so that tables of one frame belong together row by "
-            "row. `sequence` and `frame` name the frame; the configuration `frames` has the path, the pose and the time of each."
-        )
-        text.append(
-            _table(["configuration", "rows", "columns"], [[t.name, t.title, ", ".join(t.columns)] for t in tables])
-        )
-        if facts.lossy_mm:
-            text.append(f"`x`, `y` and `z` are whole numbers of {facts.lossy_mm:g} mm.")
+        hub = place.repository and json.dumps(place.repository.partition("/datasets/")[2])
+        data = say("data_on_hub", name=hub) if hub else say("data_here")  # "." would be a data set without a name
+        text += [
+            say("open_tables"),
+            say("open_datasets", data=data, split=split, config=json.dumps(config.name)),
+            say("order_of_rows"),
+            _table(["configuration", "rows", "columns"], [[t.name, t.title, ", ".join(t.columns)] for t in tables]),
+        ]
+        text += [say("whole_numbers", step=f"{facts.lossy_mm:g}")] if facts.lossy_mm else []
     return "\n\n".join(text)
-
-
-def _data_set(place: Place) -> str:
-    """Return lines of Python that name the data for `load_dataset`: "." would be a data set without a name."""
-    if place.repository:
-        name = json.dumps(place.repository.partition("/datasets/")[2])
-        return f"from datasets import load_dataset\n\ndata = {name}"
-    return (
-        "from pathlib import Path\n\nfrom datasets import load_dataset\n\n"
-        "data = str(Path().resolve())  # the folder of this file; at the Hugging Face Hub, ORG/NAME"
-    )
 
 
 def _first_read(first: SequenceOverview) -> str:
@@ -213,20 +208,19 @@ def _samples(facts: Facts, name: str) -> str:
 
 def _classes(facts: Facts) -> str:
     if not facts.statistics:
-        return "The data have no labels."
+        return say("no_labels")
     text = []
     for one in facts.statistics:
         rows = [
             [str(index), name, _percent(of_points), _percent(of_voxels)]
             for index, name, of_points, of_voxels in shares(one, one.total)
         ]
-        text.append(f"The class table is `{_text(one.classes.name)}`; classes that do not occur are left out.")
+        text.append(say("class_table", name=_text(one.classes.name)))
         text.append(_table(["id", "class", "points %", "known voxels %"], rows))
     share = facts.known_share() if any(one.total.grids for one in facts.statistics) else None
-    known = "" if share is None else f" {share:.1%} of the voxels are known; the others have count 0."
-    text.append(f"Class 0 is unlabelled on points and free in voxels.{known}")
-    if facts.every > 1:
-        text.append(f"Counted on every {facts.every}th frame.")
+    known = "" if share is None else say("known_share", share=f"{share:.1%}")
+    text.append(say("class_zero", known=known))
+    text += [say("counted_here", every=facts.every)] if facts.every > 1 else []
     return "\n\n".join(text)
 
 
@@ -240,7 +234,7 @@ def _sequences(facts: Facts) -> str:
     ]
     text.append(_table(["sequence", "frames", "made from", "licence", "classes"], rows[:_MOST_SEQUENCES]))
     if len(rows) > _MOST_SEQUENCES:
-        text.append(f"{len(rows) - _MOST_SEQUENCES} more sequences: croissant.json lists all of them.")
+        text.append(say("more_sequences", count=len(rows) - _MOST_SEQUENCES))
     return "\n\n".join(text)
 
 
@@ -260,13 +254,10 @@ def _making(facts: Facts) -> str:
             ]
             for name, one in facts.reports.items()
         ]
-        text.append("From the reports (`carlasc-report.json`) that the runs left beside the grids:")
+        text.append(say("from_reports"))
         header = ["grid", "known voxels %", "occupied of these %", "changed with a tenth fewer scans %", "made with"]
         text.append(_table(header, rows[:_MOST_SEQUENCES]))
-    if facts.grids:
-        text.append(
-            "`params.json` beside each grid has all settings; `carlasc validate` compares the files with their digests."
-        )
+    text += [say("settings")] if facts.grids else []
     return "\n\n".join(text)
 
 
@@ -282,19 +273,12 @@ def _licenses(facts: Facts) -> str:
         for part in facts.parts
     ]
     text = [_table(["source", "licence", "conditions", "sequences", "named by"], rows, links=True)]
-    if len(facts.licenses) > 1:
-        text.append(
-            "Each sequence keeps the licence of its source. Who uses all of them together keeps the conditions of all of them, of which the first "
-            "row has the strictest."
-        )
-    if facts.sources:
-        text.append(
-            "The licence of the data that a sequence was converted from holds for what was made from them: name their authors too."
-        )
+    text += [say("several_licenses")] if len(facts.licenses) > 1 else []
+    text += [say("license_of_source")] if facts.sources else []
     return "\n\n".join(text)
 
 
-def _limits(facts: Facts, details: Details) -> str:
+def _limits(facts: Facts, details: CardDetails) -> str:
     told = responsibility(facts, details)
     personal = told["personalSensitiveInformation"]
     items = [
@@ -307,16 +291,15 @@ def _limits(facts: Facts, details: Details) -> str:
     return "\n".join(f"- {_text(item)}" for item in items)
 
 
-def _citation(facts: Facts, details: Details) -> str:
+def _citation(facts: Facts, details: CardDetails) -> str:
     text = [_code(details.citation)] if details.citation else []
     if facts.sources:
         papers = [f"{source}: {paper or 'see the page of its publishers'}" for source, paper in facts.citations.items()]
-        text.append("Sequences were converted from these data, which are to be cited as well:")
+        text.append(say("cite_sources"))
         text.append("\n".join(f"- {_text(line)}" for line in papers))
     if details.citation or not facts.simulated:
-        text.append("The layout and the classes are those of CarlaSC:")
-    text.append(_code(MOTIONSC))
-    text.append("Made with carlasc; its CITATION.cff says how to cite the software.")
+        text.append(say("cite_layout"))
+    text += [_code(read("motionsc.bib")), say("cite_software")]
     return "\n\n".join(text)
 
 
