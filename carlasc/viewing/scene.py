@@ -26,6 +26,7 @@ from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
 from carlasc.viewing.finding import (
     FoundSequence,
+    RemappedSequence,
     SceneSource,
     choose_grid,
     common_table,
@@ -36,7 +37,6 @@ from carlasc.viewing.finding import (
     list_fields,
     table_of,
 )
-from carlasc.viewing.remapping import RemappedSequence
 
 CONTENTS = ("grid", "scan", "flow", "truth", "errors")
 """What a picture can show of a frame."""
@@ -273,7 +273,9 @@ class SceneReader:
             FormatError: the data do not have the format.
         """
         scan = self.read_scan(frame)
-        boxes = self._read_boxes(frame) if scan is None else scan.boxes
+        boxes = scan.boxes if scan is not None else self.data.read_boxes(frame)
+        if scan is None and self.mirrored and boxes is not None:
+            boxes = mirror_boxes(boxes)
         return FrameContent(self._read_grids(frame), scan, self.read_time(frame), boxes, self.read_pose(frame))
 
     def read_scan(self, frame: int) -> Scan | None:
@@ -319,16 +321,11 @@ class SceneReader:
             return None
         return self.data.sequence.read("bev", frame).tobytes()
 
-    def _read_boxes(self, frame: int) -> Boxes | None:
-        boxes = self.data.read_boxes(frame)
-        return mirror_boxes(boxes) if self.mirrored and boxes is not None else boxes
-
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:
         if not self.data.grid:
             return ()
-        grid = self.data.read_grid(frame)
-        grids: tuple[Grid, ...] = (grid,)
+        grids = [self.data.read_grid(frame)]
         if self.truth is not None:
             truth = self.truth.read_grid(frame)
-            grids = grid, truth, Grid(truth.spec, compare_grids(grid, truth), truth.counts)
-        return tuple(map(mirror_voxels, grids)) if self.mirrored else grids
+            grids += [truth, Grid(truth.spec, compare_grids(grids[0], truth), truth.counts)]
+        return tuple(map(mirror_voxels, grids) if self.mirrored else grids)

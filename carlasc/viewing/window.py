@@ -2,26 +2,76 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import re
+import shutil
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.scans import Scan
-from carlasc.errors import DependencyError
+from carlasc.errors import DependencyError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import Entry
-from carlasc.viewing.libraries import PAGE_ADVICE, import_open3d
 from carlasc.viewing.rendering.drawings import ego_vehicle, grid_extent, motion_arrows, scan_extent
 from carlasc.viewing.rendering.meshes import QuadMesh, arrows, grid_mesh
 from carlasc.viewing.scene import FrameContent, Scene, SceneReader
+
+PAGE_ADVICE = 'or write a page instead with `out="page.html"`'
+
+_DEBIAN = {  # shared library -> its package in Debian and Ubuntu
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libGLX.so.0": "libglx0",
+    "libX11.so.6": "libx11-6",
+    "libudev.so.1": "libudev1",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libidn2.so.0": "libidn2-0",
+    "libgomp.so.1": "libgomp1",
+    "libstdc++.so.6": "libstdc++6",
+    "libz.so.1": "zlib1g",
+}
+
+
+def import_open3d() -> ModuleType:
+    """Import Open3D.
+
+    Raises:
+        DependencyError: Open3D is not installed, or a system library is missing; the advice says what to install.
+    """
+    try:
+        return importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        missing = missing_library(str(error))
+        if missing is None and isinstance(error, ImportError):
+            return import_extra("open3d", "view")  # says that it is not installed, or what the loader said
+        problem = str(error) if missing is None else f"{missing} is missing"
+        raise DependencyError("open3d", problem=f"cannot be loaded: {problem}", advice=advice(missing)) from error
+
+
+def missing_library(message: str) -> str | None:
+    """Return the shared library that is missing according to a loader's message, or None."""
+    match = re.search(r"(\S+\.so[.0-9]*): cannot open shared object file", message)
+    return match[1] if match else None
+
+
+def advice(library: str | None) -> str:
+    """Return what to install for a library, or what to do if its package is not known."""
+    package = _DEBIAN.get(library or "")
+    if package is None:
+        return f"install the library that the message names, {PAGE_ADVICE}"
+    root = "sudo " if shutil.which("sudo") else ""
+    return f"{root}apt-get install {package} (Debian, Ubuntu), {PAGE_ADVICE}"
+
 
 LAYERS = {"g": "grid", "p": "points", "f": "flow", "b": "boxes", "v": "vehicle"}
 KEYS = {
@@ -190,10 +240,7 @@ class Window:
         lower, upper = corners.min(0), corners.max(0)
         rim = np.array([(x, y, lower[2]) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], np.float64)
         rim[:, :2] = lower[:2] + rim[:, :2] * (upper - lower)[:2]
-        lines = self.o3d.geometry.LineSet(
-            self._vectors(rim),
-            self.o3d.utility.Vector2iVector(np.array([(0, 1), (1, 2), (2, 3), (3, 0)])),
-        )
+        lines = self._lines(rim, np.array([(0, 1), (1, 2), (2, 3), (3, 0)]))
         lines.paint_uniform_color((0.55, 0.58, 0.63))
         self._visualizer.add_geometry(lines)
         self._reset_camera()
@@ -257,10 +304,7 @@ class Window:
         face, side = np.nonzero(mesh.edges)
         corners = mesh.corners + 4e-3 * mesh.normals[:, None]
         ends = np.stack([corners[face, side], corners[face, (side + 1) % 4]], axis=1)
-        lines = self.o3d.geometry.LineSet(
-            self._vectors(ends.reshape(-1, 3)),
-            self.o3d.utility.Vector2iVector(np.arange(2 * len(face), dtype=np.int32).reshape(-1, 2)),
-        )
+        lines = self._lines(ends, np.arange(2 * len(face)))
         lines.colors = self.o3d.utility.Vector3dVector(
             mesh.colors[face] * (_EDGE / 255.0) * self._light(mesh)[face, None]
         )
@@ -299,10 +343,7 @@ class Window:
             "nij,nkj->nki", boxes.sensor_T_box[:, :3, :3], _BOX_CORNERS * boxes.sizes[:, None] / 2
         )
         edges = 8 * np.arange(len(boxes))[:, None, None] + _BOX_EDGES
-        lines = self.o3d.geometry.LineSet(
-            self._vectors(corners.reshape(-1, 3)),
-            self.o3d.utility.Vector2iVector(edges.reshape(-1, 2).astype(np.int32)),
-        )
+        lines = self._lines(corners, edges)
         colors = np.repeat(self.reader.colors.by_id[boxes.labels], len(_BOX_EDGES), axis=0)
         lines.colors = self.o3d.utility.Vector3dVector(colors / 255.0)
         return lines
@@ -322,6 +363,10 @@ class Window:
         """Return the brightness of each face in the sun; a level face without shade has exactly its own colour."""
         lit = np.clip(mesh.normals @ _SUN, 0, None) / _SUN[2]
         return 0.58 + 0.42 * np.minimum(lit, 1.25)
+
+    def _lines(self, corners: NDArray[np.floating], ends: NDArray[np.integer]) -> Any:
+        pairs = self.o3d.utility.Vector2iVector(ends.reshape(-1, 2).astype(np.int32))
+        return self.o3d.geometry.LineSet(self._vectors(corners.reshape(-1, 3)), pairs)
 
     def _vectors(self, points: NDArray[np.floating]) -> Any:
         return self.o3d.utility.Vector3dVector(np.asarray(points, np.float64))

@@ -23,8 +23,8 @@ from carlasc.storage import FolderSink, layout
 from carlasc.viewing import Scene, ViewResult, view
 from carlasc.viewing.colors import ERRORS, PATH, UNLABELLED
 from carlasc.viewing.recordings.content import class_surfaces, record_frames, thin_scan
-from carlasc.viewing.recordings.recording import RECORDINGS
 from carlasc.viewing.rendering.meshes import grid_mesh
+from carlasc.viewing.viewer import RECORDINGS
 
 pytestmark = pytest.mark.needs("rerun", "foxglove")
 
@@ -333,7 +333,7 @@ def test_thinning_keeps_an_even_share_and_always_the_same_points(count):
 @pytest.mark.parametrize("ending", RECORDINGS)
 def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_first(ending, tmp_path, monkeypatch):
     folder = write_blocks(tmp_path / "cartesian", frames=6)
-    monkeypatch.setattr("carlasc.viewing.recordings.recording.MAX_POINTS", 1000)
+    monkeypatch.setattr("carlasc.viewing.viewer.MAX_POINTS", 1000)
     said = []
     thin = view(folder, tmp_path / f"thin{ending}", report=said.append)
     assert said == []
@@ -358,7 +358,7 @@ def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_fir
 
 @pytest.mark.parametrize("ending", RECORDINGS)
 def test_the_size_is_estimated_within_a_few_percent(ending, tmp_path):
-    from carlasc.viewing.recordings.recording import estimate_size
+    from carlasc.viewing.viewer import estimate_size
 
     folder = write_blocks(tmp_path / "cartesian", frames=12)
     result = view(folder, tmp_path / f"a{ending}", full_points=True)
@@ -500,7 +500,7 @@ def test_sixty_frames_take_less_than_40_megabytes_and_20_seconds(ending, tmp_pat
 def test_only_the_scene_reads_sequences():
     """Whatever shows data reads it through a `SceneReader`."""
     viewing = Path(sys.modules["carlasc.viewing"].__file__).parent
-    allowed = {"scene.py", "choosing.py", "remapping.py", "finding.py"}
+    allowed = {"scene.py", "finding.py"}
     reading = re.compile(r"\.sequence\.(read|scan|grid|boxes|frames|fields|metadata|poses|times|params)")
     found = [
         path.name for path in viewing.rglob("*.py") if path.name not in allowed and reading.search(path.read_text())

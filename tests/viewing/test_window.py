@@ -1,5 +1,6 @@
 """The window under Xvfb, in a process of its own: a screenshot after each key."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -18,8 +19,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, DependencyError
 from carlasc.storage import FolderSink
 from carlasc.viewing import Scene, Window
-from carlasc.viewing.libraries import import_open3d
-from carlasc.viewing.window import KEYS, help_lines
+from carlasc.viewing.window import KEYS, advice, help_lines, import_open3d, missing_library
 
 STEPS = """
 import json, sys
@@ -259,3 +259,40 @@ def test_boxes_are_drawn_where_they_are_in_the_colours_of_their_classes(tmp_path
     ends = window.o3d.utility.Vector2iVector.call_args.args[0]
     lengths = np.linalg.norm(corners[ends[:, 0]] - corners[ends[:, 1]], axis=1)
     assert sorted(np.round(lengths, 6).tolist()) == [1.5] * 4 + [2.0] * 4 + [4.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("message", "package"),
+    [
+        ("libEGL.so.1: cannot open shared object file: No such file or directory", "libegl1"),
+        ("libGL.so.1: cannot open shared object file: No such file or directory", "libgl1"),
+        ("libX11.so.6: cannot open shared object file: No such file or directory", "libx11-6"),
+        ("libudev.so.1: cannot open shared object file: No such file or directory", "libudev1"),
+        ("libusb-1.0.so.0: cannot open shared object file: No such file or directory", "libusb-1.0-0"),
+        ("libidn2.so.0: cannot open shared object file: No such file or directory", "libidn2-0"),
+        ("libgomp.so.1: cannot open shared object file: No such file or directory", "libgomp1"),
+    ],
+)
+@pytest.mark.parametrize("kind", [ImportError, OSError])
+def test_the_package_of_a_missing_library_is_named(monkeypatch, message, package, kind):
+    def fail(_):
+        raise kind(message)
+
+    monkeypatch.setattr(importlib, "import_module", fail)
+    with pytest.raises(DependencyError) as error:
+        import_open3d()
+    said = str(error.value)
+    assert f"apt-get install {package} " in said and message.split(":")[0] in said and '`out="page.html"`' in said
+    assert "\n" not in said
+
+
+def test_an_unknown_library_is_named():
+    assert missing_library("libstrange.so.3: cannot open shared object file: No such file") == "libstrange.so.3"
+    assert "page.html" in advice("libstrange.so.3")
+    assert missing_library("undefined symbol: foo") is None
+
+
+def test_without_open3d_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(DependencyError, match=r"carlasc\[view\]"):
+        import_open3d()

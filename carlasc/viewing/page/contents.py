@@ -9,7 +9,6 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
@@ -116,10 +115,17 @@ class PageContent:
             FormatError: the data do not have the format.
         """
         content = self.reader.read(frame)
-        grids = [*content.grids, *self._read_beside(frame, content.grids)]
+        grids = list(content.grids)
+        if self.beside is not None:
+            grids.append(self.beside.data.read_grid(frame))
+            if self.reader.truth is not None:
+                truth = content.grids[1]
+                grids.append(Grid(truth.spec, compare_grids(grids[-1], truth), truth.counts))
         arrays: Arrays = {}
         for number, (panel, grid) in enumerate(zip(self.panels, grids, strict=True)):
-            found = encode_grid(grid) | encode_evidence(grid, self._read_evidence(panel, frame))
+            data = (self.reader if panel.run == 0 or self.beside is None else self.beside).data
+            names = [name for name in panel.evidence if frame in data.frames_with(f"{data.grid}/{name}")]
+            found = encode_grid(grid) | encode_evidence(grid, {name: data.read_part(name, frame) for name in names})
             arrays |= {f"panel{number}/{name}": array for name, array in found.items()}
         if content.scan is not None:
             arrays |= {f"scan/{name}": array for name, array in encode_scan(content.scan, self.thin_m).items()}
@@ -128,6 +134,7 @@ class PageContent:
     def describe(self) -> dict[str, Any]:
         """Return what the scripts of the page need to know besides the frames and their scores."""
         reader = self.reader
+        poses = [pose for pose in map(reader.read_pose, self.frames) if pose is not None]
         tables = {colors.table.name: colors for colors in (reader.colors, *(panel.colors for panel in self.panels))}
         return {
             "name": reader.name,
@@ -138,7 +145,7 @@ class PageContent:
             "runs": list(self.runs),
             "frames": list(self.frames),
             "times": [reader.read_time(frame) for frame in self.frames],
-            "poses": self._read_poses(),
+            "poses": [np.round(pose[:3].reshape(-1), 5).tolist() for pose in poses] or None,  # first_T_sensor
             "hasPoints": reader.has("points"),
             "hasFlow": reader.has("flow"),
             "pointCell": self.thin_m,
@@ -147,21 +154,6 @@ class PageContent:
 
     def _fields_of(self, reader: SceneReader) -> tuple[str, ...]:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
-
-    def _read_beside(self, frame: int, grids: tuple[Grid, ...]) -> list[Grid]:
-        if self.beside is None:
-            return []
-        grid = self.beside.data.read_grid(frame)
-        if self.reader.truth is None:
-            return [grid]
-        truth = grids[1]
-        return [grid, Grid(truth.spec, compare_grids(grid, truth), truth.counts)]
-
-    def _read_evidence(self, panel: PagePanel, frame: int) -> dict[str, NDArray[Any]]:
-        reader = self.reader if panel.run == 0 or self.beside is None else self.beside
-        sequence, grid = reader.data.sequence, reader.data.grid
-        names = (name for name in panel.evidence if frame in sequence.frames(f"{grid}/{name}"))
-        return {name: sequence.read(f"{grid}/{name}", frame) for name in names}
 
     def _score(self, grids: list[Grid]) -> FrameScores | None:
         """Return the scores of the runs' predictions in the classes that are shown, where the truth is known."""
@@ -175,11 +167,6 @@ class PageContent:
             tuple(matrix.mean_iou(with_free=False, absent="skip") for matrix in found),
             tuple(matrix.completeness().iou for matrix in found),
         )
-
-    def _read_poses(self) -> list[list[float]] | None:
-        """Return the first three rows of the pose of each frame, in the frame of the first scan; None if there are none."""
-        poses = [pose for pose in map(self.reader.read_pose, self.frames) if pose is not None]
-        return [np.round(pose[:3].reshape(-1), 5).tolist() for pose in poses] or None
 
 
 def open_content(

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError
 from carlasc.storage.durability import make_folder, sync_all
@@ -93,7 +93,8 @@ def check_folder(out: Path, overwrite: bool) -> None:
     """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
-    if not _is_page(out):
+    index = out / "index.html"
+    if not (index.is_file() and _MARK in index.read_bytes()[:2000] and (out / FRAMES).is_dir()):
         found = "a folder with other files" if out.is_dir() else "a file"
         advice = "choose another name; one that ends in .html writes a page in one file"
         raise ConflictError(out, expected="the folder of a page, or a new one", found=found, advice=advice)
@@ -159,11 +160,6 @@ def writing_folder(out: Path) -> Iterator[NewFolder]:
             old.rename(out)
 
 
-def _is_page(path: Path) -> bool:
-    index = path / "index.html"
-    return index.is_file() and _MARK in index.read_bytes()[:2000] and (path / FRAMES).is_dir()
-
-
 def write_page(
     scene: Scene,
     out: Path,
@@ -205,11 +201,8 @@ class _Writer:
 
     def write_file(self, out: Path) -> int:
         """Write one file that contains the frames; return its size in bytes."""
-
-        def write(file: BinaryIO) -> None:
-            file.writelines(compose(self.content.reader.name, self.describe, self.blocks()))
-
-        write_output(out, write)
+        pieces = compose(self.content.reader.name, self.describe, self.blocks())
+        write_output(out, lambda file: file.writelines(pieces))
         return out.stat().st_size
 
     def write_folder(self, out: Path) -> int:

@@ -66,7 +66,9 @@ class FoxgloveWriter:
         stamp = m.Timestamp(*divmod(nanoseconds, 10**9))
 
         def log(topic: str, kind: str, **content: Any) -> None:
-            self._log(topic, kind, nanoseconds, getattr(m, kind)(**content))
+            if topic not in self._channels:
+                self._channels[topic] = getattr(self._types, f"{kind}Channel")(topic, context=self._context)
+            self._channels[topic].log(getattr(m, kind)(**content), log_time=nanoseconds)
 
         def log_scene(topic: str, entities: list[Any]) -> None:
             deletion = m.SceneEntityDeletion(timestamp=stamp, type=m.SceneEntityDeletionType.All)
@@ -115,11 +117,6 @@ class FoxgloveWriter:
         """
         self._writer.close()
         self._output.close()
-
-    def _log(self, topic: str, kind: str, nanoseconds: int, message: Any) -> None:
-        if topic not in self._channels:
-            self._channels[topic] = getattr(self._types, f"{kind}Channel")(topic, context=self._context)
-        self._channels[topic].log(message, log_time=nanoseconds)
 
     def _voxels(self, panel: GridPanel, grid: Grid) -> dict[str, Any]:
         """Return a grid as the content of a VoxelGrid: colours, transparent where free, and class ids, in the order z, y, x."""

@@ -12,8 +12,7 @@ from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import AFTER_CLASSES, Entry
-from carlasc.viewing.finding import list_fields
-from carlasc.viewing.remapping import RemappedSequence
+from carlasc.viewing.finding import RemappedSequence, list_fields
 from carlasc.viewing.rendering.drawings import Drawing
 from carlasc.viewing.rendering.meshes import QuadMesh, box, join
 

@@ -18,7 +18,7 @@ from carlasc.metrics.comparison import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry, as_color, height_colors
-from carlasc.viewing.remapping import RemappedSequence, without_invalid_points
+from carlasc.viewing.finding import RemappedSequence, without_invalid_points
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh, arrows, box, footprint, grid_mesh, join, quads
 from carlasc.viewing.rendering.raycasting import cast, empty_canvas, splat

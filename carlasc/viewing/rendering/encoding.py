@@ -16,6 +16,11 @@ from carlasc.storage.files import write_output
 
 STILLS = (".png",)
 FILMS = (".gif", ".mp4", ".webp")
+_H264 = ("-c:v", "libx264", "-crf", "18", "-preset", "medium", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
+_ENCODERS = {
+    ".mp4": (*_H264, "-f", "mp4"),
+    ".webp": ("-c:v", "libwebp_anim", "-quality", "72", "-loop", "0", "-f", "webp"),
+}
 
 
 def is_film(path: Path) -> bool:
@@ -47,15 +52,13 @@ def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float
         raise ArgumentError("fps", expected="above 0 and at most 240 pictures per second", found=f"{fps:g}")
     suffix = path.suffix.lower()
     if suffix in STILLS:
-        write_output(path, lambda file: _write_png(file, next(iter(pictures)), dpi))
-        return
-    write = {".gif": _write_gif, ".mp4": _write_mp4, ".webp": _write_webp}[suffix]
-    write_output(path, lambda file: write(file, iter(pictures), fps))
-
-
-def _write_png(file: BinaryIO, picture: NDArray[np.uint8], dpi: float | None) -> None:
-    settings = {} if dpi is None else {"dpi": (dpi, dpi)}
-    import_extra("PIL.Image", "render").fromarray(picture).save(file, format="PNG", compress_level=4, **settings)
+        image, settings = import_extra("PIL.Image", "render"), {} if dpi is None else {"dpi": (dpi, dpi)}
+        first = iter(pictures)
+        write_output(path, lambda f: image.fromarray(next(first)).save(f, format="PNG", compress_level=4, **settings))
+    elif suffix == ".gif":
+        write_output(path, lambda file: _write_gif(file, iter(pictures), fps))
+    else:
+        write_output(path, lambda file: _encode(file, iter(pictures), fps, _ENCODERS[suffix]))
 
 
 def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
@@ -73,15 +76,6 @@ def _to_palette(picture: NDArray[np.uint8]) -> Any:
     sample = np.stack([weighed >> 16, weighed >> 8 & 255, weighed & 255], axis=-1).astype(np.uint8)
     palette = module.fromarray(sample[None]).quantize(256, kmeans=1)
     return module.fromarray(picture).quantize(palette=palette, dither=module.Dither.NONE)
-
-
-def _write_mp4(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    h264 = ("-c:v", "libx264", "-crf", "18", "-preset", "medium", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
-    _encode(file, pictures, fps, (*h264, "-f", "mp4"))
-
-
-def _write_webp(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    _encode(file, pictures, fps, ("-c:v", "libwebp_anim", "-quality", "72", "-loop", "0", "-f", "webp"))
 
 
 def _encode(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: tuple[str, ...]) -> None:

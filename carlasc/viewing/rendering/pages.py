@@ -91,7 +91,8 @@ def plan_page(
     gap = max(2, font_size // 2) if panels > 1 else 0
     title_height = round(font_size * 1.9) if titled else 0
     if captions:
-        lines = max(_count_lines(text, font_size, area.width / columns - 2 * gap) for text in captions)
+        room, font = area.width / columns - 2 * gap, font_of(font_size)
+        lines = max(len(wrap_text(text, font, room)) for text in captions)
         title_height = round(font_size * 0.4) + lines * line_height(font_size)
     boxes, titles = [], []
     for number in range(panels):
@@ -155,10 +156,6 @@ def draw_page(
     return np.asarray(image)
 
 
-def _count_lines(text: str, font_size: int, room: float) -> int:
-    return len(wrap_text(text, font_of(font_size), room))
-
-
 def _place_legend(
     size: tuple[int, int], font_size: int, entries: list[Entry], panels: int, aspect: float, wanted: int | None
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
@@ -208,7 +205,9 @@ def _place_below(
     rows_allowed = max(1, int(0.4 * height) // line)
     lines: list[list[int]] = []
     for room in range(len(entries), 0, -1):
-        shown = _cut(entries, room)
+        shown = entries
+        if room < len(entries):
+            shown = [*entries[: room - 1], Entry(f"and {len(entries) - room + 1} more", NO_SWATCH)]
         widths = [entry_width(entry, font, font_size) for entry in shown]
         lines = wrap_entries(widths, width - 2 * pad, pad)
         if len(lines) <= rows_allowed:
@@ -221,12 +220,6 @@ def _place_below(
             positions.append((max(0, x), top + number * line))
             x += widths[i] + pad
     return shown, positions, Box(0, 0, width, max(1, top - pad // 2))
-
-
-def _cut(entries: list[Entry], room: int) -> list[Entry]:
-    if len(entries) <= room:
-        return entries
-    return [*entries[: room - 1], Entry(f"and {len(entries) - room + 1} more", NO_SWATCH)]
 
 
 def _tiling(width: int, height: int, panels: int, aspect: float, wanted: int | None) -> tuple[int, int]:
@@ -313,9 +306,8 @@ def draw_entry(draw: Any, font: Any, size: int, entry: Entry, left: int, middle:
     swatch = round(size * 0.95)
     top = round(middle - swatch / 2)
     if entry.color != NO_SWATCH:
-        draw.rounded_rectangle(
-            (left, top, left + swatch, top + swatch), max(2, size // 6), entry.color, _outline(entry.color)
-        )
+        outline = tuple(round(value * 0.7) for value in entry.color)
+        draw.rounded_rectangle((left, top, left + swatch, top + swatch), max(2, size // 6), entry.color, outline)
     draw.text((left + swatch + round(size * 0.45), middle), entry.name, INK, font, anchor="lm")
 
 
@@ -343,8 +335,3 @@ def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> ND
             draw_entry(draw, font, font_size, entries[i], left, margin + (number + 0.5) * line)
             left += widths[i] + font_size
     return np.asarray(image)
-
-
-def _outline(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    red, green, blue = (round(value * 0.7) for value in color)
-    return red, green, blue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from string import ascii_lowercase
 
 import numpy as np
@@ -13,7 +14,7 @@ from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
-from carlasc.viewing.remapping import RemappedSequence
+from carlasc.viewing.finding import RemappedSequence
 from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
 from carlasc.viewing.rendering.drawings import (
@@ -293,25 +294,22 @@ def caption_panels(cells: Sequence[Cell], texts: Sequence[str], film: bool) -> t
         rows = [row[:2] + row[3:] for row in parts] if film else parts
         differing = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
         texts = [", ".join(row[column] for column in differing if row[column]) for row in rows]
-    return tuple(f"({_letter(number)}) {text}".strip() for number, text in enumerate(texts))
+    letters = [*ascii_lowercase, *map("".join, product(ascii_lowercase, repeat=2))]  # a, b, ... z, aa, ab, ...
+    return tuple(f"({letter}) {text}".strip() for letter, text in zip(letters, texts, strict=False))
 
 
 def _parts_of(cells: Sequence[Cell]) -> list[tuple[str, ...]]:
     """Return sequence, grid, frame, content and view of each panel."""
     return [
-        (reader.name, reader.data.grid, f"frame {cell.frame}", _content_name(cell, content), _VIEW_NAMES[view])
+        (
+            reader.name,
+            reader.data.grid,
+            f"frame {cell.frame}",
+            content if content == "grid" and reader.truth is None else cell.renderer.title(content),
+            _VIEW_NAMES[view],
+        )
         for cell in cells
         for reader in [cell.renderer.reader]
         for content in reader.contents
         for view in cell.renderer.camera.views
     ]
-
-
-def _content_name(cell: Cell, content: str) -> str:
-    return content if content == "grid" and cell.renderer.reader.truth is None else cell.renderer.title(content)
-
-
-def _letter(number: int) -> str:
-    """Return a, b, ... z, aa, ab, ..."""
-    first, last = divmod(number, len(ascii_lowercase))
-    return (ascii_lowercase[first - 1] if first else "") + ascii_lowercase[last]

@@ -75,7 +75,8 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
     """
     if not len(mesh):
         return
-    scene, geometry = _embree_scene(mesh)
+    scene = import_extra("embreex.rtcore_scene", "render").EmbreeScene()
+    geometry = import_extra("embreex.mesh_construction", "render").TriangleMesh(scene, *mesh.triangles())
     sky = _sky_visibility(scene, mesh)
     suns = _suns(axes)
     extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
@@ -114,13 +115,6 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
             canvas.depth[rows].reshape(-1),
         )
     del geometry
-
-
-def _embree_scene(mesh: QuadMesh) -> tuple[Any, Any]:
-    rtcore_scene = import_extra("embreex.rtcore_scene", "render")
-    construction = import_extra("embreex.mesh_construction", "render")
-    scene = rtcore_scene.EmbreeScene()
-    return scene, construction.TriangleMesh(scene, *mesh.triangles())
 
 
 def _suns(axes: Axes) -> NDArray[np.float32]:

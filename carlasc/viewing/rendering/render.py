@@ -120,7 +120,11 @@ def render(
     started = time.monotonic()
     together = not isinstance(source, _ONE)
     scenes = [as_scene(source)] if isinstance(source, _ONE) else [as_scene(one) for one in source]
-    _check_together(scenes, style, together=together)
+    if not scenes:
+        raise ArgumentError("source", expected="at least one source", found="none")
+    if not together and (style.captions or style.columns is not None):
+        name = "captions" if style.captions else "columns"
+        raise ArgumentError(name, expected="several sources or frames in one picture", found="one")
     readers, film = _open_scenes(scenes, what, out, orbit=camera.orbit, together=together)
     target = _name_after(readers[0], film) if out is None else Path(out)
     check_target(target, STILLS + FILMS, overwrite)
@@ -147,7 +151,7 @@ def render(
     shots = _plan_shots(drawer, pictures, camera)
     if fps is None:
         fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(_take, shots, run)) as drawn:
+    with closing(run_all(_Shot.render, shots, run)) as drawn:
         write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
     if legend_file is not None and entries and sheet.font_size is not None:
         write_pictures(legend_file, [draw_legend(entries, sheet.font_size, sheet.size[0])], fps, sheet.dpi)
@@ -163,15 +167,6 @@ def render(
         tuple(_notes_of(readers, pictures)),
         legend_file if entries else None,
     )
-
-
-def _check_together(scenes: Sequence[Scene], style: StyleOptions, *, together: bool) -> None:
-    """Raise ArgumentError for a style that has no meaning with this number of scenes."""
-    if not scenes:
-        raise ArgumentError("source", expected="at least one source", found="none")
-    if not together and (style.captions or style.columns is not None):
-        name = "captions" if style.captions else "columns"
-        raise ArgumentError(name, expected="several sources or frames in one picture", found="one")
 
 
 def _open_scenes(
@@ -212,6 +207,9 @@ class _Shot:
     cells: list[Cell]
     viewpoint: Viewpoint
 
+    def render(self) -> NDArray[np.uint8]:
+        return self.drawer.render(self.cells, self.viewpoint)
+
 
 def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions) -> list[_Shot]:
     """Return which frames are seen from where in each picture."""
@@ -221,10 +219,6 @@ def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: Cam
         pictures = pictures * ORBIT_PICTURES
     angles = 2 * np.pi * np.arange(len(pictures)) / len(pictures)
     return [_Shot(drawer, cells, camera.viewpoint.turned(float(a))) for cells, a in zip(pictures, angles, strict=True)]
-
-
-def _take(shot: _Shot) -> NDArray[np.uint8]:
-    return shot.drawer.render(shot.cells, shot.viewpoint)
 
 
 def _reported(
