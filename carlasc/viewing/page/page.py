@@ -18,8 +18,7 @@ from carlasc.storage.durability import make_folder, sync_all
 from carlasc.storage.files import write_output, writing
 from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.page.coding import pack_arrays
-from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content
+from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content, pack_arrays
 from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import ViewResult, check_target, first_frames
 
@@ -214,7 +213,7 @@ class _Writer:
         return folder.size_bytes
 
     def blocks(self) -> Iterator[bytes]:
-        """Yield the frames, each as one block of arrays (see `coding`)."""
+        """Yield the frames, each as one block of arrays (see `contents`)."""
         for done, frame in enumerate(self.content.frames, 1):
             arrays, scores = self.content.read(frame)
             self.scores.append(scores)

@@ -1,4 +1,4 @@
-// Decoding the bytes of a frame to typed arrays: the inverse of carlasc/viewing/page/coding.py.
+// Decoding the bytes of a frame to typed arrays: the inverse of carlasc/viewing/page/contents.py.
 
 async function inflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate'));

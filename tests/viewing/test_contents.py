@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.viewing.page.coding import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays
+from carlasc.viewing.page.contents import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),
