@@ -11,6 +11,7 @@ from .conventions import Convention as Convention
 from .conventions import ConventionScore as ConventionScore
 from .conventions import convention_named as convention_named
 from .conventions import own_convention as own_convention
+from .evaluation import Scoring as Scoring
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluate_by_all_conventions as evaluate_by_all_conventions
 from .leaderboard import ScoreTable as ScoreTable
@@ -38,7 +39,6 @@ from .sampling import Comparison as Comparison
 from .sampling import Interval as Interval
 from .sampling import bootstrap as bootstrap
 from .sampling import compare as compare
-from .scorer import Scoring as Scoring
 from .temporal import Consistency as Consistency
 from .temporal import Forecasting as Forecasting
 from .temporal import ForecastScore as ForecastScore

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -39,28 +39,28 @@ class FigureTable:
 
     def to_csv(self) -> str:
         """Return the table as CSV with a header."""
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(self.header)
-        writer.writerows(self.texts())
-        return buffer.getvalue()
+        return _csv([self.header, *self.texts()])
 
     def to_latex(self) -> str:
         r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule, \midrule, \bottomrule)."""
-        lines = [" & ".join(map(_escape, row)) + r" \\" for row in [list(self.header), *self.texts()]]
+        escaped = str.maketrans({letter: f"\\{letter}" for letter in "&%$#_{}"})
+        rows = [[cell.translate(escaped) for cell in row] for row in [list(self.header), *self.texts()]]
+        lines = [" & ".join(row) + r" \\" for row in rows]
         body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
         columns = "l" + "r" * (len(self.header) - 1)
         return f"% {self.title}\n\\begin{{tabular}}{{{columns}}}\n{body}\n\\end{{tabular}}\n"
+
+
+def _csv(rows: Iterable[Sequence[str]]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
 
 
 def _text(cell: Cell) -> str:
     if isinstance(cell, str):
         return cell
     return "-" if math.isnan(cell) else f"{cell:.2f}"
-
-
-def _escape(text: str) -> str:
-    return "".join(f"\\{letter}" if letter in "&%$#_{}" else letter for letter in text)
 
 
 @dataclass(frozen=True)
@@ -153,21 +153,25 @@ class Evaluation:
 
     def tables(self) -> tuple[FigureTable, ...]:
         """Return the paper's two tables, IoU of each class and completeness, and one of the regions if there are any."""
-        tables = [semantic_table([self]), geometric_table([self])]
-        return (*tables, self._breakdown_table()) if self.breakdown else tuple(tables)
+        tables = semantic_table([self]), geometric_table([self])
+        if not self.breakdown:
+            return tables
+        rows: list[tuple[Cell, ...]] = []
+        for name, matrix in self.breakdown.items():
+            score = self.convention.score(matrix)
+            rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
+        header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
+        return (*tables, FigureTable("By region", header, tuple(rows)))
 
     def to_csv(self) -> str:
         """Return the scores of each frame as CSV."""
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        names = list(self.class_iou)
-        writer.writerow(["sequence", "frame", "miou", "iou", "precision", "recall", "false_free", *names])
+        rows = [["sequence", "frame", "miou", "iou", "precision", "recall", "false_free", *self.class_iou]]
         for frame in self.frame_scores:
             score = frame.score
             figures = [score.miou, score.iou, score.precision, score.recall, score.false_free]
             cells = ["" if math.isnan(v) else f"{v:.6f}" for v in (*figures, *score.class_iou.values())]
-            writer.writerow([frame.sequence, frame.frame, *cells])
-        return buffer.getvalue()
+            rows.append([frame.sequence, frame.frame, *cells])
+        return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return every figure by name, as fractions, for JSON; None for a figure that is not defined."""
@@ -200,14 +204,6 @@ class Evaluation:
             "notes": list(self.notes),
             "failures": [list(failure) for failure in self.failures],
         }
-
-    def _breakdown_table(self) -> FigureTable:
-        rows: list[tuple[Cell, ...]] = []
-        for name, matrix in self.breakdown.items():
-            score = self.convention.score(matrix)
-            rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
-        header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
-        return FigureTable("By region", header, tuple(rows))
 
 
 def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:

@@ -126,7 +126,7 @@ class Uncertainty:
             # Bins are (low, high]: a confidence of exactly 1 is in the last one.
             bins = np.clip(np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1)
             weights = None, confidence[chosen], right[chosen]
-            sums = np.stack([np.bincount(bins, weight, self.bins) for weight in weights])
+            sums: NDArray[np.float64] = np.stack([np.bincount(bins, weight, self.bins) for weight in weights])
             self.sums[row] += sums
             if chosen.any():
                 self.ece[row] += _reliability(sums).ece, 1
@@ -137,7 +137,8 @@ class Uncertainty:
         """Return the score of everything that was added; NaN where nothing was."""
         with np.errstate(invalid="ignore"):
             ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
-        return UncertaintyScore(*map(float, (*ece, *nll)), *map(_reliability, self.sums))
+        empty, occupied = map(_reliability, self.sums)
+        return UncertaintyScore(float(ece[0]), float(ece[1]), float(nll[0]), float(nll[1]), empty, occupied)
 
     def merge(self, other: Uncertainty) -> Self:
         """Add what another metric of the same settings has added up, in any order.
