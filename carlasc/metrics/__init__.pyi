@@ -1,7 +1,5 @@
 from .casting import cast_rays as cast_rays
 from .casting import rayiou_directions as rayiou_directions
-from .comparison import VoxelOutcome as VoxelOutcome
-from .comparison import compare_grids as compare_grids
 from .confusion import Completeness as Completeness
 from .confusion import ConfusionMatrix as ConfusionMatrix
 from .confusion import TruthScore as TruthScore
@@ -14,6 +12,8 @@ from .conventions import own_convention as own_convention
 from .evaluation import Scoring as Scoring
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluate_by_all_conventions as evaluate_by_all_conventions
+from .grids import VoxelOutcome as VoxelOutcome
+from .grids import compare_grids as compare_grids
 from .leaderboard import ScoreTable as ScoreTable
 from .leaderboard import scores as scores
 from .panoptic import PanopticQuality as PanopticQuality
@@ -30,15 +30,15 @@ from .regions import height_bands as height_bands
 from .regions import known as known
 from .regions import motion as motion
 from .regions import visibility as visibility
+from .results import Comparison as Comparison
 from .results import Evaluation as Evaluation
 from .results import FigureTable as FigureTable
 from .results import FrameScore as FrameScore
+from .results import Interval as Interval
+from .results import bootstrap as bootstrap
+from .results import compare as compare
 from .results import geometric_table as geometric_table
 from .results import semantic_table as semantic_table
-from .sampling import Comparison as Comparison
-from .sampling import Interval as Interval
-from .sampling import bootstrap as bootstrap
-from .sampling import compare as compare
 from .temporal import Consistency as Consistency
 from .temporal import Forecasting as Forecasting
 from .temporal import ForecastScore as ForecastScore
