@@ -6,7 +6,7 @@ import dataclasses
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -135,6 +135,29 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
     if failures:
         summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
         raise BatchError(summary, [message for _, message in failures])
+
+
+def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool) -> None:
+    """Print what a run made, as JSON or in lines, and end with exit code 1 if frames failed.
+
+    Args:
+        result: what the library returned: with notes, failures, made, skipped and elapsed_s.
+        places: a line for each place that was written to.
+        done: what was done to the frames: "made"; may begin with what was made and a colon.
+        json: print JSON.
+    """
+    if json:
+        print_json(result)
+    else:
+        for note in result.notes:
+            echo(f"note: {note}")
+        for place in places:
+            echo(place)
+        what, _, verb = done.rpartition(": ")
+        skipped = f" ({result.skipped} existed)" if result.skipped else ""
+        echo(f"{what}{what and ': '}{result.made} frames {verb}{skipped} in {result.elapsed_s:.1f} s")
+    failures = [(failure.frame, failure.message) for failure in result.failures]
+    report_failures(failures, result.made + result.skipped + len(failures))
 
 
 @contextmanager

@@ -15,8 +15,7 @@ from carlasc.cli.common import (
     echo,
     file_argument,
     place_argument,
-    print_json,
-    report_failures,
+    print_frames,
 )
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
@@ -136,15 +135,4 @@ def convert(
             options=options.values,
             run=spread,
         )
-    if json:
-        print_json(result)
-    else:
-        for note in result.notes:
-            echo(f"note: {note}")
-        for place in (*result.sequences, *result.grids):
-            echo(place)
-        skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        echo(f"{result.made} frames converted{skipped} in {result.elapsed_s:.1f} s")
-    report_failures(
-        [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
-    )
+    print_frames(result, (*result.sequences, *result.grids), "converted", json=json)

@@ -22,7 +22,7 @@ from carlasc.cli.common import (
     report_failures,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.core.choices import BreakdownName, Voxels
+from carlasc.core.choices import Voxels
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
@@ -62,8 +62,10 @@ class ScoringFlags(Flags):
         float, typer.Option(help="Score only voxels in this angle about the forward axis, degrees.", min=1, max=360)
     ] = 360.0
     by: Annotated[
-        list[BreakdownName] | None,
-        typer.Option(help="Also score parts of the grid; may be given several times."),
+        list[str] | None,
+        typer.Option(
+            metavar="PART", help="Also score by distance, height, visibility or motion; may be given several times."
+        ),
     ] = None
     rays: Annotated[
         bool, typer.Option("--rays", help="Also score what rays meet first: RayIoU. Needs poses and a Cartesian grid.")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, echo, file_argument, place_argument, print_json, report_failures
+from carlasc.cli.common import Json, echo, file_argument, place_argument, print_frames
 from carlasc.cli.flags import DeclaredOptions, RunFlags
 
 
@@ -68,15 +68,5 @@ def export(
             options=options.values,
             run=spread,
         )
-    if json:
-        print_json(result)
-    else:
-        for note in result.notes:
-            echo(f"note: {note}")
-        for path, place in result.sequences.items():
-            echo(f"{path or '.'} -> {result.out / place}")
-        skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        echo(f"{result.made} frames written{skipped} in {result.elapsed_s:.1f} s")
-    report_failures(
-        [(f.frame, f.message) for f in result.failures], result.made + result.skipped + len(result.failures)
-    )
+    lines = [f"{path or '.'} -> {result.out / place}" for path, place in result.sequences.items()]
+    print_frames(result, lines, "written", json=json)

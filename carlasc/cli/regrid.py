@@ -11,11 +11,9 @@ from carlasc.cli.common import (
     FramesOption,
     Json,
     Overwrite,
-    echo,
     place_argument,
     place_option,
-    print_json,
-    report_failures,
+    print_frames,
 )
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
@@ -77,17 +75,7 @@ def regrid(
             overwrite=overwrite,
             run=spread,
         )
-    if json:
-        print_json(result)
-    else:
-        for note in result.notes:
-            echo(f"note: {note}")
-        skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        for grid in result.grids:
-            echo(grid)
-        echo(f"{spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")
-    failures = [(failure.frame, failure.message) for failure in result.failures]
-    report_failures(failures, result.made + result.skipped + len(failures))
+    print_frames(result, result.grids, f"{spec}: made", json=json)
 
 
 def _observe(

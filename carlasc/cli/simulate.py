@@ -9,7 +9,7 @@ import typer
 
 import carlasc
 from carlasc.cli.capture import OutArgument, SensorFlags
-from carlasc.cli.common import Json, console, echo, print_json, report_failures
+from carlasc.cli.common import Json, console, print_frames, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import GridFlags
 
@@ -37,8 +37,7 @@ def simulate(
     spec, simulated = grid.spec_or_published(), carlasc.captures.SimulatedCapture(**drive)
     with run.spread("simulate") as spread:
         made = carlasc.regrid(simulated, spec, out, run=spread)
-    print_json(made) if json else _print_grids(made)
-    report_failures([(f.frame, f.message) for f in made.failures], made.made + made.skipped + len(made.failures))
+    print_frames(made, made.grids, f"{made.spec}: made", json=json)
 
 
 def _print_capture(result: carlasc.captures.SimulationResult) -> None:
@@ -50,10 +49,3 @@ def _print_capture(result: carlasc.captures.SimulationResult) -> None:
         table.add_row(name, f"{points_of_class:,}", f"{points_of_class / total:.2%}")
     console().print(table)
     console().print(f"{result.written} frames written, {result.count - result.written} existed already")
-
-
-def _print_grids(result: carlasc.groundtruth.RegridResult) -> None:
-    for grid in result.grids:
-        echo(grid)
-    skipped = f" ({result.skipped} existed)" if result.skipped else ""
-    echo(f"{result.spec}: {result.made} frames made{skipped} in {result.elapsed_s:.1f} s")

@@ -29,9 +29,6 @@ FlowSource = Literal["auto", "none"]
 Voxels = Literal["known", "all"]
 """Which voxels are scored."""
 
-BreakdownName = Literal["distance", "height", "visibility", "motion"]
-"""What a score can be broken down by."""
-
 ViewName = Literal["perspective", "bev", "both"]
 """Where the pictures of a scene are taken from."""
 

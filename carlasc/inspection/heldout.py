@@ -18,8 +18,8 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.from_scans.others import feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import GridPlan, RunProgress
 from carlasc.inspection.heldout_scores import HeldOutScores
@@ -163,7 +163,7 @@ class _HeldOutDrive:
                 inputs.location, expected=f"frames to leave out in {inputs.plan.frames}", found=f"only {hidden}"
             )
         measured = [frame for frame in chosen if len(whole.window_of(frame)) >= enough] or chosen
-        return cls(inputs, feed_without(inputs, hidden), tuple(measured))
+        return cls(inputs, whole.without(hidden), tuple(measured))
 
     @property
     def steps_before(self) -> int:
@@ -213,7 +213,7 @@ def _measure(task: _HeldOutFrame) -> HeldOutScores:
     if scan.labels is not None:
         feed.classes.check(scan.labels, f"{task.whole.location}: labels of frame {task.frame}")
         keep &= scan.labels > 0
-    grid = grid_from_others(feed, task.actors, task.frame, task.plan)
+    grid = merge_frame(task.plan, feed, task.actors, task.frame, feed.reaching(task.frame, task.plan.spec)).grid
     here = invert(feed.pose(task.frame))
     others = [here @ feed.pose(other) for other in window]
     labels = None if scan.labels is None else scan.labels[keep]

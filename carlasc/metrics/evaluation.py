@@ -7,12 +7,10 @@ from contextlib import closing
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.choices import BreakdownName
 from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
@@ -32,6 +30,7 @@ from carlasc.running.spreading import Run
 Region = Callable[[GridSpec], NDArray[np.bool_]]
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair, which a worker scores together
 LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]  # of a prediction and of the truth
+BREAKDOWNS = ("distance", "height", "visibility", "motion")
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
 
@@ -59,8 +58,8 @@ class Scoring:
     def __post_init__(self) -> None:
         if self.voxels not in ("known", "all"):
             raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
-        if unknown := [name for name in self.by if name not in get_args(BreakdownName)]:
-            raise ArgumentError("by", expected=f"any of {', '.join(get_args(BreakdownName))}", found=repr(unknown[0]))
+        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
+            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
 
 
 class Scorer:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import thin
 from carlasc.motion.evidence import FreeSpaceEvidence
-from carlasc.motion.paths import estimate_path, headings_of, is_standing, nearest_points
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
+from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
 _MAX_GAP_S = 1.0  # a mover may be hidden for this long

@@ -33,15 +33,15 @@ def estimate_poses(
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Estimate the pose of every scan of a drive from its usable points: see `follow_scans`.
+    """Estimate the pose of every scan of a drive from its usable points, in the way that `follow_scans` describes.
 
     Args:
         scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
         seconds: (N,) time of each point of each scan, after the time of its frame.
-        times: as in `follow_scans`, and so are the other arguments but these:
-        max_range_m: see there.
-        min_range_m: see there.
-        voxel_size_m: see there.
+        times: (F,) seconds, increasing: the time of each frame, needed with the times of points; None for frames at 10 Hz.
+        max_range_m: farther points are not used.
+        min_range_m: nearer points are not used.
+        voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
         total: number of scans, for `progress`.
         progress: called with the number of finished scans and the number of all scans.
 

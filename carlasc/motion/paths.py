@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, thin, transform_points
-from carlasc.motion.planes import Planes
+from carlasc.motion.planes import Planes, nearest_points
 from carlasc.motion.solving import least_squares
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
@@ -181,7 +181,17 @@ def resample(
     positions: NDArray[np.float64],
     velocities: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (A, 3) positions and (A, 3) velocities at the times `at`: linear between the (F,) known times, constant velocity beyond."""
+    """Return positions and velocities at other times: linear between the known times, at constant velocity beyond.
+
+    Args:
+        at: (A,) the other times, seconds.
+        seconds: (F,) the known times, increasing.
+        positions: (F, 3) metres.
+        velocities: (F, 3) m/s.
+
+    Returns:
+        (A, 3) positions and (A, 3) velocities.
+    """
     path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
     speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
@@ -376,18 +386,3 @@ def _least_variance(points: NDArray[np.float64]) -> float:
     x, y = (points - points.mean(axis=0)).T
     a, b, c = (float((one * other).sum()) / (len(points) - 1) for one, other in ((x, x), (x, y), (y, y)))
     return (a + c) / 2 - float(np.sqrt(((a - c) / 2) ** 2 + b * b))
-
-
-@cached(error_model="python")
-def nearest_points(
-    points: NDArray[np.float64], model: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the index of the model point nearest to each point, and the squared distance, by comparing all pairs."""
-    index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
-    for i in range(len(points)):
-        for j in range(len(model)):
-            dx, dy, dz = points[i, 0] - model[j, 0], points[i, 1] - model[j, 1], points[i, 2] - model[j, 2]
-            distance = dx * dx + dy * dy + dz * dz
-            if distance < squared[i]:
-                squared[i], index[i] = distance, j
-    return index, squared

@@ -190,3 +190,18 @@ def nearest_within(
             rows[count], nearest[count] = i, found
             count += 1
     return rows[:count], nearest[:count]
+
+
+@cached(error_model="python")
+def nearest_points(
+    points: NDArray[np.float64], model: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the index of the model point nearest to each point, and the squared distance, by comparing all pairs."""
+    index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    for i in range(len(points)):
+        for j in range(len(model)):
+            dx, dy, dz = points[i, 0] - model[j, 0], points[i, 1] - model[j, 1], points[i, 2] - model[j, 2]
+            distance = dx * dx + dy * dy + dz * dz
+            if distance < squared[i]:
+                squared[i], index[i] = distance, j
+    return index, squared

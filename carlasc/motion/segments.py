@@ -172,7 +172,15 @@ class Standing:
 def standing_points(
     frame: int, scan: Scan, world_T_sensor: Transform, labels: Collection[int], *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> Standing:
-    """Return the points of a scan that are of one of the classes `labels`, and slower than `min_speed_m_s`."""
+    """Return the points of a scan that stand although they are of classes that may move; none without flow and labels.
+
+    Args:
+        frame: frame number.
+        scan: points, with labels and flow.
+        world_T_sensor: (4, 4) pose of the scan.
+        labels: ids of the classes that may move.
+        min_speed_m_s: slower points stand.
+    """
     if scan.flow is None or scan.labels is None:
         return Standing.empty(frame)
     members = np.flatnonzero(~is_fast(scan.flow, min_speed_m_s) & np.isin(scan.labels, sorted(labels)))

@@ -91,9 +91,9 @@ def look_up(
     Args:
         points: (M, 3) metres.
         pose: from the points' frame to the sensor of the other scan.
-        start: as in the other scan's SortedReturns.
-        slope: the same.
-        distance: the same.
+        start: (C + 1,) first return of each column of azimuth of the other scan.
+        slope: (N,) height over horizontal distance of its returns, increasing within a column.
+        distance: (N,) metres from its sensor.
         bit: number of the bit that is set.
         free: (M,) gets the bit where the place of the point was free.
         hit: (M,) gets the bit where it was occupied.

@@ -14,8 +14,9 @@ from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth import FromScans, Voting
+from carlasc.groundtruth.from_scans.feed import WithoutScans
+from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.from_scans.others import WithoutScans, feed_without, grid_from_others
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection import HeldOutScores, holdout
@@ -42,8 +43,8 @@ def plan_of(observe):
 
 def grid_without(folder, frame, observe=OBSERVE):
     plan = plan_of(observe)
-    feed = feed_without(ScanSequence(sequence_of(folder), plan, observe), [frame])
-    return grid_from_others(feed, find_actors(feed), frame, plan)
+    feed = ScanSequence(sequence_of(folder), plan, observe).feed.without([frame])
+    return merge_frame(plan, feed, find_actors(feed), frame, feed.reaching(frame, plan.spec)).grid
 
 
 def test_a_hidden_scan_is_not_listed_and_reads_as_empty(street):

@@ -14,7 +14,6 @@ from carlasc.motion.paths import (
     headings_of,
     is_standing,
     lay,
-    nearest_points,
     resample,
     smooth,
     smooth_at,
@@ -171,15 +170,6 @@ def test_one_time_alone_is_smoothed_as_among_all():
 def test_the_weights_of_outliers_follow_the_median_of_numpy(count):
     values = np.random.default_rng(count).exponential(size=count)
     assert _median(values) == np.median(values)
-
-
-def test_nearest_points_are_those_of_all_pairs():
-    rng = np.random.default_rng(1)
-    points, model = rng.uniform(-1, 1, (50, 3)), rng.uniform(-1, 1, (40, 3))
-    index, squared = nearest_points(points, model)
-    pairs = np.square(points[:, None] - model[None]).sum(axis=2)
-    assert np.array_equal(index, pairs.argmin(axis=1))
-    assert np.allclose(squared, pairs.min(axis=1))
 
 
 def test_points_are_laid_on_planes_with_the_bits_of_numpy():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.geometry import invert, rotation_z, thin, transform_points, translation
-from carlasc.motion.planes import Planes, covariances, extend_sums, first_of_cells, nearest_within
+from carlasc.motion.planes import Planes, covariances, extend_sums, first_of_cells, nearest_points, nearest_within
 
 CELL_M, MOST, RADIUS_M = 0.15, 1200, 0.5
 
@@ -124,3 +124,12 @@ def test_a_pose_that_is_not_finite_pairs_nothing():
     model = Planes(sighting(np.random.default_rng(7)))
     rows, nearest = model.near(model.points, np.full((4, 4), np.nan), 1.0)
     assert len(rows) == len(nearest) == 0
+
+
+def test_nearest_points_are_those_of_all_pairs():
+    rng = np.random.default_rng(1)
+    points, model = rng.uniform(-1, 1, (50, 3)), rng.uniform(-1, 1, (40, 3))
+    index, squared = nearest_points(points, model)
+    pairs = np.square(points[:, None] - model[None]).sum(axis=2)
+    assert np.array_equal(index, pairs.argmin(axis=1))
+    assert np.allclose(squared, pairs.min(axis=1))

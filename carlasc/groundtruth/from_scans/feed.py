@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -49,7 +49,7 @@ class ScanMotion:
 
     Attributes:
         frame: frame number.
-        segments: actors that may move.
+        segments: actors that may move, with at most `_SIGHTING_POINTS` points each; `members` are complete.
         standing: standing points of classes that may move.
     """
 
@@ -57,10 +57,50 @@ class ScanMotion:
     segments: tuple[Segment, ...]
     standing: Standing
 
-    def thinned(self) -> ScanMotion:
-        """Return the same actors with at most `_SIGHTING_POINTS` points each; `members` stay complete."""
-        segments = (replace(s, points=thin(s.points, _SIGHTING_POINTS)) for s in self.segments)
-        return replace(self, segments=tuple(segments))
+
+class WithoutScans(Sequence):
+    """A sequence some of whose scans are hidden. The poses and times of these frames are still known.
+
+    A hidden frame is not listed among the frames of a scan's fields, and reads as a scan without points.
+
+    Args:
+        whole: the sequence.
+        hidden: numbers of the frames whose scans are hidden.
+    """
+
+    def __init__(self, whole: Sequence, hidden: Collection[int]) -> None:
+        self.whole, self.hidden = whole, frozenset(hidden)
+        self.path, self.location = whole.path, whole.location
+        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
+        self._given_poses = whole._given_poses
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields of the whole sequence."""
+        return self.whole.fields()
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field; without the hidden ones if it is a field of the scans."""
+        frames = self.whole.frames(field)
+        return frames[~np.isin(frames, sorted(self.hidden))] if field in layout.SCAN_FIELDS else frames
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame; no rows if the frame is hidden."""
+        if frame not in self.hidden or field not in layout.SCAN_FIELDS:
+            return self.whole.read(field, frame)
+        entry = layout.SCAN_FIELDS[field]
+        return np.empty(0 if entry.columns is None else (0, entry.columns), entry.dtype)
+
+    def documents(self) -> tuple[str, ...]:
+        """Return the text files of the whole sequence."""
+        return self.whole.documents()
+
+    def read_document(self, name: str) -> bytes:
+        """Return the bytes of a text file of the whole sequence."""
+        return self.whole.read_document(name)
+
+    def line_of(self, frame: int, lines: int, document: str) -> int:
+        """Return the line of a text file that belongs to a frame: the one in the whole sequence."""
+        return self.whole.line_of(frame, lines, document)
 
 
 class ScanFeed:
@@ -90,6 +130,13 @@ class ScanFeed:
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
         return _restore, (self._key, without_caches(self.sequence), self.options)
+
+    def without(self, hidden: Collection[int]) -> ScanFeed:
+        """Return the scans without those of some frames, which neither vote nor show how actors move.
+
+        What the vehicle itself drove through is no evidence either.
+        """
+        return ScanFeed(WithoutScans(self.sequence, hidden), replace(self.options, own_path=False))
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
@@ -279,7 +326,8 @@ class ScanFeed:
             speed = self.options.motion.min_speed_m_s
             found = segment_by_flow(frame, scan, pose, min_speed_m_s=speed)
             standing = standing_points(frame, scan, pose, self.classes.movable, min_speed_m_s=speed)
-        return ScanMotion(frame, tuple(found), standing)
+        thinned = [replace(segment, points=thin(segment.points, _SIGHTING_POINTS)) for segment in found]
+        return ScanMotion(frame, tuple(thinned), standing)
 
     def _voting_points(self, frame: int) -> Scan:
         """Read a scan without the points that do not vote: unlabelled, too near or too far. Points with one origin are together."""

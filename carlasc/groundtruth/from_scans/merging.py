@@ -152,7 +152,17 @@ class PreparedScan:
         moving: NDArray[np.int64] | None = None,
         origins: NDArray[np.float32] | None = None,
     ) -> PreparedScan:
-        """Prepare the voting points of a scan. Those with the same origin, (N, 3), must be next to each other; None: all are at the sensor."""
+        """Prepare the voting points of a scan.
+
+        Args:
+            frame: frame number.
+            points: (N, 3) metres, sensor frame.
+            labels: (N,) class ids.
+            world_T_sensor: (4, 4) pose of the scan.
+            seconds: time of the scan.
+            moving: (M,) indices of the points that move; None: none does.
+            origins: (N, 3) where the ray to each point began, metres; None: all at the sensor. Points with one origin are next to each other.
+        """
         reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
         moving = np.empty(0, np.int64) if moving is None else moving
         rays = tuple(RaysFromPlace.of(points, part, origin) for part, origin in runs_of_origins(origins, len(points)))

@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import invert, transform_points
-from carlasc.groundtruth.from_scans.feed import ScanFeed, ScanMotion
+from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.motion import (
     HORIZON_S,
     Chain,
@@ -49,17 +50,6 @@ _BLOCK = 100  # frames whose evidence is found in one piece
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class _FindSegments:
-    """Finds the actors of one scan, in a worker."""
-
-    feed: ScanFeed
-    boxes: tuple[Track, ...]
-
-    def __call__(self, frame: int) -> ScanMotion:
-        return self.feed.segments(frame, self.boxes).thinned()
 
 
 @dataclass(frozen=True)
@@ -122,7 +112,7 @@ class _MotionPass:
             return tracks
         for begin in range(0, len(frames), _BATCH):
             ended: list[Chain] = []
-            with self._each(_FindSegments(self.feed, ()), frames[begin : begin + _BATCH]) as scans:
+            with self._each(partial(self.feed.segments, boxes=()), frames[begin : begin + _BATCH]) as scans:
                 for scan in scans:
                     ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.standing)
                     self._count(1)
@@ -134,7 +124,7 @@ class _MotionPass:
     def boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
         """Return the tracks of annotated boxes, with the points that are in them."""
         segments: dict[int, list[Segment]] = {}
-        with self._each(_FindSegments(self.feed, moving), list(self.feed.times)) as scans:
+        with self._each(partial(self.feed.segments, boxes=moving), list(self.feed.times)) as scans:
             for scan in scans:
                 for segment in scan.segments:
                     segments.setdefault(segment.instance, []).append(replace(segment, points=segment.points[:0]))

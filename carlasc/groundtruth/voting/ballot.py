@@ -118,7 +118,7 @@ class Ballot:
     Args:
         spec: geometry of the grid.
         classes: class table of the labels.
-        rule: "sensor", "sample" or "ray", as in `count_votes`.
+        rule: "sensor": at most one vote per observation, voxel and class; "sample" and "ray": every sample counts.
         free_step_m: distance between two free samples on a ray, in metres.
         count_views: also count how many observations saw each voxel; not with "sensor".
         regions: (V,) uint16, region of each voxel, for observations that vote in one region only.
