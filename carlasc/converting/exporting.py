@@ -111,7 +111,7 @@ def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
     found: dict[str, storage.Sequence] = {}
     for sequence in source.sequences().values():
         other = found.get(sequence.name)
-        if other is not None and (other.split, sequence.coordinates) != (sequence.split, _other_coordinates(other)):
+        if other is not None and (other.split != sequence.split or other.coordinates == sequence.coordinates):
             raise FormatError(
                 source.location,
                 expected="sequences of different names",
@@ -121,10 +121,6 @@ def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
         if other is None or sequence.coordinates == "cartesian":
             found[sequence.name] = sequence
     return found
-
-
-def _other_coordinates(sequence: storage.Sequence) -> str:
-    return "cylindrical" if sequence.coordinates == "cartesian" else "cartesian"
 
 
 def _choose(
@@ -270,12 +266,8 @@ class _SequenceExport:
         self.steps(frames)
 
     def _made(self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]) -> Generator[Any, None, None]:
-        return run_all(function, jobs, self.run, lost=_fail)
-
-
-def _fail(job: ExportJob, message: str) -> str:
-    """Return the result of a frame that no worker could finish."""
-    return message
+        """Return the results of jobs; that of a frame that no worker could finish is a message, as of one that cannot be made."""
+        return run_all(function, jobs, self.run, lost=lambda job, message: message)
 
 
 def _write_frame(job: ExportJob) -> str | None:

@@ -107,16 +107,13 @@ def resample_to(
 
 def _pair_axis(source: GridSpec, target: GridSpec, axis: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return which cells of the source go to which cells of the target along an axis: two arrays, which do not decrease."""
-    sizes = source.voxel_size[axis], target.voxel_size[axis]
-    if sizes[1] >= sizes[0] * (1 - _SAME):
-        cells = np.arange(source.size[axis])
-        other = _cell_of(source.lower[axis] + (cells + 0.5) * sizes[0], target, axis)
-        inside = (other >= 0) & (other < target.size[axis])
-        return cells[inside], other[inside]
-    cells = np.arange(target.size[axis])
-    other = _cell_of(target.lower[axis] + (cells + 0.5) * sizes[1], source, axis)
-    inside = (other >= 0) & (other < source.size[axis])
-    return other[inside], cells[inside]
+    finer = target.voxel_size[axis] < source.voxel_size[axis] * (1 - _SAME)
+    one, other = (target, source) if finer else (source, target)  # each cell of one has one cell of the other
+    cells = np.arange(one.size[axis])
+    centers = one.lower[axis] + (cells + 0.5) * one.voxel_size[axis]
+    places = np.floor((centers - other.lower[axis]) / other.voxel_size[axis] + _SNAP).astype(np.int64)
+    inside = (places >= 0) & (places < other.size[axis])
+    return (places[inside], cells[inside]) if finer else (cells[inside], places[inside])
 
 
 def _targets_of(
@@ -138,11 +135,6 @@ def _targets_of(
     rows = np.repeat(np.arange(len(cells)), times)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(times) - times, times)
     return rows, pair[1][start[cells[rows]] + within]
-
-
-def _cell_of(positions: NDArray[np.float64], spec: GridSpec, axis: int) -> NDArray[np.int64]:
-    cells = (positions - spec.lower[axis]) / spec.voxel_size[axis]
-    return np.floor(cells + _SNAP).astype(np.int64)
 
 
 def _any_by_target(

@@ -99,7 +99,9 @@ def convert(
     ]
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
-    metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, _provenance(converter))
+    said = {"license": converter.license, "citation": converter.citation, "simulated": converter.simulated or None}
+    known = {key: value for key, value in said.items() if value is not None}
+    metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
     with one_pool(run) as pooled:
@@ -181,12 +183,6 @@ def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec,
         f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to {fitted.upper[2]:g} m in z"
         f" instead of {spec.lower[2]:g} to {spec.upper[2]:g}; bounds that are given are kept"
     ]
-
-
-def _provenance(converter: type[Converter]) -> dict[str, Any]:
-    """Return what carlasc.json says of the data that a sequence was made from, as far as the converter knows it."""
-    said = {"license": converter.license, "citation": converter.citation, "simulated": converter.simulated or None}
-    return {key: value for key, value in said.items() if value is not None}
 
 
 def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:

@@ -117,8 +117,7 @@ def jitter(poses: NDArray[np.float64]) -> float:
 
 def jitter_note(poses: NDArray[np.float64]) -> str | None:
     """Return a note if poses jump; None if they do not."""
-    found = jitter(poses)
-    if found < _JITTER_M:
+    if (found := jitter(poses)) < _JITTER_M:
         return None
     return f"poses jump by about {100 * found:.0f} cm from one to the next, which blurs grids: {_ESTIMATE}"
 

@@ -6,7 +6,7 @@ Papers differ in all of these. A score without the name of its convention theref
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal
@@ -249,7 +249,18 @@ def _via(first: Mapping[int, int], second: Mapping[int, int]) -> dict[int, int]:
 _RAW_TO_19 = _without_zero(REMAPS["semantickitti19"].mapping)
 _CARLA_TO_RAW = REMAPS["carla_to_semantickitti"].mapping
 _CARLASC11_TO_19 = {0: 0, 1: 13, 2: 14, 3: IGNORED, 4: 6, 5: 18, 6: 9, 7: 17, 8: 11, 9: 15, 10: 1}
-_THINGS_AND_STUFF = tuple(range(17))
+_OCC3D_LIDAR = Convention(
+    "occ3d-lidar",
+    "Occ3D-nuScenes, voxels that the LiDAR observed",
+    OCC3D,
+    17,
+    tuple(range(17)),
+    TO_OCC3D,
+    OCC3D,
+    OCC3D,
+    absent="skip",
+    notes='"others" is one of the classes of the mean; SparseOcc\'s script is occ3d-lidar-sparseocc.',
+)
 
 CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
     {
@@ -298,40 +309,18 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 epsilon=1e-5,
                 notes="An unknown voxel is left out only where its label is 0; ours always are.",
             ),
-            Convention(
-                "occ3d-lidar",
-                "Occ3D-nuScenes, voxels that the LiDAR observed",
-                OCC3D,
-                17,
-                _THINGS_AND_STUFF,
-                TO_OCC3D,
-                OCC3D,
-                OCC3D,
-                absent="skip",
-                notes='"others" is one of the classes of the mean; SparseOcc\'s script is occ3d-lidar-sparseocc.',
-            ),
-            Convention(
-                "occ3d-lidar-sparseocc",
-                "Occ3D-nuScenes as SparseOcc's script takes the mean",
-                OCC3D,
-                17,
-                _THINGS_AND_STUFF,
-                TO_OCC3D,
-                OCC3D,
-                OCC3D,
+            _OCC3D_LIDAR,
+            replace(
+                _OCC3D_LIDAR,
+                name="occ3d-lidar-sparseocc",
+                title="Occ3D-nuScenes as SparseOcc's script takes the mean",
                 absent="skip-truth",
                 notes="A class that is not in the truth is left out of the mean even if it was predicted.",
             ),
-            Convention(
-                "occ3d-camera",
-                "Occ3D-nuScenes, voxels that a camera observed",
-                OCC3D,
-                17,
-                _THINGS_AND_STUFF,
-                TO_OCC3D,
-                OCC3D,
-                OCC3D,
-                absent="skip",
+            replace(
+                _OCC3D_LIDAR,
+                name="occ3d-camera",
+                title="Occ3D-nuScenes, voxels that a camera observed",
                 seen_by="camera",
                 notes="Data without cameras do not say which voxels a camera observed, so this score does not exist for them.",
             ),

@@ -2,21 +2,248 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
+from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc.metrics.conventions import CONVENTIONS, Convention
+from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLA, table_named
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
+from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
-from carlasc.metrics.results import Evaluation
-from carlasc.metrics.scorer import LabelPair, Scorer, Scoring
+from carlasc.metrics.rays import RayIoU, ray_origins
+from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_bands, motion, visibility
+from carlasc.metrics.results import Evaluation, FrameScore
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 
+Region = Callable[[GridSpec], NDArray[np.bool_]]
+_FrameBatch = tuple[Pair, list[int]]  # frames of one pair, which a worker scores together
+LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]  # of a prediction and of the truth
+BREAKDOWNS = ("distance", "height", "visibility", "motion")
+_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """What is scored of each frame.
+
+    Attributes:
+        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
+        region: function from a GridSpec to a (X, Y, Z) bool mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in
+            the mask count. With several processes it must be a function that can be pickled.
+        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
+        rays: also compute RayIoU; this needs poses and a Cartesian grid.
+
+    Raises:
+        ArgumentError: an unknown value.
+    """
+
+    voxels: Voxels = "known"
+    region: Region | None = None
+    by: Collection[str] = ()
+    rays: bool = False
+
+    def __post_init__(self) -> None:
+        if self.voxels not in ("known", "all"):
+            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
+        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
+            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
+
+
+class Scorer:
+    """Adds up the frames of all sequences by one convention."""
+
+    def __init__(
+        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, scoring: Scoring
+    ) -> None:
+        self.scoring = scoring
+        self.impossible: CarlascError | None = None
+        self.convention = _resolve(convention, pairs)
+        given = None if source_classes is None else table_named(source_classes)
+        self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
+        self.matrices: dict[str, ConfusionMatrix] = {}
+        self.failures: list[tuple[str, str]] = []
+        self.frames: list[FrameScore] = []
+        self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
+        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if scoring.rays else None
+        try:
+            for pair in pairs:
+                self.tables[pair.truth.path] = self._check(pair, given)
+                self.matrices[pair.truth.path] = self._matrix()
+        except CarlascError as error:
+            self.impossible = error
+
+    def empty(self) -> Scorer:
+        """Return a scorer by the same rules to which nothing was added."""
+        other = copy(self)
+        other.matrices = {path: self._matrix() for path in self.matrices}
+        other.failures, other.frames = [], []
+        other.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
+        other.rays = copy(self.rays)
+        if other.rays is not None:
+            other.rays.reset()
+        return other
+
+    def merge(self, other: Scorer) -> None:
+        """Add what another scorer by the same rules has added up."""
+        for path, matrix in other.matrices.items():
+            self.matrices[path] += matrix
+        self.failures += other.failures
+        self.frames += other.frames
+        self.breakdown.merge(other.breakdown)
+        if self.rays is not None and other.rays is not None:
+            self.rays.merge(other.rays)
+
+    def add(self, pair: Pair, frame: int, content: LabelPair | CarlascError) -> None:
+        """Score a frame, or record the reason why it cannot be scored."""
+        if self.impossible is not None:
+            return
+        path, frame_name = pair.truth.path, pair.truth.name_of(frame)
+        try:
+            if isinstance(content, CarlascError):
+                raise content
+            matrix = self._score(pair, frame, *content)
+        except ArgumentError:
+            raise  # the error is the same in every frame
+        except CarlascError as error:
+            self.failures.append((f"{path}:{frame_name}", str(error)))
+            return
+        self.matrices[path] += matrix
+        self.frames.append(FrameScore(path, frame_name, self.convention.score(matrix)))
+
+    def result(self, name: str, notes: tuple[str, ...]) -> Evaluation | CarlascError:
+        """Return the scores of all frames that were added, or the error that prevented them."""
+        if self.impossible is not None:
+            return self.impossible
+        summed = sum(self.matrices.values(), self._matrix())
+        return Evaluation(
+            name, self.convention, summed, self.matrices, len(self.frames), self.scoring.voxels, self.failures, tuple(self.frames), notes,
+            self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
+        )  # fmt: skip
+
+    def _matrix(self) -> ConfusionMatrix:
+        return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
+
+    def _check(self, pair: Pair, given: ClassTable | None) -> tuple[ClassTable, ClassTable]:
+        """Return the class tables of a pair's sides, after checking that the convention can score them."""
+        truth = pair.truth.classes or self.convention.usual_truth
+        prediction = given or pair.prediction.classes or self.convention.usual_prediction
+        self.convention.check(truth, pair.truth.location)
+        self.convention.check(prediction, pair.prediction.location)
+        if self.convention.seen_by == "camera" and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
+            raise MissingDataError(
+                pair.truth.location,
+                expected="which voxels a camera observed",
+                found="data without cameras",
+                advice=f"score by another convention than {self.convention.name}",
+            )
+        true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
+        if true_spec and predicted_spec and true_spec != predicted_spec:
+            raise FormatError(
+                pair.prediction.location,
+                expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
+                found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
+            )
+        for argument, asked in (("region", self.scoring.region), ("by", self.scoring.by), ("rays", self.scoring.rays)):
+            if asked and pair.spec is None:
+                raise ArgumentError(
+                    argument,
+                    expected="None for grids without geometry",
+                    found="a region" if argument == "region" else str(asked),
+                    advice=f"add params.json to {pair.truth.location}",
+                )
+        if (self.scoring.rays or "motion" in self.scoring.by) and not isinstance(pair.truth, SequenceGrid):
+            raise ArgumentError(
+                "rays" if self.scoring.rays else "by",
+                expected="a data set with poses and scans as the truth",
+                found="files of grids",
+            )
+        return prediction, truth
+
+    def _score(
+        self, pair: Pair, frame: int, prediction: NDArray[np.unsignedinteger], truth: NDArray[np.unsignedinteger]
+    ) -> ConfusionMatrix:
+        tables = self.tables[pair.truth.path]
+        known, spec = self._known(pair, frame, truth.shape), pair.spec
+        region = None
+        if self.scoring.region is not None and spec is not None:
+            region = self.scoring.region(spec).reshape(truth.shape)
+        try:
+            matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
+            if (self.scoring.by or self.rays is not None) and spec is not None:
+                pred, true, counted = self.convention.prepare(
+                    (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
+                )
+                for masks in self._masks(pair, frame, spec, true, known, tables[1]):
+                    self.breakdown.update(pred, true, masks, counted)
+                if self.rays is not None and isinstance(pair.truth, SequenceGrid):
+                    numbers = (
+                        pair.truth.frames().tolist()
+                    )  # rays begin where the sensor was in the frames with a true grid
+                    poses = np.stack([pair.truth.sequence.read_pose(number) for number in numbers])
+                    self.rays.update(pred, true, spec, ray_origins(poses, numbers.index(frame), spec))
+        except FormatError as error:  # the message must name the side
+            side = pair.prediction if error.where == "prediction" else pair.truth
+            raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
+        return matrix
+
+    def _known(self, pair: Pair, frame: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """Return which voxels the truth evaluated; None: all of them."""
+        if self.scoring.voxels == "all":
+            return None
+        known = pair.truth.known(frame, self.convention.seen_by)
+        if known is None and self.convention.unknown == "left out":
+            raise MissingDataError(
+                f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
+                expected="counts or a mask, which say what is known",
+                found="none",
+                advice="give `voxels=all` to score all voxels",
+            )
+        return None if known is None else known.reshape(shape)
+
+    def _masks(
+        self,
+        pair: Pair,
+        frame: int,
+        spec: GridSpec,
+        truth: NDArray[np.unsignedinteger],
+        known: NDArray[np.bool_] | None,
+        table: ClassTable,
+    ) -> Iterator[Masks]:
+        """Yield the masks of each breakdown that was asked for."""
+        counts = None if known is None else known.astype(np.float32).reshape(spec.size)
+        if "distance" in self.scoring.by:
+            yield distance_bands(spec, _DISTANCES_M)
+        if "height" in self.scoring.by:
+            yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
+        if "visibility" in self.scoring.by:
+            yield visibility(Grid(spec, truth, counts), free=self.convention.free)
+        if "motion" in self.scoring.by and isinstance(pair.truth, SequenceGrid):
+            labels = pair.truth.labels(frame).reshape(spec.size)
+            yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))
+
+
+def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Convention:
+    if isinstance(convention, Convention):
+        return convention
+    tables = [side.classes for pair in pairs for side in (pair.truth, pair.prediction) if side.classes is not None]
+    table = tables[0] if tables else CARLA
+    if convention is None:
+        usual = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
+        convention = pairs[0].truth.benchmark or usual
+    return own_convention(table) if convention == "own" else convention_named(convention)
 
 
 def evaluate(
@@ -27,7 +254,7 @@ def evaluate(
     grid: str | None = None,
     truth_grid: str | None = None,
     source_classes: str | None = None,
-    scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
+    scoring: Scoring = Scoring(),
     frames: Frames = None,
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
@@ -59,9 +286,8 @@ def evaluate(
         FormatError: the grids or the classes of the two sides cannot be compared.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
-    frames_of = _choose_frames(pairs, frames)
     scorer = Scorer(convention, pairs, source_classes, scoring)
-    _score_frames([scorer], frames_of, run)
+    _score_frames([scorer], pairs, frames, run)
     result = scorer.result(name or _name_of(source), notes)
     if isinstance(result, CarlascError):
         raise result
@@ -95,9 +321,8 @@ def evaluate_by_all_conventions(
         For the name of each convention: the scores, or the error that says why the data cannot be scored by it.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
-    frames_of = _choose_frames(pairs, frames)
     scorers = {convention: Scorer(convention, pairs, source_classes, Scoring()) for convention in CONVENTIONS}
-    _score_frames(list(scorers.values()), frames_of, run)
+    _score_frames(list(scorers.values()), pairs, frames, run)
     return {convention: scorer.result(name or _name_of(source), notes) for convention, scorer in scorers.items()}
 
 
@@ -105,69 +330,51 @@ def _name_of(source: Place) -> str:
     return getattr(source, "location", None) or str(source)
 
 
-def _choose_frames(pairs: list[Pair], frames: Frames) -> list[tuple[Pair, list[int]]]:
-    """Return the frames of each pair that are scored.
+def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, run: Run) -> None:
+    """Read each frame that is asked for once, and add its scores to each scorer.
 
     Raises:
         MissingDataError: there are none.
     """
     chosen = FrameRange.of(frames)
-    found = [(pair, chosen.select(pair.truth.frames()).tolist()) for pair in pairs]
-    if not any(numbers for _, numbers in found):
+    frames_of = [(pair, chosen.select(pair.truth.frames()).tolist()) for pair in pairs]
+    total, done = sum(len(numbers) for _, numbers in frames_of), 0
+    if not total:
         raise MissingDataError(
             pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
         )
-    return found
-
-
-@dataclass(frozen=True)
-class _FrameBatch:
-    """Frames of one pair, which a worker scores together. It pickles into a worker."""
-
-    pair: Pair
-    frames: tuple[int, ...]
-
-
-def _score_frames(scorers: Sequence[Scorer], frames_of: list[tuple[Pair, list[int]]], run: Run) -> None:
-    """Read each frame once, and add its scores to each scorer."""
     size = 1 if run.is_alone else _TOGETHER
     batches = [
-        _FrameBatch(pair, tuple(numbers[first : first + size]))
-        for pair, numbers in frames_of
-        for first in range(0, len(numbers), size)
+        (pair, numbers[first : first + size]) for pair, numbers in frames_of for first in range(0, len(numbers), size)
     ]
-    total, done = sum(len(numbers) for _, numbers in frames_of), 0
-    score, fail = partial(_score_batch, scorers=scorers), partial(_fail_batch, scorers=scorers)
-    with closing(run_all(score, batches, run, lost=fail)) as results:
-        for batch, parts in zip(batches, results, strict=True):
+    score = partial(_score_batch, scorers=scorers)
+    with closing(run_all(score, batches, run, lost=score)) as results:
+        for (_, numbers), parts in zip(batches, results, strict=True):
             for scorer, part in zip(scorers, parts, strict=True):
                 scorer.merge(part)
-            done += len(batch.frames)
+            done += len(numbers)
             if run.progress is not None:
                 run.progress(done, total)
 
 
-def _score_batch(batch: _FrameBatch, scorers: Sequence[Scorer]) -> list[Scorer]:
-    """Read frames and score them, in a worker: return what there is to add to each scorer."""
+def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequence[Scorer]) -> list[Scorer]:
+    """Read frames and score them, in a worker: return what there is to add to each scorer.
+
+    `lost` is the message if no worker could score them: they are not read then.
+    """
     parts = [scorer.empty() for scorer in scorers]
-    predicted = set(batch.pair.prediction.frames().tolist())
-    for frame in batch.frames:
+    pair, frames = batch
+    predicted = set(pair.prediction.frames().tolist())
+    for frame in frames:
         content: LabelPair | CarlascError
         try:
-            content = _read(batch.pair, frame, predicted)
+            if lost is not None:
+                raise CarlascError("", problem=lost)
+            content = _read(pair, frame, predicted)
         except CarlascError as error:
             content = error
         for part in parts:
-            part.add(batch.pair, frame, content)
-    return parts
-
-
-def _fail_batch(batch: _FrameBatch, message: str, scorers: Sequence[Scorer]) -> list[Scorer]:
-    """Return what there is to add for frames that no worker could score."""
-    parts = [scorer.empty() for scorer in scorers]
-    for frame in batch.frames:
-        for part in parts:
-            part.add(batch.pair, frame, CarlascError("", problem=message))
+            part.add(pair, frame, content)
     return parts
 
 

@@ -1,4 +1,7 @@
-"""Matching the predicted grids with the true ones."""
+"""Opening the grids that are scored, also in the files of other benchmarks, and matching the predicted ones with the true ones.
+
+The other files are Occ3D's `.npz`, OpenOccupancy's `.npy`, and the folders of SemanticKITTI and SSCBench.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,148 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from carlasc.errors import MissingDataError
-from carlasc.metrics.foreign import foreign_grids
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
+from carlasc.core.classes import ClassTable
+from carlasc.core.grids import GridSpec
+from carlasc.core.tables import SEMANTICKITTI
+from carlasc.errors import FormatError, MissingDataError
 from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
 from carlasc.storage import Sequence, Source, as_source, layout
+from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
 
 Place = str | os.PathLike[str] | Source
+
+OCC3D_SPEC = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
+OPENOCCUPANCY_SPEC = GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0))
+KITTI_SPEC = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
+_LABELS = (
+    "semantics",
+    "pred",
+    "occ_pred",
+)  # names of the array of classes in an .npz: the benchmark's own, and other common ones
+_NOISE = 255
+
+
+class TokenFrames(GridFrames):
+    """A scene whose frames are named by tokens. Frames are numbered in the order of the tokens of the ground truth.
+
+    Attributes:
+        files: file of each frame, by token.
+        tokens: names of the frames in order.
+    """
+
+    def __init__(self, folder: Path, path: str, files: dict[str, Path]) -> None:
+        self.path, self.location, self.files = path, str(folder), files
+        self.tokens = sorted(files)
+
+    def follow(self, truth: GridFrames) -> None:
+        """Number the frames as the ground truth does."""
+        if isinstance(truth, TokenFrames):
+            self.tokens = truth.tokens
+
+    def frames(self) -> NDArray[np.int64]:
+        """Return the numbers of the frames that have a file."""
+        return np.array([i for i, token in enumerate(self.tokens) if token in self.files], np.int64)
+
+    def name_of(self, frame: int) -> str:
+        """Return a frame's token."""
+        return self.tokens[frame]
+
+    def _file(self, frame: int) -> Path:
+        return self.files[self.tokens[frame]]
+
+
+class Occ3dScene(TokenFrames):
+    """A scene of Occ3D-nuScenes: `{scene}/{token}/labels.npz`."""
+
+    spec, classes, benchmark = OCC3D_SPEC, OCC3D, "occ3d-lidar"
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (200, 200, 16) labels."""
+        file = self._file(frame)
+        with open_npz(file) as arrays:
+            name = next((name for name in _LABELS if name in arrays.names), _LABELS[0])
+            name = arrays.names[0] if len(arrays.names) == 1 else name
+            labels = arrays.read(name, ArrayFormat(WHOLE_NUMBERS, self.spec.size))
+        if labels.min() < 0 or labels.max() > _NOISE:
+            found = f"{labels.min()} to {labels.max()}"
+            raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=found)
+        return labels.astype(np.uint8, copy=False)
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
+        """Return the (200, 200, 16) mask of the voxels that the LiDAR or a camera observed; None if the file does not contain it."""
+        name = f"mask_{seen_by}"
+        with open_npz(self._file(frame)) as arrays:
+            if name not in arrays.names:
+                return None
+            return arrays.read(name, ArrayFormat(WHOLE_NUMBERS, self.spec.size)).astype(np.bool_)
+
+
+class OpenOccupancyScene(TokenFrames):
+    """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy`, rows z, y, x, ..., class of occupied voxels."""
+
+    spec, classes, benchmark = OPENOCCUPANCY_SPEC, OPENOCCUPANCY, "openoccupancy"
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (512, 512, 40) labels; a stored 0 is noise, 255 here."""
+        file = self._file(frame)
+        rows = read_npy(file, ArrayFormat(NUMBERS, (None, None)))
+        if rows.shape[1] not in (4, 7):
+            raise FormatError(file, expected="rows of 4 or 7 columns (z, y, x, ..., class)", found=str(rows.shape))
+        if not np.isfinite(rows).all():
+            raise FormatError(file, expected="finite numbers", found="others")
+        z, y, x = rows[:, :3].astype(np.int64).T
+        classes = rows[:, -1].astype(np.int64)
+        size = np.array(self.spec.size)[:, None]
+        if (np.array([x, y, z]) >= size).any() or rows[:, :3].min(initial=0) < 0:
+            raise FormatError(file, expected=f"voxels inside {self.spec}", found=f"({x.max()}, {y.max()}, {z.max()})")
+        if len(classes) and not (classes.min() >= 0 and classes.max() <= _NOISE):
+            raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=f"{classes.min()} to {classes.max()}")
+        labels = np.zeros(self.spec.size, np.uint8)
+        labels[x, y, z] = np.where(classes == 0, _NOISE, classes)
+        return labels
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> None:
+        """Return None, because the benchmark does not say which voxels were observed."""
+        return None
+
+
+class KittiFolder(LabelFolder):
+    """A folder of SemanticKITTI or SSCBench: `.label` files of raw ids, uint16, and masks.
+
+    The geometry is known if the files have the size of the benchmarks' grid.
+    """
+
+    classes: ClassTable | None = SEMANTICKITTI
+    _width = 2
+
+    def __init__(self, folder: Path, path: str, benchmark: str) -> None:
+        super().__init__(folder, path)
+        self.benchmark = benchmark
+        if self.voxels is None and len(frames := self.frames()):
+            self.voxels = self._file(int(frames[0]), ".label").stat().st_size // self._width
+        if self.voxels == KITTI_SPEC.num_voxels:
+            self.spec = KITTI_SPEC
+
+
+def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
+    """Yield the grids of a folder in the layout of another benchmark; nothing if it has none of these layouts."""
+    for scene in sorted(path for path in folder.glob("*") if path.is_dir()):
+        if files := {file.parent.name: file for file in scene.glob("*/labels.npz")}:
+            yield Occ3dScene(scene, scene.name, files)
+        elif scene.name.startswith("scene_") and (files := {f.stem: f for f in scene.glob("occupancy/*.npy")}):
+            yield OpenOccupancyScene(scene, scene.name, files)
+    if (folder / "gts").is_dir():
+        yield from foreign_grids(folder / "gts", grid, role)
+    name = grid or {"prediction": "predictions", "truth": "voxels"}[role]
+    for pattern, benchmark in ((f"sequences/*/{name}", "semantickitti"), (f"data_2d_raw/*/{name}", "sscbench")):
+        for sequence in sorted(path for path in folder.glob(pattern) if path.is_dir()):
+            grids = KittiFolder(sequence, sequence.parent.name, benchmark)
+            if len(grids.frames()):
+                yield grids
 
 
 @dataclass(frozen=True)
@@ -22,6 +161,11 @@ class Pair:
 
     prediction: GridFrames
     truth: GridFrames
+
+    @property
+    def spec(self) -> GridSpec | None:
+        """The geometry of both; None if it is not known."""
+        return self.truth.spec or self.prediction.spec
 
 
 def pair_grids(
@@ -52,7 +196,7 @@ def pair_grids(
                 raise MissingDataError(
                     prediction.location,
                     expected=f"ground truth for the sequence {prediction.path!r}",
-                    found=_shorten(truths),
+                    found=", ".join(list(truths)[:3]) + (", ..." if len(truths) > 3 else ""),
                     advice="give both sides from the same level, such as two data sets or two splits",
                 )
             pairs.append(Pair(prediction, truths[prediction.path]))
@@ -101,7 +245,3 @@ def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
             advice="choose one with `grid` or `truth_grid`",
         )
     return names[0] if names else None
-
-
-def _shorten(paths: dict[str, GridFrames]) -> str:
-    return ", ".join(list(paths)[:3]) + (", ..." if len(paths) > 3 else "")

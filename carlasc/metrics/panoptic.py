@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.compiling import cached
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.counting import to_numpy
+from carlasc.metrics.confusion import check_ids, ratio, to_numpy
 
 Variant = Literal["standard", "pasco"]
 _SLOTS = 256  # of the tables of latest segments and pairs; a power of two
@@ -131,10 +131,7 @@ class PanopticQuality:
         if counted is not None:
             sides = [(classes[counted], ids[counted]) for classes, ids in sides]
         for name, (classes, _) in zip(("prediction", "truth"), sides, strict=True):
-            if len(classes) and (classes.min() < 0 or classes.max() >= self.num_classes):
-                raise FormatError(
-                    name, expected=f"class ids 0..{self.num_classes - 1}", found=f"{classes.min()} to {classes.max()}"
-                )
+            check_ids(name, classes, self.num_classes)
         self.add(match_segments(*sides, things=self.things, free=self.free))
         return self
 
@@ -164,13 +161,13 @@ class PanopticQuality:
     def compute(self) -> PanopticScore:
         """Return the score of everything that was added."""
         tp, fp, fn = self.counts
-        sq = _ratio(self.iou_sum, tp)
-        rq = _ratio(tp, tp + (fp + fn) / 2)
+        sq = ratio(self.iou_sum, tp)
+        rq = ratio(tp, tp + (fp + fn) / 2)
         occurs = self.counts.sum(axis=0) > 0
         pq = np.where(occurs, np.nan_to_num(sq) * np.nan_to_num(rq), np.nan)
         common, predicted, true = self.elements
         return PanopticScore(
-            pq, np.where(occurs, np.nan_to_num(sq), np.nan), rq, _ratio(common, predicted + true - common), self.things
+            pq, np.where(occurs, np.nan_to_num(sq), np.nan), rq, ratio(common, predicted + true - common), self.things
         )
 
     def merge(self, other: PanopticQuality) -> Self:
@@ -276,8 +273,3 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
             overlaps[row, 0], overlaps[row, 1], overlaps[row, 2] = pair >> 32, pair & 0xFFFFFFFF, count
             row += 1
     return np.array(keys[0]), np.array(sizes[0]), np.array(keys[1]), np.array(sizes[1]), overlaps
-
-
-def _ratio(numerator: ArrayLike, denominator: ArrayLike) -> NDArray[np.float64]:
-    numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
-    return np.divide(numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0)

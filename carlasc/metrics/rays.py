@@ -17,7 +17,7 @@ from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.casting import cast_rays, cast_rays_on_device, rayiou_directions
-from carlasc.metrics.counting import device_of, to_numpy
+from carlasc.metrics.confusion import device_of, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
@@ -171,8 +171,7 @@ class RayIoU:
 
     def compute(self) -> RayScore:
         """Return the score of everything that was added."""
-        union = self.true + self.predicted - self.hits
-        iou = np.divide(self.hits, union, out=np.full(union.shape, np.nan), where=union > 0)
+        iou = ratio(self.hits, self.true + self.predicted - self.hits)
         return RayScore(iou, self.thresholds_m, self.free)
 
     def merge(self, other: RayIoU) -> Self:
@@ -198,7 +197,8 @@ class RayIoU:
         if array.shape != spec.size:
             raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
         if array.dtype.kind not in "ui" or (array.size and (array.min() < 0 or array.max() >= self.num_classes)):
-            raise FormatError(name, expected=f"class ids 0..{self.num_classes - 1}", found=_range_text(array))
+            found = f"{array.dtype} from {array.min()} to {array.max()}" if array.size else str(array.dtype)
+            raise FormatError(name, expected=f"class ids 0..{self.num_classes - 1}", found=found)
         return array.astype(np.uint16, copy=False)
 
 
@@ -270,10 +270,6 @@ class RayPQ:
         for own, theirs in zip(self.qualities, other.qualities, strict=True):
             own.merge(theirs)
         return self
-
-
-def _range_text(array: NDArray[Any]) -> str:
-    return f"{array.dtype} from {array.min()} to {array.max()}" if array.size else str(array.dtype)
 
 
 def _mean(values: NDArray[np.float64]) -> float:

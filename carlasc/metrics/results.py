@@ -1,22 +1,31 @@
-"""The scores of predictions over a data set, and tables of them as text, LaTeX and CSV."""
+"""The scores of predictions over a data set, how sure they are, and tables of them as text, LaTeX and CSV.
+
+Confidence intervals come from a bootstrap over sequences, and a paired test compares two predictions. Sequences are drawn instead of frames,
+because the frames of one sequence show nearly the same scene.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from carlasc.core.classes import ClassTable
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import Convention, ConventionScore
 from carlasc.metrics.rays import RayScore
-from carlasc.metrics.sampling import FEWEST_SEQUENCES, Comparison, Interval, bootstrap, compare
 
 Cell = str | float
+Score = Callable[[ConfusionMatrix], float]
+_FEWEST_SEQUENCES = 5
+_DRAWS, _SEED, _EXACT = 2000, 0, 12
 
 
 @dataclass(frozen=True)
@@ -39,28 +48,28 @@ class FigureTable:
 
     def to_csv(self) -> str:
         """Return the table as CSV with a header."""
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(self.header)
-        writer.writerows(self.texts())
-        return buffer.getvalue()
+        return _csv([self.header, *self.texts()])
 
     def to_latex(self) -> str:
         r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule, \midrule, \bottomrule)."""
-        lines = [" & ".join(map(_escape, row)) + r" \\" for row in [list(self.header), *self.texts()]]
+        escaped = str.maketrans({letter: f"\\{letter}" for letter in "&%$#_{}"})
+        rows = [[cell.translate(escaped) for cell in row] for row in [list(self.header), *self.texts()]]
+        lines = [" & ".join(row) + r" \\" for row in rows]
         body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
         columns = "l" + "r" * (len(self.header) - 1)
         return f"% {self.title}\n\\begin{{tabular}}{{{columns}}}\n{body}\n\\end{{tabular}}\n"
+
+
+def _csv(rows: Iterable[Sequence[str]]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
 
 
 def _text(cell: Cell) -> str:
     if isinstance(cell, str):
         return cell
     return "-" if math.isnan(cell) else f"{cell:.2f}"
-
-
-def _escape(text: str) -> str:
-    return "".join(f"\\{letter}" if letter in "&%$#_{}" else letter for letter in text)
 
 
 @dataclass(frozen=True)
@@ -137,7 +146,7 @@ class Evaluation:
 
     def interval(self, level: float = 0.95) -> Interval | None:
         """Return the confidence interval of `miou` by bootstrap over sequences; None with fewer than five of them."""
-        if len(self.sequences) < FEWEST_SEQUENCES:
+        if len(self.sequences) < _FEWEST_SEQUENCES:
             return None
         return bootstrap(list(self.sequences.values()), lambda m: self.convention.score(m).miou, level=level)
 
@@ -153,21 +162,25 @@ class Evaluation:
 
     def tables(self) -> tuple[FigureTable, ...]:
         """Return the paper's two tables, IoU of each class and completeness, and one of the regions if there are any."""
-        tables = [semantic_table([self]), geometric_table([self])]
-        return (*tables, self._breakdown_table()) if self.breakdown else tuple(tables)
+        tables = semantic_table([self]), geometric_table([self])
+        if not self.breakdown:
+            return tables
+        rows: list[tuple[Cell, ...]] = []
+        for name, matrix in self.breakdown.items():
+            score = self.convention.score(matrix)
+            rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
+        header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
+        return (*tables, FigureTable("By region", header, tuple(rows)))
 
     def to_csv(self) -> str:
         """Return the scores of each frame as CSV."""
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        names = list(self.class_iou)
-        writer.writerow(["sequence", "frame", "miou", "iou", "precision", "recall", "false_free", *names])
+        rows = [["sequence", "frame", "miou", "iou", "precision", "recall", "false_free", *self.class_iou]]
         for frame in self.frame_scores:
             score = frame.score
             figures = [score.miou, score.iou, score.precision, score.recall, score.false_free]
             cells = ["" if math.isnan(v) else f"{v:.6f}" for v in (*figures, *score.class_iou.values())]
-            writer.writerow([frame.sequence, frame.frame, *cells])
-        return buffer.getvalue()
+            rows.append([frame.sequence, frame.frame, *cells])
+        return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return every figure by name, as fractions, for JSON; None for a figure that is not defined."""
@@ -200,14 +213,6 @@ class Evaluation:
             "notes": list(self.notes),
             "failures": [list(failure) for failure in self.failures],
         }
-
-    def _breakdown_table(self) -> FigureTable:
-        rows: list[tuple[Cell, ...]] = []
-        for name, matrix in self.breakdown.items():
-            score = self.convention.score(matrix)
-            rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
-        header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
-        return FigureTable("By region", header, tuple(rows))
 
 
 def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
@@ -251,3 +256,124 @@ def _percent(*values: float) -> tuple[float, ...]:
 
 def _number(value: float) -> float | None:
     return None if math.isnan(value) else float(value)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A confidence interval.
+
+    Attributes:
+        value: the score of all sequences together.
+        low: lower end.
+        high: upper end.
+        level: confidence level: share of such intervals that contain the true value.
+    """
+
+    value: float
+    low: float
+    high: float
+    level: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two predictions of the same sequences.
+
+    Attributes:
+        difference: score of the first minus that of the second, with its interval.
+        p_value: probability of a difference at least as large if both are equally good.
+        sequences: the sequences that both predictions have.
+    """
+
+    difference: Interval
+    p_value: float
+    sequences: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures by name, as fractions, for JSON."""
+        return {
+            "difference": self.difference.value,
+            "interval": [self.difference.low, self.difference.high],
+            "p_value": self.p_value,
+            "sequences": list(self.sequences),
+        }
+
+
+def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95) -> Interval:
+    """Return a score with its confidence interval by bootstrap: sequences are drawn again with replacement.
+
+    Args:
+        matrices: confusion matrix of each sequence.
+        score: function that computes the score from the sum of the matrices.
+        level: confidence level of the interval.
+
+    Raises:
+        ArgumentError: there are fewer than five sequences.
+    """
+    _check_number(len(matrices))
+    counts = np.stack([matrix.counts for matrix in matrices])
+    draws = np.random.default_rng(_SEED).integers(0, len(counts), (_DRAWS, len(counts)))
+    values = [score(_matrix(counts[draw].sum(axis=0), matrices[0])) for draw in draws]
+    return _interval(score(_matrix(counts.sum(axis=0), matrices[0])), values, level)
+
+
+def compare(
+    first: Mapping[str, ConfusionMatrix], second: Mapping[str, ConfusionMatrix], score: Score, *, level: float = 0.95
+) -> Comparison:
+    """Compare two predictions, sequence by sequence.
+
+    For the interval, the same sequences are drawn again for both predictions. For the p-value, the two predictions are swapped in some of
+    the sequences: in all possible ways for up to twelve sequences, in 2,000 random ways for more.
+
+    Args:
+        first: confusion matrix of each sequence, by path.
+        second: likewise; sequences that only one of them has are left out.
+        score: function that computes the score from a sum of matrices.
+        level: confidence level of the interval.
+
+    Raises:
+        MissingDataError: they have no sequence in common.
+        ArgumentError: they have fewer than five in common.
+    """
+    common = tuple(sorted(set(first) & set(second)))
+    if not common:
+        raise MissingDataError("second", expected="sequences of the first", found=", ".join(sorted(second)) or "none")
+    _check_number(len(common))
+    like = first[common[0]]
+    a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
+
+    def difference(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
+        return score(_matrix(one, like)) - score(_matrix(other, like))
+
+    found = difference(a.sum(axis=0), b.sum(axis=0))
+    rng = np.random.default_rng(_SEED)
+    draws = rng.integers(0, len(common), (_DRAWS, len(common)))
+    spread = [difference(a[draw].sum(axis=0), b[draw].sum(axis=0)) for draw in draws]
+    if len(common) <= _EXACT:
+        swaps = (np.arange(2 ** len(common))[:, None] >> np.arange(len(common)) & 1).astype(bool)
+    else:
+        swaps = rng.random((_DRAWS, len(common))) < 0.5
+        swaps[0] = False  # the actual assignment is one of them
+    swapped = [
+        difference(np.where(s[:, None, None], b, a).sum(axis=0), np.where(s[:, None, None], a, b).sum(axis=0))
+        for s in swaps
+    ]
+    p_value = float(np.mean(np.abs(swapped) >= abs(found) - 1e-12))
+    return Comparison(_interval(found, spread, level), p_value, common)
+
+
+def _check_number(sequences: int) -> None:
+    if sequences < _FEWEST_SEQUENCES:
+        raise ArgumentError("sequences", expected=f"at least {_FEWEST_SEQUENCES} to draw from", found=str(sequences))
+
+
+def _matrix(counts: NDArray[np.int64], like: ConfusionMatrix) -> ConfusionMatrix:
+    return ConfusionMatrix(like.num_classes, free=like.free, counts=counts)
+
+
+def _interval(value: float, draws: Sequence[float], level: float) -> Interval:
+    present = np.array(draws)[~np.isnan(draws)]
+    if not len(present):
+        return Interval(value, float("nan"), float("nan"), level)
+    low, high = np.quantile(present, [(1 - level) / 2, (1 + level) / 2])
+    return Interval(value, float(low), float(high), level)

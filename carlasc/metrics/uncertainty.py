@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.counting import to_numpy
+from carlasc.metrics.confusion import check_ids, to_numpy
 
 _BINS = 15
 _TOLERANCE = 1e-3  # largest deviation of the sum of the probabilities of a voxel from one: half precision gives 5e-4
@@ -117,16 +117,16 @@ class Uncertainty:
                 found=f"a sum of {prob[worst].sum():.4g} (lowest value {prob.min():.4g})",
                 advice="apply a softmax first",
             )
-        if len(target) and (target.min() < 0 or target.max() >= self.num_classes):
-            raise FormatError(
-                "truth", expected=f"class ids 0..{self.num_classes - 1}", found=f"{target.min()} to {target.max()}"
-            )
+        check_ids("truth", target, self.num_classes)
         predicted = prob.argmax(axis=1)
         confidence, right = prob.max(axis=1, initial=0.0), predicted == target
         loss = -np.log(prob[np.arange(len(target)), target] + _EPSILON)
         occupied = predicted != self.free
         for row, chosen in enumerate((~occupied, occupied)):
-            sums = self._bin(confidence[chosen], right[chosen])
+            # Bins are (low, high]: a confidence of exactly 1 is in the last one.
+            bins = np.clip(np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1)
+            weights = None, confidence[chosen], right[chosen]
+            sums: NDArray[np.float64] = np.stack([np.bincount(bins, weight, self.bins) for weight in weights])
             self.sums[row] += sums
             if chosen.any():
                 self.ece[row] += _reliability(sums).ece, 1
@@ -137,14 +137,8 @@ class Uncertainty:
         """Return the score of everything that was added; NaN where nothing was."""
         with np.errstate(invalid="ignore"):
             ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
-        return UncertaintyScore(
-            float(ece[0]),
-            float(ece[1]),
-            float(nll[0]),
-            float(nll[1]),
-            _reliability(self.sums[0]),
-            _reliability(self.sums[1]),
-        )
+        empty, occupied = map(_reliability, self.sums)
+        return UncertaintyScore(float(ece[0]), float(ece[1]), float(nll[0]), float(nll[1]), empty, occupied)
 
     def merge(self, other: Uncertainty) -> Self:
         """Add what another metric of the same settings has added up, in any order.
@@ -158,11 +152,6 @@ class Uncertainty:
         self.nll += other.nll
         self.ece += other.ece
         return self
-
-    def _bin(self, confidence: NDArray[np.float64], right: NDArray[np.bool_]) -> NDArray[np.float64]:
-        # Bins are (low, high]: a confidence of exactly 1 is in the last one.
-        number = np.clip(np.ceil(confidence * self.bins).astype(int) - 1, 0, self.bins - 1)
-        return np.stack([np.bincount(number, weights, self.bins) for weights in (None, confidence, right)])
 
 
 def _reliability(sums: NDArray[np.float64]) -> Reliability:

@@ -18,7 +18,7 @@ from carlasc.core.choices import PaletteName as PaletteName  # noqa: PLC0414 (pa
 from carlasc.core.classes import ClassTable, Color
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError
-from carlasc.metrics.comparison import VoxelOutcome
+from carlasc.metrics.grids import VoxelOutcome
 
 PALETTES: tuple[str, ...] = get_args(PaletteName)
 

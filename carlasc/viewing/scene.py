@@ -21,7 +21,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.metrics.comparison import check_same_geometry, compare_grids
+from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
 from carlasc.viewing.finding import (

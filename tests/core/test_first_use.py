@@ -20,7 +20,7 @@ class Compiled(event.Listener):
 
 event.register("numba:compile", Compiled())
 
-from carlasc.metrics.counting import count_arrays
+from carlasc.metrics.confusion import count_arrays
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import box
 from carlasc.viewing.rendering.rasterizing import hits, visible_triangles
@@ -49,7 +49,7 @@ from carlasc.core.first_use import note_compiling
 note_compiling(lambda: print("told"), after_s=float(sys.argv[1]))
 assert "numba" not in sys.modules
 import numpy as np
-from carlasc.metrics.counting import count_arrays
+from carlasc.metrics.confusion import count_arrays
 labels = np.zeros(9, np.uint8)
 count_arrays(labels, labels, None, 3)
 """

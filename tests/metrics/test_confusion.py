@@ -91,7 +91,7 @@ def test_tensors_count_as_arrays_do():
 
 def test_the_count_on_another_device_is_that_on_the_cpu():
     torch = pytest.importorskip("torch")
-    from carlasc.metrics.counting import count_tensors
+    from carlasc.metrics.confusion import count_tensors
 
     pred, target, mask = labels_and_mask(4)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

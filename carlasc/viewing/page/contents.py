@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.metrics.comparison import check_same_geometry, compare_grids
 from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.finding import SceneSource, find_truth
 from carlasc.viewing.rendering.drawings import motion_arrows

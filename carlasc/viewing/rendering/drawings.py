@@ -14,7 +14,7 @@ from carlasc.core.evidence import VoxelFlag
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.metrics.comparison import VoxelOutcome, compare_grids
+from carlasc.metrics.grids import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry, as_color, height_colors
