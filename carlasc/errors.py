@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Self
+from typing import Any, Self, get_args
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
 # What a terminal obeys, or what changes the order in which a line is read: control characters (ESC starts the terminal's commands), the marks
@@ -137,6 +137,22 @@ class ConflictError(CarlascError):
 
 class StorageError(CarlascError):
     """The output cannot be written: a full disk, a folder without write permission. Every further write would fail alike."""
+
+
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Check that an argument has one of the values that it may have.
+
+    Args:
+        name: the argument's name.
+        value: what was given.
+        choices: a `Literal` of words, or the words.
+
+    Raises:
+        ArgumentError: it has another value.
+    """
+    allowed = get_args(choices) or tuple(choices)
+    if value not in allowed:
+        raise ArgumentError(name, expected=f"one of {', '.join(allowed)}", found=repr(value))
 
 
 def import_extra(module: str, extra: str) -> ModuleType:

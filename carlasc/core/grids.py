@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, check_choice
 
 Triple = tuple[float, float, float]
 
@@ -81,8 +81,7 @@ class GridSpec:
             "cartesian_fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
             "cylindrical": cls("cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)),
         }
-        if name not in presets:
-            raise ArgumentError("published grid", expected=f"one of {', '.join(presets)}", found=repr(name))
+        check_choice("published grid", name, presets)
         return presets[name]
 
     @classmethod

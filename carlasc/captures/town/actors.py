@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.settings import TRAFFIC, TrafficLevel, check_traffic
+from carlasc.captures.settings import TRAFFIC, TrafficLevel
 from carlasc.captures.town.meshes import Mesh, close_loop
 from carlasc.captures.town.plan import KERB_M
 from carlasc.captures.town.shapes import (
@@ -26,6 +26,7 @@ from carlasc.captures.town.streets import HALF_ROAD_M, CityBlock
 from carlasc.captures.town.town import Town
 from carlasc.captures.town.traffic import Traffic, place_vehicles
 from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.errors import check_choice
 from carlasc.storage.layout import FRAME_PERIOD_S
 
 _OFFSETS_M = (1.1, 1.75, 2.3)
@@ -125,7 +126,7 @@ class Population:
         Raises:
             ArgumentError: the level of traffic is unknown.
         """
-        check_traffic(traffic)
+        check_choice("traffic", traffic, TrafficLevel)
         count = TRAFFIC[traffic]
         self._shapes, lengths = _draw_vehicles(rng, count)
         lane, along = _draw_ego_start(rng, town)

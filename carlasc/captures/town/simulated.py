@@ -17,12 +17,11 @@ from carlasc.captures.settings import (
     Lidar,
     TrafficLevel,
     check_at_least,
-    check_traffic,
 )
 from carlasc.captures.town.drive import Snapshot, TownDrive
 from carlasc.core.geometry import Transform, rotate_vectors
 from carlasc.core.tables import CARLA
-from carlasc.errors import MissingDataError, import_extra
+from carlasc.errors import MissingDataError, check_choice, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 
 _SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
@@ -110,7 +109,7 @@ class SimulatedCapture(Capture):
         """
         check_at_least(1, count=count, sensors=sensors)
         check_at_least(0, first_frame=first_frame, seed=seed)
-        check_traffic(traffic)
+        check_choice("traffic", traffic, TrafficLevel)
         self.location, self.classes = f"the simulated town of seed {seed}", CARLA
         self._frames, self._count = range(first_frame, first_frame + count), sensors
         self._drive_of, self._bev = (seed, traffic, lidar or Lidar()), bev
