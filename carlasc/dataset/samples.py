@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
-from carlasc.dataset.scans import RecentScans
 from carlasc.dataset.selection import (
+    RecentScans,
     SequenceFrames,
     choose_sequences,
     common_frames,

@@ -13,10 +13,9 @@ from functools import partial
 from typing import Any
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra
-from carlasc.running.clients import one_line_if_lost
+from carlasc.running.clients import Versions, one_line_if_lost
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
 from carlasc.running.spreading import DaskClient, LazyClient, Run
-from carlasc.running.workers import Versions
 
 _CONNECT_S = "10s"  # Dask's setting carlasc.connect-timeout replaces it
 _WORKERS_S = "10m"  # the same of carlasc.workers-timeout

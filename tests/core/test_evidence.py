@@ -3,7 +3,7 @@ import pytest
 
 import carlasc
 from carlasc.core import VoxelFlag
-from carlasc.core.evidence import is_confident
+from carlasc.core.grids import is_confident
 
 
 def test_the_bits_are_those_of_the_format():

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from carlasc.running.interrupts import postponed_interrupts
+from carlasc.errors import postponed_interrupts
 
 PROGRAM = """
 import os, signal, threading

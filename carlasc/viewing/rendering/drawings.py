@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
-from carlasc.core.evidence import VoxelFlag
-from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
 from carlasc.metrics.comparison import VoxelOutcome, compare_grids

@@ -14,7 +14,7 @@ from carlasc.captures import Capture, Lidar, SimulatedCapture, simulate
 from carlasc.captures.town.actors import EGO_ID
 from carlasc.captures.town.drive import Snapshot
 from carlasc.captures.town.meshes import MeshBuilder, RayScene
-from carlasc.captures.town.simulated import render_birdseye
+from carlasc.captures.town.simulation import render_birdseye
 from carlasc.cli import app
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec
