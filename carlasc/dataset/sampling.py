@@ -99,7 +99,8 @@ class ShardSampler(_Sampler):
         self.dataset = dataset
         self.seed = seed
         self.epoch = 0
-        self.shard = _default_shard(dataset.history) if shard is None else shard
+        before = -(-(dataset.history - 1) // _STORED_TOGETHER) * _STORED_TOGETHER
+        self.shard = max(_STORED_TOGETHER, _READ_AGAIN * before) if shard is None else shard
         self.window = window
         self.rank = rank
         self.world = world
@@ -187,11 +188,6 @@ class ShardSampler(_Sampler):
         for sequence, frames in places:
             digest = zlib.crc32(np.asarray(frames, "<i8").tobytes(), zlib.crc32(sequence.name.encode(), digest))
         return {"samples": len(self._shards), "data": digest, "shard": self.shard, "window": self.window}
-
-
-def _default_shard(history: int) -> int:
-    before = -(-(history - 1) // _STORED_TOGETHER) * _STORED_TOGETHER
-    return max(_STORED_TOGETHER, _READ_AGAIN * before)
 
 
 def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:

@@ -289,18 +289,13 @@ def simulate(
             note(frame)
             progress(done, len(wanted))
     if run.part.count > 1:
-        _write_times_of_all(writer, range(first_frame, first_frame + count), sensors, bev)
+        writer.target.tree.refresh()
+        frames = range(first_frame, first_frame + count)
+        if all(writer.has_frame(frame, sensors, bev) for frame in frames):
+            timed = writer.timed_frames(sensors)
+            writer.write_times({frame: [frame * FRAME_PERIOD_S] * sensors for frame in frames if frame not in timed})
     classes = {name: points[name] for name in CARLA.names.values() if points[name]}
     return SimulationResult(writer.out, len(wanted), len(missing), sensors, points.total(), classes)
-
-
-def _write_times_of_all(writer: CaptureWriter, frames: range, sensors: int, bev: bool) -> None:
-    """Write the times of all frames if all exist."""
-    writer.target.tree.refresh()
-    if all(writer.has_frame(frame, sensors, bev) for frame in frames):
-        with TimesLog(writer) as log:
-            for frame in sorted(set(frames) - writer.timed_frames(sensors)):
-                log.add(frame, [frame * FRAME_PERIOD_S] * sensors)
 
 
 def check_dependencies(bev: bool = True) -> None:

@@ -286,20 +286,14 @@ def build_town(rng: np.random.Generator) -> Town:
     plan = TownPlan(rng, PlantCatalogue(rng))
     pave_roads(plan, streets)
     paint_markings(plan, streets)
-    uses = _draw_block_uses(rng, len(streets.blocks) - 1)
-    for block, use in zip(streets.blocks, uses, strict=False):
-        fill_block(plan, block, use)
+    extra = rng.integers(len(BLOCK_USES), size=max(len(streets.blocks) - 1 - len(BLOCK_USES), 0))
+    uses = [*BLOCK_USES, *(BLOCK_USES[int(i)] for i in extra)]  # every use occurs at least once
+    for block, use in zip(streets.blocks[:-1], rng.permutation(len(uses)), strict=False):
+        fill_block(plan, block, uses[int(use)])
     fill_outskirts(plan, streets.blocks[-1])
     add_traffic_signals(plan, streets)
     add_footbridge(plan, streets)
     return Town(streets, plan.builder.build(), tuple(plan.buildings), tuple(plan.parking))
-
-
-def _draw_block_uses(rng: np.random.Generator, count: int) -> list[str]:
-    """Draw the use of each block. Every use occurs at least once."""
-    extra = rng.integers(len(BLOCK_USES), size=max(count - len(BLOCK_USES), 0))
-    uses = [*BLOCK_USES, *(BLOCK_USES[int(i)] for i in extra)]
-    return [uses[int(i)] for i in rng.permutation(len(uses))][:count]
 
 
 OUTSKIRTS_M = 90.0  # width of the land around the town
