@@ -314,9 +314,9 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _problems_of_import(name: str) -> Iterator[str]:
-    """Yield why a package that is always needed does not load; its module has the name of the package."""
+    """Yield why a package that is always needed does not load; its module has the name of the package, with underscores."""
     try:
-        import_extra(name, "")
+        import_extra(name.replace("-", "_"), "")
     except DependencyError as error:
         yield f"{name} does not load ({describe(error.__cause__ or error)})"
 

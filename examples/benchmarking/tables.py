@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarking.runs import Result
 from carlasc.core import CARLASC11
-from carlasc.metrics import Table, geometric_table, semantic_table
+from carlasc.metrics import FigureTable, geometric_table, semantic_table
 
 VEHICLE, PEDESTRIAN = CARLASC11.id_of("Vehicles"), CARLASC11.id_of("Pedestrian")
 FREE = 0
@@ -53,15 +53,15 @@ FIGURES: Mapping[str, Callable[[Result], float]] = {
 """The columns of the table of labels."""
 
 
-def label_table(groups: Mapping[str, Sequence[Result]]) -> Table:
+def label_table(groups: Mapping[str, Sequence[Result]]) -> FigureTable:
     """Return what each kind of labels gives: one row per group of runs."""
     rows = tuple(
         (name, *(spread([figure(run) for run in runs]) for figure in FIGURES.values())) for name, runs in groups.items()
     )
-    return Table("What labels are worth, scored on capture truth", ("trained on", *FIGURES), rows)
+    return FigureTable("What labels are worth, scored on capture truth", ("trained on", *FIGURES), rows)
 
 
-def network_tables(groups: Mapping[str, Sequence[Result]]) -> list[Table]:
+def network_tables(groups: Mapping[str, Sequence[Result]]) -> list[FigureTable]:
     """Return the paper's two tables with one row per group of runs."""
     tables = []
     for make in (semantic_table, geometric_table):
@@ -70,7 +70,7 @@ def network_tables(groups: Mapping[str, Sequence[Result]]) -> list[Table]:
             table = make([run.evaluation(name) for run in runs])
             columns = list(zip(*table.rows, strict=True))[1:]
             rows.append((name, *(spread([float(value) for value in column]) for column in columns)))
-        tables.append(Table(table.title, table.header, tuple(rows)))
+        tables.append(FigureTable(table.title, table.header, tuple(rows)))
     return tables
 
 
@@ -82,7 +82,7 @@ def spread(values: Sequence[float]) -> str:
     return f"{np.mean(values):.2f}{deviation}"
 
 
-def to_markdown(table: Table) -> str:
+def to_markdown(table: FigureTable) -> str:
     """Return a table as Markdown, under its title."""
     rows = [list(table.header), ["---", *["---:"] * (len(table.header) - 1)], *table.texts()]
     return "\n".join([table.title, "", *(f"| {' | '.join(row)} |" for row in rows)])

@@ -121,7 +121,7 @@ def test_where_every_frame_fails_the_first_cause_is_the_message(installed, tmp_p
     assert [failure.frame for failure in result.failures] == [0, 1]
     assert result.failures[0].message == cause
     assert (result.made, result.grids) == (0, ())
-    options = ["--option", f"how={how}", "--option", f"posed={posed}", "--workers", "1"]
+    options = ["--how", how, "--posed" if posed else "--no-posed", "--workers", "1"]
     ran = CliRunner().invoke(app, ["convert", "failing", str(installed), str(tmp_path / "cli"), *options])
     assert ran.exit_code == 1
     assert cause in ran.stderr.splitlines()[0]

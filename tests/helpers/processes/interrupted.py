@@ -15,7 +15,7 @@ from carlasc.cli import flags, main
 
 
 @contextmanager
-def interrupting_bar(description: str) -> Iterator[Callable[[int, int], None]]:
+def interrupting_bar(description: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
     def interrupt(done: int, total: int) -> None:
         if done >= frames:
             os.killpg(os.getpgrp(), number)
