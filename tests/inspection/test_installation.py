@@ -132,7 +132,15 @@ def test_json_holds_the_same_figures(tmp_path):
     found = json.loads(ran.stdout)
     assert ran.exit_code == 0
     assert found["version"] == carlasc.__version__
-    assert {package["name"] for package in found["packages"]} == {"aiohttp", "fsspec", "lazy-loader", "numba", "numpy", "rich", "typer"}
+    assert {package["name"] for package in found["packages"]} == {
+        "aiohttp",
+        "fsspec",
+        "lazy-loader",
+        "numba",
+        "numpy",
+        "rich",
+        "typer",
+    }
     assert found["processor"]["usable"] >= 1 and found["compiled"]["compile_s"] > 0
     assert found["compiled"]["writable"] is True
 
