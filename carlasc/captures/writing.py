@@ -86,7 +86,13 @@ class CaptureWriter:
         return all(self._has(array_path(name, sensor, frame)) for name in FOLDERS)
 
     def has_frame(self, frame: int, sensors: int, bev: bool) -> bool:
-        """Whether all files of a frame exist: those of `sensors` sensors, and the bird's-eye picture where `bev` is true."""
+        """Whether all files of a frame exist.
+
+        Args:
+            frame: number of the frame.
+            sensors: number of sensors whose files are looked for.
+            bev: whether the bird's-eye picture is looked for too.
+        """
         complete = all(self.has(sensor, frame) for sensor in range(sensors))
         return complete and (not bev or self._has(bev_path(frame)))
 
@@ -105,6 +111,11 @@ class CaptureWriter:
 
     def write(self, sensor: int, frame: int, recording: SensorRecording) -> None:
         """Write what a sensor recorded in a frame. Existing files are replaced.
+
+        Args:
+            sensor: number of the sensor; 0 is the ego sensor.
+            frame: number of the frame.
+            recording: its scan, with labels and instances, and its pose.
 
         Raises:
             FormatError: the scan has no labels or instances, or the pose is not rigid.

@@ -114,7 +114,7 @@ class SequenceFile(AbstractContextManager["SequenceFile"]):
 
     @abstractmethod
     def add(self, frame: int, content: Mapping[str, NDArray[Any]]) -> None:
-        """Write a frame. Frames come in increasing order.
+        """Write a frame, whose arrays have the shapes that `make_frame` gives them, (N, ...) for N points. Frames come in increasing order.
 
         Raises:
             CarlascError: the frame cannot be expressed in the format. Nothing of it is written.
@@ -142,7 +142,7 @@ class SequenceExporter(Exporter):
 
     @abstractmethod
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, NDArray[Any]]:
-        """Return the arrays of a frame, by name.
+        """Return the arrays of a frame by name, of shape (N, ...) for N points.
 
         Raises:
             CarlascError: the frame cannot be read, or cannot be expressed in the other format.

@@ -92,9 +92,14 @@ class Boxes:
         sizes: NDArray[np.floating],
         annotated: NDArray[np.bool_] | None = None,
     ) -> Boxes:
-        """Return boxes with the poses (N, 4, 4) `sensor_T_box`; the other arguments are those of the constructor.
+        """Return boxes with given poses.
 
-        All boxes count as annotated if `annotated` is None.
+        Args:
+            tracks: (N,) numbers of the tracks.
+            labels: (N,) class ids.
+            sensor_T_box: (N, 4, 4) poses of the centres.
+            sizes: (N, 3) length, width and height, metres.
+            annotated: (N,) whether a box was annotated; None for all.
 
         Raises:
             FormatError: as for the constructor. Poses are not checked: `carlasc.core.check_rigid` does that.
@@ -149,7 +154,7 @@ class Boxes:
         return poses_from(self.quaternions, self.centers)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Boxes:
-        """Return the boxes that a mask or indices select."""
+        """Return the boxes that a mask of shape (N,) or indices of shape (M,) select."""
         return Boxes(
             self.tracks[keep],
             self.labels[keep],

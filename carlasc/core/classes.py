@@ -164,7 +164,7 @@ class ClassTable:
         )
 
     def check(self, labels: NDArray[np.integer], where: str) -> None:
-        """Raise a FormatError if an id is negative or not below `num_channels`; `where` is the file named in the message."""
+        """Raise a FormatError if an id, in labels of any shape, is negative or not below `num_channels`; `where` is the file named in the message."""
         if labels.size and (int(labels.max()) >= self.num_channels or int(labels.min()) < 0):
             bad = int(labels.max()) if int(labels.max()) >= self.num_channels else int(labels.min())
             count = int(np.count_nonzero(labels == bad))
@@ -214,7 +214,7 @@ class Remap:
         return np.where(self.table < 0, 0, self.table).astype(self.target.dtype)
 
     def unknown(self, labels: NDArray[np.integer]) -> dict[int, int]:
-        """Return the number of occurrences of each id that is not in the mapping."""
+        """Return the number of occurrences of each id, in labels of any shape, that is not in the mapping."""
         ids, counts = np.unique(labels, return_counts=True)
         return {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping}
 

@@ -68,7 +68,7 @@ class FrameRange:
         return (self.start is None or frame >= self.start) and (self.stop is None or frame < self.stop)
 
     def select(self, frames: NDArray[Any]) -> NDArray[Any]:
-        """Return those of an array of frame numbers that are in the range, in their order."""
+        """Return those of (N,) frame numbers that are in the range, in their order, as an array of shape (M,)."""
         chosen = np.ones(len(frames), np.bool_)
         if self.start is not None:
             chosen &= frames >= self.start

@@ -55,7 +55,7 @@ class Scan:
         return len(self.points)
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
-        """Return the points that a mask or indices select, with all of their fields; boxes are kept."""
+        """Return the points that a mask of shape (N,) or indices of shape (M,) select, with all of their fields; boxes are kept."""
 
         def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if values is None else values[keep]

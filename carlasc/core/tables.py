@@ -303,7 +303,7 @@ def to_table(
     """Return labels of one table as ids of another.
 
     Args:
-        labels: ids of `source`.
+        labels: ids of `source`, any shape.
         source: class table of the labels.
         target: class table of the result.
         where: the file or field named in errors.

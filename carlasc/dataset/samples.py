@@ -227,7 +227,7 @@ class Dataset(_MapStyle):
 
     @property
     def frames(self) -> tuple[NDArray[np.int64], ...]:
-        """Numbers of the frames of each of `sequences`: samples are in this order."""
+        """Numbers of the frames of each of `sequences`, arrays of shape (N,): samples are in this order."""
         return tuple(part.frames for part in self._parts)
 
     @property

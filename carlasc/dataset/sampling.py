@@ -121,7 +121,7 @@ class ShardSampler(_Sampler):
         self.epoch = epoch
 
     def order(self, epoch: int) -> NDArray[np.int64]:
-        """Return the indices of all samples, for all processes together, in the order of an epoch."""
+        """Return the (N,) indices of all samples, for all processes together, in the order of an epoch."""
         drawn = np.random.default_rng([self.seed, epoch])
         place = np.argsort(np.argsort(drawn.random(int(self._shards[-1]) + 1), kind="stable"), kind="stable")
         return np.argsort(place[self._shards] + self.window * drawn.random(len(self._shards)), kind="stable")

@@ -111,7 +111,7 @@ class Statistics:
         return found
 
     def summed(self, counts: NDArray[np.int64]) -> dict[str, int]:
-        """Return counts by the names of the remapped classes."""
+        """Return (C,) counts of the classes by the names of the remapped classes."""
         if self.remap is None:
             return self.named(counts)
         summed = dict.fromkeys(self.remap.target.names.values(), 0)
@@ -120,7 +120,7 @@ class Statistics:
         return summed
 
     def named(self, counts: NDArray[np.int64]) -> dict[str, int]:
-        """Return counts by the names of the classes."""
+        """Return (C,) counts of the classes by their names."""
         return {name: int(counts[index]) for index, name in self.classes.names.items()}
 
     def weights(self) -> dict[str, float]:

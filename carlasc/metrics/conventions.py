@@ -153,7 +153,17 @@ class Convention:
         known: NDArray[np.bool_] | None,
         region: NDArray[np.bool_] | None = None,
     ) -> ConfusionMatrix:
-        """Return the confusion matrix of a frame in the scored classes; arguments and errors as for `prepare`."""
+        """Return the confusion matrix of a frame in the scored classes.
+
+        Args:
+            prediction: predicted labels, shape (X, Y, Z), and their class table.
+            truth: true labels of the same shape, and their class table.
+            known: which voxels the data set evaluated, same shape; None for all.
+            region: only voxels where it is true count, same shape; None for all.
+
+        Raises:
+            FormatError: an id has no target.
+        """
         return ConfusionMatrix(self.num_classes, free=self.free).update(*self.prepare(prediction, truth, known, region))
 
     def score(self, matrix: ConfusionMatrix) -> ConventionScore:

@@ -20,12 +20,20 @@ Masks = Mapping[str, NDArray[np.bool_]]
 
 
 def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return the voxels that have votes (count > 0): the data set's own rule."""
+    """Return the voxels that have votes (count > 0), same shape as `counts`: the data set's own rule."""
     return counts > 0
 
 
 def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) -> NDArray[np.bool_]:
     """Return the voxels whose centre is at a horizontal distance of `near_m <= r < far_m` from the sensor.
+
+    Args:
+        spec: geometry of the grid.
+        near_m: where the band begins, metres.
+        far_m: where it ends, metres.
+
+    Returns:
+        A mask of shape (X, Y, Z).
 
     Raises:
         ArgumentError: `near_m` is negative, or `far_m` is not greater than `near_m`.
@@ -141,7 +149,14 @@ class Breakdown:
         self.matrices: dict[str, ConfusionMatrix] = {}
 
     def update(self, prediction: ArrayLike, truth: ArrayLike, masks: Masks, counted: ArrayLike | None = None) -> Self:
-        """Add a frame: to each region's matrix the voxels of its mask that count."""
+        """Add a frame: to each region's matrix the voxels of its mask that count.
+
+        Args:
+            prediction: predicted classes, shape (X, Y, Z).
+            truth: true classes, same shape.
+            masks: the voxels of each region by its name, same shape.
+            counted: the voxels that count, same shape; None for all.
+        """
         for name, mask in masks.items():
             inside = mask if counted is None else mask & np.asarray(counted, np.bool_)
             self._matrix(name).update(np.asarray(prediction), np.asarray(truth), inside)

@@ -142,6 +142,12 @@ class Forecasting:
     def update(self, horizon_s: float, prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
         """Add the future of one frame: the prediction for the time `horizon_s` later, and the truth at that time.
 
+        Args:
+            horizon_s: how far ahead the prediction is, seconds.
+            prediction: predicted classes, shape (X, Y, Z).
+            truth: true classes at that time, same shape.
+            mask: the voxels that count, same shape; None for all.
+
         Raises:
             ArgumentError: the horizon is not one of those of the metric.
             FormatError: the shapes do not match, or an id is out of range.

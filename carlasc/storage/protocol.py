@@ -76,7 +76,7 @@ class Sequence(ABC):
 
     @abstractmethod
     def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the sorted numbers of the frames that have a field; empty if the sequence does not have the field."""
+        """Return the sorted numbers of the (N,) frames that have a field; empty if the sequence does not have the field."""
 
     @abstractmethod
     def read(self, field: str, frame: int) -> NDArray[Any]:
@@ -103,7 +103,7 @@ class Sequence(ABC):
         """
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read one field of several frames. Stores that can do so read them together."""
+        """Read one field of several frames, each with the shape that `read` gives. Stores that can do so read them together."""
         return [self.read(field, frame) for frame in frames]
 
     def read_xyz(
@@ -240,6 +240,11 @@ class Sequence(ABC):
         Line i belongs to frame i if the file is long enough for the last frame; frames in between may be missing. If the file has
         exactly one line per existing frame, the lines belong to the frames in their order.
 
+        Args:
+            frame: number of the frame.
+            lines: number of lines of the file.
+            document: name of the file, for the error.
+
         Raises:
             FormatError: the file has too few lines.
         """
@@ -262,7 +267,7 @@ class Sequence(ABC):
         return int(frames[-1]) if len(frames) else -1, {int(frame): line for line, frame in enumerate(frames)}
 
     def scan_frames(self) -> NDArray[np.int64]:
-        """Return the frames of the sequence: those with points, or those of all fields if the sequence has only grids."""
+        """Return the (N,) frames of the sequence: those with points, or those of all fields if the sequence has only grids."""
         if len(points := self.frames("points")):
             return points
         return np.unique(

@@ -60,12 +60,17 @@ class SequenceWriter(ABC):
         The params.json of a grid must be written before its first frame. Stores that append need the frames of each field in
         increasing order.
 
+        Args:
+            field: name of the field (see `carlasc.storage.layout`).
+            frame: number of the frame.
+            array: the values, with the shape that the field has in its published file: (N, ...) for N points, (X, Y, Z) for a grid.
+
         Raises:
             FormatError: the array does not fit the field.
         """
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the fields of several frames, in the order given: by frame number, then by name of the field.
+        """Write the fields of several frames, with the shapes that `write` takes, in the order given: by frame number, then by name of the field.
 
         Stores that keep several frames in one file write those of a block together, and best get a whole block at once.
         """

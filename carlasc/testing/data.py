@@ -143,5 +143,5 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
 
 
 def published_bytes(field: str, array: NDArray[Any]) -> bytes:
-    """Return the bytes of an array's published file: they must be equal, whatever type a store keeps the array in."""
+    """Return the bytes of the published file of an array of any shape: they must be equal, whatever type a store keeps the array in."""
     return bytes(layout.field_named(field).encode(array, field))

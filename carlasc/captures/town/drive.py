@@ -97,7 +97,7 @@ class TownDrive:
         return self._population.at(frame)
 
     def sensor_offsets(self, sensors: int) -> NDArray[np.float64]:
-        """Return (sensors, 3) offsets of the sensors in the vehicle's frame, metres, the ego sensor first.
+        """Return the (S, 3) offsets of the sensors in the vehicle's frame, metres, the ego sensor first.
 
         A drive with more sensors has the same offsets for the first ones.
 
@@ -108,7 +108,7 @@ class TownDrive:
         return sensor_offsets(sensors, self._random(_SENSORS))
 
     def sensor_poses(self, frame: int, sensors: int) -> NDArray[np.float64]:
-        """Return (sensors, 4, 4) world_T_sensor. The sensors have the orientation of the vehicle.
+        """Return world_T_sensor of each sensor, shape (S, 4, 4). The sensors have the orientation of the vehicle.
 
         Raises:
             ArgumentError: the frame is negative, or the number of sensors is less than 1.
