@@ -99,7 +99,13 @@ def demonstrate(
             sequence, count=count, sensors=sensors, seed=seed, traffic="heavy", run=replace(run, progress=progress)
         )
     grids = []
-    for name, spec in _demo_grids().items():
+    published = GridSpec.published()
+    specs = {
+        "published coarse": published,
+        "0.2 m": published.with_resolution(0.2),
+        "cylindrical": GridSpec.published("cylindrical"),
+    }
+    for name, spec in specs.items():
         with step(f"ground truth, {name}") as progress:
             made = regrid(sequence, spec, run=replace(run, progress=progress))
             if made.failures:
@@ -121,15 +127,6 @@ def demonstrate(
         view(Scene(grids[0]), page, overwrite=True, progress=progress)
     elapsed_s = time.perf_counter() - start
     return DemoResult(sequence, tuple(grids), tuple(pictures), page, validation, statistics, elapsed_s)
-
-
-def _demo_grids() -> dict[str, GridSpec]:
-    published = GridSpec.published()
-    return {
-        "published coarse": published,
-        "0.2 m": published.with_resolution(0.2),
-        "cylindrical": GridSpec.published("cylindrical"),
-    }
 
 
 def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, CameraOptions]]:

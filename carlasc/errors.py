@@ -1,4 +1,4 @@
-"""The few kinds of error that a user can meet, and the check for optional packages.
+"""The few kinds of error that a user can meet, the check for optional packages, and Ctrl-C that waits.
 
 Every message is one line: what it is about (a file, a field, an argument), what was expected, what was found, what to do. Parts of it come
 from files and from other libraries: `printable` shows what a terminal would obey, and no part is longer than a few lines.
@@ -7,13 +7,14 @@ from files and from other libraries: `printable` shows what a terminal would obe
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import ModuleType
-from typing import Self
+from types import FrameType, ModuleType
+from typing import Any, Self, get_args
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
 # What a terminal obeys, or what changes the order in which a line is read: control characters (ESC starts the terminal's commands), the marks
@@ -139,6 +140,22 @@ class StorageError(CarlascError):
     """The output cannot be written: a full disk, a folder without write permission. Every further write would fail alike."""
 
 
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Check that an argument has one of the values that it may have.
+
+    Args:
+        name: the argument's name.
+        value: what was given.
+        choices: a `Literal` of words, or the words.
+
+    Raises:
+        ArgumentError: it has another value.
+    """
+    allowed = get_args(choices) or tuple(choices)
+    if value not in allowed:
+        raise ArgumentError(name, expected=f"one of {', '.join(allowed)}", found=repr(value))
+
+
 def import_extra(module: str, extra: str) -> ModuleType:
     """Import an optional module, or say in one line which extra to install.
 
@@ -153,7 +170,7 @@ def import_extra(module: str, extra: str) -> ModuleType:
         DependencyError: the module is not installed or fails to load.
     """
     try:
-        with _ctrl_c_waits():
+        with postponed_interrupts():
             return importlib.import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
@@ -164,21 +181,24 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
 
 @contextmanager
-def _ctrl_c_waits() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of the block: packages such as trimesh catch every exception of what they import, and go on without it."""
-    usual, pressed = signal.getsignal(signal.SIGINT), False
-    if not callable(usual) or threading.current_thread() is not threading.main_thread():
+def postponed_interrupts() -> Iterator[None]:
+    """Within the block, Ctrl-C waits for its end.
+
+    For blocks that give work to an executor: a thread whose start is interrupted runs, but its executor does not know it, and the interpreter waits
+    for it for ever when it ends. And for imports: packages such as trimesh catch every exception of what they import, and go on without it.
+    In other threads than the main one, which Ctrl-C does not reach, nothing changes.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or handler is None:
         yield
         return
-
-    def remember(*_: object) -> None:
-        nonlocal pressed
-        pressed = True
-
-    signal.signal(signal.SIGINT, remember)
+    caught: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: caught.append((number, frame)))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, usual)
-        if pressed:
-            usual(signal.SIGINT, None)
+        signal.signal(signal.SIGINT, handler)
+        if caught and callable(handler):
+            handler(*caught[0])
+        elif caught:
+            os.kill(os.getpid(), signal.SIGINT)

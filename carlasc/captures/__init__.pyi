@@ -9,7 +9,7 @@ from .settings import Lidar as Lidar
 from .settings import TrafficLevel as TrafficLevel
 from .town.actors import TownActor as TownActor
 from .town.drive import TownDrive as TownDrive
-from .town.simulated import SimulatedCapture as SimulatedCapture
+from .town.simulation import SimulatedCapture as SimulatedCapture
 from .town.simulation import SimulationResult as SimulationResult
 from .town.simulation import simulate as simulate
 from .writing import CaptureWriter as CaptureWriter

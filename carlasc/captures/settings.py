@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,16 +35,6 @@ def check_at_least(minimum: int, **values: int) -> None:
     for name, value in values.items():
         if value < minimum:
             raise ArgumentError(name, expected=f"at least {minimum}", found=str(value))
-
-
-def check_traffic(traffic: str) -> None:
-    """Check the name of a level of traffic.
-
-    Raises:
-        ArgumentError: no level has this name.
-    """
-    if traffic not in TRAFFIC:
-        raise ArgumentError("traffic", expected=f"one of {', '.join(get_args(TrafficLevel))}", found=repr(traffic))
 
 
 EGO_SENSOR_M = (-0.5, 0.0, 1.8)

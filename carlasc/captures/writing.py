@@ -154,7 +154,12 @@ class CaptureWriter:
         files: dict[str, bytes | memoryview] = {}
         for sensor in range(max(map(len, times_s.values()), default=0)):
             lines = self._times_of(sensor)
-            lines |= {frame: _time_line(frame, float(times[sensor])) for frame, times in times_s.items()}
+            for frame, times in times_s.items():
+                elapsed_s = float(times[sensor])
+                lines[frame] = (
+                    f"{frame}, Timestamp(frame={frame},elapsed_seconds={elapsed_s},delta_seconds={FRAME_PERIOD_S},"
+                    f"platform_timestamp={elapsed_s})"
+                )
             files[times_path(sensor)] = "".join(f"{lines[frame]}\n" for frame in sorted(lines)).encode()
         self.target.put_many(files)
 
@@ -205,11 +210,3 @@ class TimesLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.flush()
-
-
-def _time_line(frame: int, elapsed_s: float) -> str:
-    """Return the line of a frame in CARLA's form."""
-    return (
-        f"{frame}, Timestamp(frame={frame},elapsed_seconds={elapsed_s},delta_seconds={FRAME_PERIOD_S},"
-        f"platform_timestamp={elapsed_s})"
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from carlasc.converting.protocol import Converter
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError, check_choice
 from carlasc.storage.metadata import Axes
 
 _IDS = np.iinfo(np.uint16).max + 1
@@ -41,9 +40,8 @@ class LayoutOptions:
     allow_unknown: bool = False
 
     def __post_init__(self) -> None:
-        for name, allowed in (("axes", get_args(Axes)), ("flow", get_args(FlowSource))):
-            if getattr(self, name) not in allowed:
-                raise ArgumentError(name, expected=f"one of {', '.join(allowed)}", found=repr(getattr(self, name)))
+        check_choice("axes", self.axes, Axes)
+        check_choice("flow", self.flow, FlowSource)
 
     def of(self, converter: type[Converter]) -> AxesAndClasses:
         """Return the axes and the classes in which the data of a converter are written.
@@ -51,9 +49,7 @@ class LayoutOptions:
         Raises:
             ArgumentError: `classes` is neither "carla" nor the name of the converter's class table.
         """
-        allowed = ("carla", converter.classes.name)
-        if self.classes not in allowed:
-            raise ArgumentError("classes", expected=f"one of {', '.join(allowed)}", found=repr(self.classes))
+        check_choice("classes", self.classes, ("carla", converter.classes.name))
         remap = converter.to_carla if self.classes == "carla" else None
         return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
 

@@ -18,7 +18,7 @@ from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.tables import CARLA, remaps_between
-from carlasc.errors import ArgumentError, DependencyError
+from carlasc.errors import ArgumentError, DependencyError, check_choice
 
 GROUP = "carlasc.converters"
 EXPORTERS = "carlasc.exporters"
@@ -101,8 +101,8 @@ class OptionDeclaration:
         Raises:
             ArgumentError: the option cannot have that value.
         """
-        if self.choices and value not in self.choices and value is not self.default:
-            raise ArgumentError(self.name, expected=f"one of {', '.join(self.choices)}", found=repr(value))
+        if self.choices and value is not self.default:
+            check_choice(self.name, value, self.choices)
         if not isinstance(value, str) or self.type is str:
             return value
         kinds: dict[type, tuple[str, Callable[[str], Any]]] = {

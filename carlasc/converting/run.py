@@ -9,7 +9,7 @@ from collections.abc import Sequence as Series
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from carlasc.converting.registry import load_converter, read_options
 from carlasc.converting.results import ConvertResult, Failure, StepCounter, check_outside
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting
 from carlasc.groundtruth.run import RegridResult, regrid
@@ -203,8 +203,7 @@ def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> No
         ConflictError: the output lies inside the source.
         MissingDataError: the source does not exist.
     """
-    if split not in get_args(SplitName):
-        raise ArgumentError("split", expected=f"one of {', '.join(get_args(SplitName))}", found=repr(split))
+    check_choice("split", split, SplitName)
     if not (isinstance(grids, GridOptions) or grids in ("voxels", None)):
         raise ArgumentError("grids", expected='GridOptions(...), "voxels" or None', found=repr(grids))
     target = getattr(sink, "target", None)

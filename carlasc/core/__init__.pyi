@@ -17,7 +17,6 @@ from .classes import ClassTable as ClassTable
 from .classes import Color as Color
 from .classes import Remap as Remap
 from .classes import class_weights as class_weights
-from .evidence import VoxelFlag as VoxelFlag
 from .frames import FrameRange as FrameRange
 from .frames import Frames as Frames
 from .geometry import Transform as Transform
@@ -34,6 +33,7 @@ from .geometry import translation as translation
 from .grids import Coordinates as Coordinates
 from .grids import Grid as Grid
 from .grids import GridSpec as GridSpec
+from .grids import VoxelFlag as VoxelFlag
 from .scans import Scan as Scan
 from .scans import runs_of_origins as runs_of_origins
 from .scans import sorted_by_origin as sorted_by_origin

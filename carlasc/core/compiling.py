@@ -173,7 +173,10 @@ class _SharedCache(FunctionCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-            self._remove_old()
+            for old in Path(self.cache_path).glob(self._versions):
+                with suppress(OSError):  # another process removes them too
+                    if time.time() - old.stat().st_mtime > _KEPT_S:
+                        old.unlink()
         finally:
             self._release()
 
@@ -195,9 +198,3 @@ class _SharedCache(FunctionCache):
         lock, self._lock = self._lock, None
         if lock is not None:
             lock.close()
-
-    def _remove_old(self) -> None:
-        for old in Path(self.cache_path).glob(self._versions):
-            with suppress(OSError):  # another process removes them too
-                if time.time() - old.stat().st_mtime > _KEPT_S:
-                    old.unlink()

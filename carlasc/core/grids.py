@@ -1,4 +1,4 @@
-"""Voxel grids: the geometry of their cells (GridSpec) and the content of the cells (Grid).
+"""Voxel grids: the geometry of their cells (GridSpec), the content of the cells (Grid), and how certain it is (VoxelFlag).
 
 Axes are x, y, z in a Cartesian grid and radius, azimuth = atan2(y, x), z in a cylindrical one; points are Cartesian in both.
 """
@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import IntFlag
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, check_choice
 
 Triple = tuple[float, float, float]
 
@@ -81,8 +82,7 @@ class GridSpec:
             "cartesian_fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
             "cylindrical": cls("cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)),
         }
-        if name not in presets:
-            raise ArgumentError("published grid", expected=f"one of {', '.join(presets)}", found=repr(name))
+        check_choice("published grid", name, presets)
         return presets[name]
 
     @classmethod
@@ -307,3 +307,37 @@ def most_frequent(
     order = np.lexsort((pairs, -counts, owners))
     best = order[np.flatnonzero(np.diff(owners[order], prepend=-1))]
     return owners[best], pairs[best] % channels
+
+
+class VoxelFlag(IntFlag):
+    """The bits of the field `<grid>/flags`: uint8 per voxel.
+
+    `(flags & VoxelFlag.INFERRED) != 0` is true for inferred voxels.
+
+    Attributes:
+        INFERRED: no scan saw the voxel; it was completed from what was seen of the same object.
+        CONTESTED: traffic passes through the voxel at other times of the window.
+        SEEN_NOW: the frame's own scan saw the voxel.
+        IN_ACTOR: the voxel is in the body of an actor.
+    """
+
+    INFERRED = 1
+    CONTESTED = 2
+    SEEN_NOW = 4
+    IN_ACTOR = 8
+
+
+def is_confident(occupied: NDArray[np.floating], min_confidence: float) -> NDArray[np.bool_]:
+    """Return which voxels are free or occupied with at least some probability.
+
+    Args:
+        occupied: probability that each voxel is occupied, of any shape. It is compared as float16, as in the file, so that a grid
+            and its file give the same result.
+        min_confidence: least value of max(p, 1 - p); 0 to 0.5 accepts every voxel.
+
+    Returns:
+        bool array of the same shape; False where the probability is NaN.
+    """
+    p = np.asarray(occupied, np.float16)
+    confident: NDArray[np.bool_] = np.maximum(p, 1 - p) >= np.float16(min_confidence)
+    return confident

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable, Color, Remap
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, check_choice
 
 _CARLA: tuple[tuple[str, Color, int], ...] = (  # name, colour, 11-class id; ids in order: docs/format.md#classes
     ("Free", (255, 255, 255), 0),
@@ -270,8 +270,7 @@ def remap_named(name: str) -> Remap:
     Raises:
         ArgumentError: no remap has this name.
     """
-    if name not in REMAPS:
-        raise ArgumentError("remap", expected=f"one of {', '.join(REMAPS)}", found=repr(name))
+    check_choice("remap", name, REMAPS)
     return REMAPS[name]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.core.evidence import VoxelFlag, is_confident
+from carlasc.core.grids import VoxelFlag, is_confident
 from carlasc.core.tables import remap_named
 from carlasc.dataset.transforms import Sample
 from carlasc.errors import ArgumentError, FormatError

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
-from carlasc.dataset.scans import RecentScans
 from carlasc.dataset.selection import (
+    RecentScans,
     SequenceFrames,
     choose_sequences,
     common_frames,
@@ -148,7 +148,9 @@ class Dataset(_MapStyle):
             FormatError: sequences differ in grid, axes or class table, or poses.txt does not fit the scans.
         """
         self.fields = _check_fields(fields)
-        self.history = _check_history(history)
+        if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
+            raise ArgumentError("history", expected="a number of scans of 1 or more", found=repr(history))
+        self.history = int(history)
         self.align = align
         self._grid_fields = GridFields(frozenset(self.fields), inferred, min_confidence)
         self.transform = transform
@@ -175,7 +177,8 @@ class Dataset(_MapStyle):
 
         self.sequences = tuple(part.scans for part in self._parts)
         self.axes: Axes = common_value({scans.location: scans.metadata.axes for scans in self.sequences}, "axes")
-        self._spec = grid if isinstance(grid, GridSpec) else self._spec_of_grids()
+        specs = {part.grids.location: part.grids.grids[part.grid] for part in self._parts if part.grids is not None}
+        self._spec = grid if isinstance(grid, GridSpec) else common_value(specs, "grid geometry") if specs else None
         self._label_map = self._make_label_map(remap)
         self.classes: ClassTable = self._label_map.target
 
@@ -289,10 +292,6 @@ class Dataset(_MapStyle):
             part.check_poses()
         return part
 
-    def _spec_of_grids(self) -> GridSpec | None:
-        specs = {part.grids.location: part.grids.grids[part.grid] for part in self._parts if part.grids is not None}
-        return common_value(specs, "grid geometry") if specs else None
-
     def _make_label_map(self, remap: RemapLike) -> LabelMap:
         tables: dict[str, ClassTable] = {}
         for part in self._parts:
@@ -389,9 +388,3 @@ def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
             "fields", expected=f"at least one of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}", found="none"
         )
     return chosen
-
-
-def _check_history(history: int) -> int:
-    if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
-        raise ArgumentError("history", expected="a number of scans of 1 or more", found=repr(history))
-    return int(history)

@@ -1,21 +1,27 @@
 """The order in which training reads a data set: shards in random order, and frames at random within a window of shards.
 
-Frames that are stored together are read at about the same time, so that files of an object store are fetched once, ahead of their use.
+Frames that are stored together are read at about the same time, so that files of an object store are fetched once, ahead of their use:
+threads fetch those of the next samples into the cache of a remote store, while earlier samples are trained on.
 """
 
 from __future__ import annotations
 
 import math
+import threading
+import time
 import zlib
+from collections import deque
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.dataset.reading_ahead import ReadAhead
 from carlasc.dataset.samples import Dataset
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, CarlascError
+from carlasc.storage.transport.caching import CachedTree
 
 _STORED_TOGETHER = 16  # frames of a file in packed zarr stores
 _READ_AGAIN = 4  # a shard is at least so many times as long as what is read before it for the histories
@@ -93,7 +99,8 @@ class ShardSampler(_Sampler):
         self.dataset = dataset
         self.seed = seed
         self.epoch = 0
-        self.shard = _default_shard(dataset.history) if shard is None else shard
+        before = -(-(dataset.history - 1) // _STORED_TOGETHER) * _STORED_TOGETHER
+        self.shard = max(_STORED_TOGETHER, _READ_AGAIN * before) if shard is None else shard
         self.window = window
         self.rank = rank
         self.world = world
@@ -183,11 +190,6 @@ class ShardSampler(_Sampler):
         return {"samples": len(self._shards), "data": digest, "shard": self.shard, "window": self.window}
 
 
-def _default_shard(history: int) -> int:
-    before = -(-(history - 1) // _STORED_TOGETHER) * _STORED_TOGETHER
-    return max(_STORED_TOGETHER, _READ_AGAIN * before)
-
-
 def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
     """Return the number of each sample's shard; all numbers up to the largest exist."""
     numbers: list[NDArray[np.int64]] = []
@@ -198,3 +200,98 @@ def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
             numbers.append(number.reshape(-1) + first)
             first = int(numbers[-1][-1]) + 1
     return np.concatenate(numbers)
+
+
+_THREADS = 3  # files that are fetched side by side, each in several ranges
+_STOP_S = (
+    5.0  # how long the end of an iteration waits for files being fetched: a server that is lost is asked for minutes
+)
+
+
+class ReadAhead:
+    """Threads that fetch the files of shards, in the order of their first samples, inside a `with` block.
+
+    They start with the first sample that is drawn: a loader forks its workers before that. Data that were opened without a cache need
+    no thread.
+    """
+
+    def __init__(
+        self, dataset: Dataset, order: NDArray[np.int64], shards: NDArray[np.int64], start: int, count: int
+    ) -> None:
+        """Find which shards are needed, and from when.
+
+        Args:
+            dataset: the samples.
+            order: (N,) indices of the samples in the order in which they are drawn.
+            shards: (N,) number of the shard of each sample, by the sample's index.
+            start: the position in `order` that is drawn first.
+            count: number of shards that are fetched before their first sample is drawn.
+        """
+        self._dataset = dataset
+        self._shards = shards
+        self._count = count
+        self._drawn = start
+        self._waiting: deque[tuple[CachedTree, str]] = deque()
+        self._changed = threading.Condition()
+        self._stopped = False
+        self._threads: list[threading.Thread] = []
+        if count and dataset.is_cached:
+            numbers, firsts = np.unique(shards[order], return_index=True)
+            left = np.isin(numbers, shards[order[start:]])
+            by_first = np.argsort(firsts[left], kind="stable")
+            self._next_shards = deque(numbers[left][by_first].tolist())
+            self._firsts = firsts[left][by_first]
+        else:
+            self._next_shards, self._firsts = deque(), np.empty(0, np.int64)
+
+    def draw(self, position: int) -> None:
+        """Say how many samples of the order were drawn."""
+        if not len(self._firsts):
+            return
+        with self._changed:
+            self._drawn = position
+            self._changed.notify_all()
+        if not self._threads:
+            self._threads = [
+                threading.Thread(target=self._run, name="carlasc-read-ahead", daemon=True) for _ in range(_THREADS)
+            ]
+            for thread in self._threads:
+                thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+        end = time.monotonic() + _STOP_S
+        for thread in self._threads:
+            if thread is not threading.current_thread():  # a thread that collects garbage may close an iterator
+                thread.join(max(0.0, end - time.monotonic()))
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopped or self._waiting or self._may_begin_shard())
+                if self._stopped:
+                    return
+                file = self._waiting.popleft() if self._waiting else None
+                shard = self._next_shards.popleft() if file is None else -1
+            with suppress(CarlascError):  # whoever needs the file meets the error again, and reports it
+                if file is not None:
+                    tree, path = file
+                    tree.fetch(path, wait=False)
+                    continue
+                found = self._dataset.cached_files(np.flatnonzero(self._shards == shard).tolist())
+                with self._changed:
+                    self._waiting.extend(found)
+                    self._changed.notify_all()
+
+    def _may_begin_shard(self) -> bool:
+        """Whether the next shard is among the first `count` ones whose samples are not drawn yet."""
+        begun = len(self._firsts) - len(self._next_shards)
+        open_shards = int(np.searchsorted(self._firsts, self._drawn, "right"))
+        return bool(self._next_shards) and begun < open_shards + self._count

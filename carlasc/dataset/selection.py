@@ -1,7 +1,9 @@
-"""The sequences and frames of a Dataset: the sequences of a split, their grids, and the frames that have all fields."""
+"""The sequences and frames of a Dataset: the sequences of a split, their grids, the frames that have all fields, and the scans read last."""
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -259,3 +261,34 @@ def _names(key: _Key) -> set[str]:
     """Return the names of a sequence: "Town01_Light", "Train/Town01_Light", and its path."""
     split, name, path = key
     return {name, f"{split}/{name}", path}
+
+
+class RecentScans(threading.local):
+    """Keeps the last scans that a thread read, decoded: consecutive frames share all scans of their stacks but one.
+
+    The memory of a scan that is dropped is used for the next one, so each thread has scans of its own.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        """Keep at most `capacity` scans."""
+        super().__init__()
+        self.capacity = capacity
+        self._scans: OrderedDict[tuple[Sequence, int], NDArray[np.float32]] = OrderedDict()
+
+    def read(self, sequence: Sequence, frames: list[int | None]) -> list[NDArray[np.float32] | None]:
+        """Return the points of each frame as `Sequence.read_xyz` does, and None for None. They are valid until the next call.
+
+        All scans that are not kept are read in one call.
+        """
+        wanted = [(sequence, frame) for frame in frames if frame is not None]
+        for key in wanted:
+            if key in self._scans:
+                self._scans.move_to_end(key)
+        missing = [key for key in wanted if key not in self._scans]
+        spare = []
+        while self._scans and len(self._scans) + len(missing) > self.capacity:
+            spare.append(self._scans.popitem(last=False)[1])
+        if missing:
+            read = sequence.read_xyz([frame for _, frame in missing], spare)
+            self._scans.update(zip(missing, read, strict=True))
+        return [None if frame is None else self._scans[sequence, frame] for frame in frames]

@@ -81,17 +81,14 @@ class Flip:
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample, flipped or not. The input is not changed."""
-        drawn = self._generator(sample).random(len(_DIRECTIONS)) < self.probability
+        seed: list[int] | None = None
+        if self.seed is not None:
+            seed = [self.seed, self._epoch.value, zlib.crc32(sample["sequence"].encode()), sample["frame"]]
+        drawn = np.random.default_rng(seed).random(len(_DIRECTIONS)) < self.probability
         for direction, flipped in zip(_DIRECTIONS, drawn, strict=True):
             if flipped and direction in self.directions:
                 sample = flip(sample, direction, self.spec)
         return sample
-
-    def _generator(self, sample: Sample) -> np.random.Generator:
-        if self.seed is None:
-            return np.random.default_rng()
-        name = zlib.crc32(sample["sequence"].encode())
-        return np.random.default_rng([self.seed, self._epoch.value, name, sample["frame"]])
 
 
 def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import get_args
 
 from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_choice
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 from carlasc.motion.options import MotionOptions, PoseOptions
 
@@ -62,9 +61,8 @@ class FromScans:
             raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
         if self.window_m is not None and not self.window_m > 0:
             raise ArgumentError("window_m", expected="a positive number of metres", found=str(self.window_m))
-        for name, kind in (("dynamic", Dynamic), ("complete", Complete)):
-            if (value := getattr(self, name)) not in get_args(kind):
-                raise ArgumentError(name, expected=f"one of {', '.join(get_args(kind))}", found=repr(value))
+        check_choice("dynamic", self.dynamic, Dynamic)
+        check_choice("complete", self.complete, Complete)
         for name, options in (("motion", MotionOptions), ("poses", PoseOptions)):
             if not isinstance(value := getattr(self, name), options):
                 raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))

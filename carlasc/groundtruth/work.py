@@ -18,8 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.evidence import is_confident
-from carlasc.core.grids import Grid
+from carlasc.core.grids import Grid, is_confident
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, RunProgress, SequenceInput
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames

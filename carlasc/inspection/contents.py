@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
-from carlasc.core.evidence import VoxelFlag
+from carlasc.core.grids import VoxelFlag
 from carlasc.errors import CarlascError
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.storage import layout

@@ -25,7 +25,7 @@ from carlasc.core.benchmarks import (
 )
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError, check_choice
 from carlasc.metrics.confusion import ConfusionMatrix
 
 _LEFT_OUT, _UNKNOWN = 254, 255  # values in the look-up tables; the scored ids are smaller
@@ -220,8 +220,7 @@ def convention_named(name: str) -> Convention:
     Raises:
         ArgumentError: no convention has that name.
     """
-    if name not in CONVENTIONS:
-        raise ArgumentError("convention", expected=f"one of {', '.join(CONVENTIONS)}", found=repr(name))
+    check_choice("convention", name, CONVENTIONS)
     return CONVENTIONS[name]
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_choice
 
 PoseSource = Literal["auto", "file", "kiss-icp"]
 MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
@@ -28,8 +28,7 @@ class PoseOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        if self.source not in get_args(PoseSource):
-            raise ArgumentError("poses", expected=f"one of {', '.join(get_args(PoseSource))}", found=repr(self.source))
+        check_choice("poses", self.source, PoseSource)
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,6 @@ class MotionOptions:
     min_speed_m_s: float = 0.3
 
     def __post_init__(self) -> None:
-        if self.source not in get_args(MotionSource):
-            raise ArgumentError(
-                "motion", expected=f"one of {', '.join(get_args(MotionSource))}", found=repr(self.source)
-            )
+        check_choice("motion", self.source, MotionSource)
         if not self.min_speed_m_s > 0:
             raise ArgumentError("min_speed_m_s", expected="a positive number", found=str(self.min_speed_m_s))

@@ -13,10 +13,9 @@ from functools import partial
 from typing import Any
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra
-from carlasc.running.clients import one_line_if_lost
+from carlasc.running.clients import Versions, one_line_if_lost
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
 from carlasc.running.spreading import DaskClient, LazyClient, Run
-from carlasc.running.workers import Versions
 
 _CONNECT_S = "10s"  # Dask's setting carlasc.connect-timeout replaces it
 _WORKERS_S = "10m"  # the same of carlasc.workers-timeout
@@ -200,24 +199,15 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
                     problem=f"no worker came within {workers_s:g} s",
                     advice="look at its jobs or workers, or wait longer: DASK_CARLASC__WORKERS_TIMEOUT=1h",
                 ) from error
-            _check_versions(client)
+            ours = Versions.here()  # workers that come later are checked before their first task
+            for worker, found in client.run(Versions.here, on_error="return").items():
+                if not isinstance(found, Versions):
+                    raise CarlascError(f"worker {worker}", expected=f"carlasc {ours.carlasc}", found=f"none ({found})")
+                ours.check(found, worker)
         yield client
     finally:
         with suppress(TimeoutError):  # a scheduler that is gone does not answer
             client.close(timeout=1)
-
-
-def _check_versions(client: Any) -> None:
-    """Check the versions of all workers that are there now; those that come later are checked before their first task.
-
-    Raises:
-        CarlascError: a worker has other versions, or no carlasc.
-    """
-    ours = Versions.here()
-    for worker, found in client.run(Versions.here, on_error="return").items():
-        if not isinstance(found, Versions):
-            raise CarlascError(f"worker {worker}", expected=f"carlasc {ours.carlasc}", found=f"none ({found})")
-        ours.check(found, worker)
 
 
 @contextmanager

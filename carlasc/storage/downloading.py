@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeGuard
 
-from carlasc.errors import ArgumentError, ConflictError, FormatError
+from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice
 from carlasc.storage.durability import make_folder, remove_file
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.files import parse_json, remove_stale, write_json, writing
@@ -79,8 +79,7 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
         ArgumentError: `splits` or `what` is unknown, or a split is given for grids.
     """
     kinds = tuple(dict.fromkeys(archive.what for archive in ARCHIVES))
-    if what not in kinds:
-        raise ArgumentError("what", expected=f"one of {', '.join(kinds)}", found=repr(what))
+    check_choice("what", what, kinds)
     known = tuple(dict.fromkeys(archive.split for archive in ARCHIVES if archive.split))
     wanted = {split.lower() for split in splits}
     if unknown := wanted - {*known, "all"}:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from carlasc.core.choices import PaletteName as PaletteName  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Color
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
-from carlasc.errors import ArgumentError
+from carlasc.errors import check_choice
 from carlasc.metrics.grids import VoxelOutcome
 
 PALETTES: tuple[str, ...] = get_args(PaletteName)
@@ -99,8 +99,7 @@ class ClassColors:
     palette: PaletteName = "class"
 
     def __post_init__(self) -> None:
-        if self.palette not in PALETTES:
-            raise ArgumentError("palette", expected=f"one of {', '.join(PALETTES)}", found=repr(self.palette))
+        check_choice("palette", self.palette, PALETTES)
 
     @property
     def by_id(self) -> NDArray[np.uint8]:

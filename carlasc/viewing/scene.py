@@ -20,7 +20,7 @@ from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
@@ -79,11 +79,10 @@ class Scene:
         FrameRange.of(self.frames)
         if self.every < 1:
             raise ArgumentError("every", expected="1 or more", found=str(self.every))
-        if self.palette not in PALETTES:
-            raise ArgumentError("palette", expected=f"one of {', '.join(PALETTES)}", found=repr(self.palette))
+        check_choice("palette", self.palette, PALETTES)
         for name, table in (("classes", self.classes), ("source_classes", self.source_classes)):
-            if isinstance(table, str) and table not in TABLES:
-                raise ArgumentError(name, expected=f"one of {', '.join(TABLES)}", found=repr(table))
+            if isinstance(table, str):
+                check_choice(name, table, TABLES)
 
     def open(self, what: str | Iterable[str] | None = None) -> SceneReader:
         """Find the sequence, the grids, the frames and a common class table.

@@ -15,11 +15,9 @@ import numpy as np
 from carlasc.captures import Lidar, TownActor, TownDrive
 from carlasc.captures.town import furniture
 from carlasc.captures.town.actors import EGO_ID, STRIDE_M
-from carlasc.captures.town.blocks import GROUND, PAINT_M, ROAD, ROAD_LINE, SIDEWALK, TERRAIN
 from carlasc.captures.town.buildings import add_building
 from carlasc.captures.town.meshes import Mesh
-from carlasc.captures.town.plan import KERB_M, Rectangle, TownPlan
-from carlasc.captures.town.plants import PlantCatalogue
+from carlasc.captures.town.plan import KERB_M, PlantCatalogue, Rectangle, TownPlan
 from carlasc.captures.town.shapes import (
     EGO_KIND,
     GAIT_PHASES,
@@ -29,6 +27,7 @@ from carlasc.captures.town.shapes import (
     pedestrian_mesh,
     vehicle_mesh,
 )
+from carlasc.captures.town.town import GROUND, PAINT_M, ROAD, ROAD_LINE, SIDEWALK, TERRAIN
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 

@@ -15,7 +15,7 @@ from helpers.servers.range_server import serve_folder
 
 import carlasc
 from carlasc.core.grids import GridSpec
-from carlasc.dataset import Dataset, ShardSampler, reading_ahead
+from carlasc.dataset import Dataset, ShardSampler, sampling
 from carlasc.storage.packing import pack
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
@@ -168,7 +168,7 @@ def test_workers_may_be_forked_while_files_are_fetched(served, truth, tmp_path):
 
 
 def test_a_server_that_is_lost_does_not_hold_up_the_end(served, tmp_path, monkeypatch):
-    monkeypatch.setattr(reading_ahead, "_STOP_S", 0.1)
+    monkeypatch.setattr(sampling, "_STOP_S", 0.1)
     dataset = dataset_at(served, tmp_path)
     drawing = iter(ShardSampler(dataset, **SHAPE))
     lost, back = threading.Event(), threading.Event()

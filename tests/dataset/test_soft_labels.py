@@ -6,7 +6,7 @@ from helpers.datasets.drives import write_drive
 
 import carlasc
 from carlasc import Dataset, GridSpec
-from carlasc.core.evidence import VoxelFlag
+from carlasc.core.grids import VoxelFlag
 from carlasc.core.tables import CARLA, REMAPS
 from carlasc.dataset import EVIDENCE_FIELDS
 from carlasc.dataset.transforms import flip

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from carlasc import FromScans, GridSpec, Voting
-from carlasc.core.evidence import VoxelFlag
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import translation
+from carlasc.core.grids import VoxelFlag
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame

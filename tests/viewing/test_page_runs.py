@@ -10,8 +10,7 @@ from helpers.readers.page_arrays import unpack_arrays
 from helpers.readers.pixels import BLUE, RED
 from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
 
-from carlasc.core.evidence import VoxelFlag
-from carlasc.core.grids import GridSpec
+from carlasc.core.grids import GridSpec, VoxelFlag
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import open as open_source
 from carlasc.viewing import Scene, view

@@ -13,9 +13,9 @@ import numpy as np
 from carlasc.captures.carla.sensors import ActorNumbers, SensorRig
 from carlasc.captures.carla.server import Server, ServerOptions
 from carlasc.captures.raw import Capture, SensorRecording
-from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, check_traffic, sensor_offsets
+from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, sensor_offsets
 from carlasc.captures.writing import CaptureWriter, TimesLog
-from carlasc.errors import ConflictError, MissingDataError, import_extra
+from carlasc.errors import ConflictError, MissingDataError, check_choice, import_extra
 
 SETTINGS_FILE = "recording.json"
 _REPLAY_TOLERANCE_M = 0.02  # greatest distance of the ego sensor in a replay from where it was recorded
@@ -104,7 +104,7 @@ def record(
     """
     check_at_least(1, count=count, sensors=sensors)
     check_at_least(0, seed=seed)
-    check_traffic(traffic)
+    check_choice("traffic", traffic, TrafficLevel)
     if bev:
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0

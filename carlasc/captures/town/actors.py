@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.settings import TRAFFIC, TrafficLevel, check_traffic
+from carlasc.captures.settings import TRAFFIC, TrafficLevel
 from carlasc.captures.town.meshes import Mesh, close_loop
 from carlasc.captures.town.plan import KERB_M
 from carlasc.captures.town.shapes import (
@@ -26,6 +26,7 @@ from carlasc.captures.town.streets import HALF_ROAD_M, CityBlock
 from carlasc.captures.town.town import Town
 from carlasc.captures.town.traffic import Traffic, place_vehicles
 from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.errors import check_choice
 from carlasc.storage.layout import FRAME_PERIOD_S
 
 _OFFSETS_M = (1.1, 1.75, 2.3)
@@ -125,7 +126,7 @@ class Population:
         Raises:
             ArgumentError: the level of traffic is unknown.
         """
-        check_traffic(traffic)
+        check_choice("traffic", traffic, TrafficLevel)
         count = TRAFFIC[traffic]
         self._shapes, lengths = _draw_vehicles(rng, count)
         lane, along = _draw_ego_start(rng, town)
@@ -158,19 +159,13 @@ class Population:
         return actors
 
     def _pedestrians(self, frame: int) -> list[TownActor]:
-        elapsed_s = frame * FRAME_PERIOD_S
-        first = EGO_ID + len(self._shapes)
-        return [
-            _pedestrian(first + index, walk, elapsed_s, float(height))
-            for index, (walk, height) in enumerate(zip(self._walks, self._heights, strict=True))
-        ]
-
-
-def _pedestrian(id: int, walk: Walk, elapsed_s: float, height_m: float) -> TownActor:
-    pose = walk.pose(elapsed_s, KERB_M)
-    cycle = (walk.start_m + abs(walk.speed_mps) * elapsed_s) / STRIDE_M
-    phase = int(cycle * GAIT_PHASES) % GAIT_PHASES if walk.speed_mps else -1
-    return TownActor(id, pose, abs(walk.speed_mps) * pose[:3, 0], pedestrian_mesh(round(height_m, 1), phase))
+        elapsed_s, actors = frame * FRAME_PERIOD_S, []
+        for id, (walk, height) in enumerate(zip(self._walks, self._heights, strict=True), EGO_ID + len(self._shapes)):
+            pose, speed = walk.pose(elapsed_s, KERB_M), abs(walk.speed_mps)
+            cycle = (walk.start_m + speed * elapsed_s) / STRIDE_M
+            phase = int(cycle * GAIT_PHASES) % GAIT_PHASES if speed else -1
+            actors.append(TownActor(id, pose, speed * pose[:3, 0], pedestrian_mesh(round(float(height), 1), phase)))
+        return actors
 
 
 def _draw_vehicles(rng: np.random.Generator, count: int) -> tuple[list[Mesh], list[float]]:

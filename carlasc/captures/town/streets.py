@@ -288,7 +288,8 @@ def _make_lanes(
             offset = LANE_WIDTH_M / 2 * right_of(direction)
             first = nodes[start] + stop_distances[start, end] * direction + offset
             last = nodes[end] - stop_distances[end, start] * direction + offset
-            lanes.append(Lane(_straight(first, last), start, end, turn=False))
+            count = max(2, int(np.ceil(np.linalg.norm(last - first) / PATH_STEP_M)) + 1)
+            lanes.append(Lane(first + np.linspace(0, 1, count)[:, None] * (last - first), start, end, turn=False))
     streets = list(lanes)
     for index, lane in enumerate(streets):
         exits = []
@@ -298,11 +299,6 @@ def _make_lanes(
                 lanes.append(Lane(_curve(lane.path, other.path), lane.end, lane.end, turn=True, exits=(follow,)))
         lanes[index] = Lane(lane.path, lane.start, lane.end, turn=False, exits=tuple(exits))
     return tuple(lanes)
-
-
-def _straight(first: Points, last: Points) -> Points:
-    count = max(2, int(np.ceil(np.linalg.norm(last - first) / PATH_STEP_M)) + 1)
-    return first + np.linspace(0, 1, count)[:, None] * (last - first)
 
 
 def _curve(before: Points, after: Points) -> Points:

@@ -1,20 +1,266 @@
-"""The static town: streets, blocks, and the land around it with guard rails, a railway, woods, some walls and large buildings."""
+"""The static town: its surfaces, its blocks (downtown buildings, houses with gardens, a park or a square), and the land around it.
+
+Around the town are guard rails, a railway, woods, some walls and large buildings.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.captures.town import furniture
-from carlasc.captures.town.blocks import BLOCK_USES, TERRAIN, fill_block, lay_sidewalk, paint_markings, pave_roads
 from carlasc.captures.town.buildings import add_building
-from carlasc.captures.town.furniture import add_footbridge, add_street_furniture, add_traffic_signals
+from carlasc.captures.town.furniture import add_footbridge, add_street_furniture, add_traffic_signals, mark_parking_bay
 from carlasc.captures.town.meshes import Mesh, at_height, close_loop
-from carlasc.captures.town.plan import INNER_M, KERB_M, Land, Rectangle, TownPlan
-from carlasc.captures.town.plants import PlantCatalogue
-from carlasc.captures.town.streets import CityBlock, Streets, draw_streets
-from carlasc.core.geometry import Transform
+from carlasc.captures.town.plan import INNER_M, KERB_M, PAINT_M, Land, PlantCatalogue, Rectangle, TownPlan, hedge
+from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, CityBlock, Side, Streets, draw_streets
+from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.core.tables import CARLA
+
+ROAD, ROAD_LINE, SIDEWALK = (CARLA.id_of(name) for name in ("Road", "RoadLine", "Sidewalk"))
+GROUND, TERRAIN, WATER = (CARLA.id_of(name) for name in ("Ground", "Terrain", "Water"))
+
+
+def pave_roads(plan: TownPlan, streets: Streets) -> None:
+    """Add one level road surface below the whole town. The blocks lie on it."""
+    low, high = streets.nodes.min(axis=0) - 8, streets.nodes.max(axis=0) + 8
+    tile = 12.0  # metres: small triangles make rays exact and the search tree efficient
+    xs, ys = np.arange(low[0], high[0] + tile, tile), np.arange(low[1], high[1] + tile, tile)
+    for x, following in pairwise(xs):
+        plan.builder.ribbon(
+            ROAD, *(at_height(np.column_stack([np.full(len(ys), at), ys]), 0.0) for at in (x, following))
+        )
+
+
+def paint_markings(plan: TownPlan, streets: Streets) -> None:
+    """Add centre lines, edge lines, stop lines and crosswalks."""
+    for block in streets.blocks:
+        for side in block.sides:
+            if -np.pi / 2 < side.yaw_rad <= np.pi / 2:  # only one of a street's two sides adds the centre line
+                if plan.rng.random() < 0.4:
+                    for offset in (-0.12, 0.12):
+                        _paint_line(plan, side, offset, 0.0, side.length_m, dashed=False)
+                else:
+                    _paint_line(plan, side, 0.0, 0.0, side.length_m, dashed=True)
+            _paint_line(plan, side, HALF_ROAD_M - 0.25, 0.0, side.length_m, dashed=side.has_bay)
+            zebra = np.arange(0.4, HALF_ROAD_M, 0.9)
+            bars = np.array([side.point(-2.0 - 0.5, offset) for offset in zebra])
+            plan.builder.level_rectangles(ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad)
+            bars = np.array([side.point(side.length_m + 2.0 + 0.5, offset) for offset in zebra])
+            plan.builder.level_rectangles(ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad)
+            stop = side.point(side.length_m + 0.25, HALF_ROAD_M / 2)
+            plan.builder.level_rectangles(ROAD_LINE, (*stop, PAINT_M), (0.4, HALF_ROAD_M - 0.3), side.yaw_rad)
+
+
+def _paint_line(plan: TownPlan, side: Side, offset: float, start: float, end: float, dashed: bool) -> None:
+    length, gap = (3.0, 4.5) if dashed else (6.0, 0.0)
+    starts = np.arange(start, end - 0.5, length + gap)
+    lengths = np.minimum(length, end - starts)
+    middles = np.array([side.point(at + run / 2, offset) for at, run in zip(starts, lengths, strict=True)])
+    sizes = np.column_stack([lengths, np.full(len(starts), 0.15)])
+    plan.builder.level_rectangles(ROAD_LINE, at_height(middles, PAINT_M), sizes, side.yaw_rad)
+
+
+def lay_sidewalk(plan: TownPlan, block: CityBlock) -> NDArray[np.float64]:
+    """Add the kerb and sidewalk around a block. Return the (K, 2) loop behind the sidewalk."""
+    kerb, inner = close_loop(block.outline.at(HALF_ROAD_M)), block.outline.at(INNER_M)
+    plan.builder.ribbon(SIDEWALK, at_height(kerb, -0.05), at_height(kerb, KERB_M))
+    plan.builder.ribbon(SIDEWALK, at_height(kerb, KERB_M), at_height(close_loop(inner), KERB_M))
+    return inner
+
+
+def lay_ground(plan: TownPlan, loop: NDArray[np.float64], label: int) -> None:
+    """Add the land inside a loop as rings towards its middle. Terrain is slightly uneven.
+
+    Args:
+        plan: the town's plan.
+        loop: (K, 2) boundary, metres.
+        label: class id of the land.
+    """
+    centre, rings = loop.mean(axis=0), 10
+    relief = 0.35 if label == TERRAIN else 0.0
+    phase = plan.rng.uniform(0, 2 * np.pi, 4)
+    previous = at_height(close_loop(loop), KERB_M)
+    for ring in range(1, rings + 1):
+        points = close_loop(centre + (loop - centre) * (1 - ring / rings))
+        x, y = points[:, 0] / 7.0, points[:, 1] / 9.0
+        waves = np.sin(x + phase[0]) * np.sin(y + phase[1]) + 0.4 * np.sin(2.3 * x + phase[2]) * np.sin(
+            1.9 * y + phase[3]
+        )
+        height = KERB_M + relief * float(np.clip((ring - 2) / 4, 0, 1)) * (0.5 + 0.5 * waves)
+        current = at_height(points, height)
+        plan.builder.ribbon(label, previous, current)
+        previous = current
+
+
+BLOCK_USES = ("downtown", "houses", "houses", "park", "square")
+"""Uses of a block. Houses are listed twice, so they are twice as frequent."""
+
+
+def fill_block(plan: TownPlan, block: CityBlock, use: str) -> None:
+    """Add the sidewalk and land of a block, and what belongs to its use, one of BLOCK_USES."""
+    inner = lay_sidewalk(plan, block)
+    land = Land(inner)
+    lay_ground(plan, inner, {"downtown": GROUND, "square": GROUND}.get(use, TERRAIN))
+    if use == "park":
+        _add_park(plan, block, land)
+    elif use == "square":
+        _add_square(plan, block, land)
+    else:
+        for side in block.sides:
+            _add_row_of_buildings(plan, side, land, downtown=use == "downtown")
+        _add_yard(plan, block, land, attempts=60 if use == "houses" else 25)
+    for side in block.sides:
+        add_street_furniture(plan, side, trees=use != "square")
+        mark_parking_bay(plan, side)
+
+
+def _add_row_of_buildings(plan: TownPlan, side: Side, land: Land, downtown: bool) -> None:
+    """Add buildings along a street: without gaps downtown, with front gardens elsewhere."""
+    rng, along = plan.rng, -6.0
+    while along < side.length_m + 6:
+        width = float(rng.uniform(12, 22) if downtown else rng.uniform(8, 13))
+        depth = float(rng.uniform(10, 15) if downtown else rng.uniform(8, 11))
+        back = float(rng.uniform(0.9, 1.6) if downtown else rng.uniform(3.0, 6.5))
+        bay = side.kerb_offset(min(max(along + width / 2, 0), side.length_m)) - HALF_ROAD_M
+        middle = side.point(along + width / 2, INNER_M + max(bay, BAY_M * side.has_bay) + back + depth / 2)
+        footprint = Rectangle(middle, (width, depth), side.yaw_rad)
+        if land.reserve(footprint, margin_m=0.0 if downtown else 2.0, edge_m=0.6):
+            height = float(rng.uniform(8, 24) if downtown else rng.uniform(3.2, 7.0))
+            add_building(plan, footprint, height, pitched=not downtown)
+            if not downtown:
+                _add_front_garden(plan, side, land, along, width, back)
+            along += width + float(rng.uniform(0.0, 0.4) if downtown else rng.uniform(3.0, 7.0))
+            if downtown and rng.random() < 0.2:
+                along += float(rng.uniform(4, 8))  # an alley between two buildings
+        else:
+            along += 2.0
+
+
+def _add_front_garden(plan: TownPlan, side: Side, land: Land, along: float, width: float, back: float) -> None:
+    """Add a fence, wall or hedge along the sidewalk, a driveway beside the house, and up to two bushes."""
+    rng = plan.rng
+    bay = BAY_M * side.has_bay
+    edge = side.point(along + width / 2, INNER_M + bay + 0.4)
+    piece = Rectangle(edge, (width, 0.5), side.yaw_rad)
+    style = rng.random()
+    if style < 0.8 and land.reserve(piece, 0.0):
+        if style < 0.35:
+            plan.add(furniture.fence(width, float(rng.uniform(1.0, 1.5))), edge, side.yaw_rad)
+        elif style < 0.55:
+            plan.add(furniture.wall(width, float(rng.uniform(0.7, 1.3))), edge, side.yaw_rad)
+        else:
+            plan.add(hedge(rng, width), edge, side.yaw_rad)
+    drive = side.point(along + width + 1.8, INNER_M + bay + 3.2)
+    if land.reserve(Rectangle(drive, (2.6, 5.6), side.yaw_rad), 0.2):
+        plan.builder.boxes(GROUND, (*drive, KERB_M - 0.3), (2.8, 6.2, 0.33), side.yaw_rad)
+        pose = translation((*drive, KERB_M + 0.03)) @ rotation_z(side.yaw_rad + np.pi / 2 * float(rng.choice([-1, 1])))
+        plan.parking.append(pose)
+    for _ in range(2):
+        position = side.point(
+            along + float(rng.uniform(0, width)), INNER_M + bay + float(rng.uniform(1.2, max(back - 0.5, 1.5)))
+        )
+        if land.reserve(Rectangle(position, (1.2, 1.2), 0.0), 0.0):
+            plan.add(plan.plants.bush(), position, 0.0)
+
+
+def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> None:
+    """Add trees, fences, walls, bushes and trash behind the buildings, each where the land is free."""
+    rng = plan.rng
+    span = np.ptp(land.boundary, axis=0)
+    low = land.boundary.min(axis=0)
+    for _ in range(attempts):
+        position = low + rng.uniform(0, 1, 2) * span
+        number = rng.random()
+        if number < 0.55:
+            if land.reserve(Rectangle(position, (2.4, 2.4), 0.0), 0.5, 1.5):
+                plan.add(plan.plants.tree(), position, 0.0)
+        elif number < 0.75:
+            yaw = block.sides[int(rng.integers(len(block.sides)))].yaw_rad
+            length = float(rng.uniform(6, 12))
+            if land.reserve(Rectangle(position, (length, 0.4), yaw), 0.2, 0.5):
+                plan.add(
+                    furniture.fence(length, 1.7) if rng.random() < 0.6 else furniture.wall(length, 1.9), position, yaw
+                )
+        elif number < 0.9:
+            if land.reserve(Rectangle(position, (1.4, 1.4), 0.0), 0.1, 0.5):
+                plan.add(plan.plants.bush(), position, 0.0)
+        elif land.reserve(Rectangle(position, (1.6, 1.6), 0.0), 0.1, 0.5):
+            plan.add(furniture.trash(rng), position, 0.0)
+
+
+def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
+    """Add a lawn with a pond, benches, bins and many trees, a low wall along one street and a fence along another."""
+    rng, centre = plan.rng, land.boundary.mean(axis=0)
+    radius = float(rng.uniform(5, 8))
+    land.occupied.append(Rectangle(centre, (2 * radius + 2, 2 * radius + 2), 0.0))
+    angles = np.linspace(0, 2 * np.pi, 25)
+    rim = centre + radius * (1 + 0.15 * np.sin(3 * angles + 1))[:, None] * np.column_stack(
+        [np.cos(angles), np.sin(angles)]
+    )
+    plan.builder.ribbon(WATER, at_height(rim, KERB_M + 0.42), at_height(np.tile(centre, (25, 1)), KERB_M + 0.42))
+    plan.builder.ribbon(GROUND, at_height(centre + (rim - centre) * 1.12, KERB_M - 0.2), at_height(rim, KERB_M + 0.45))
+    for index, side in enumerate(block.sides[:2]):
+        at = side.point(side.length_m / 2, INNER_M + BAY_M * side.has_bay + 0.5)
+        length = side.length_m * 0.7
+        if land.reserve(Rectangle(at, (length, 0.5), side.yaw_rad), 0.0):
+            plan.add(furniture.wall(length, 0.8) if index else furniture.fence(length, 1.2), at, side.yaw_rad)
+    low, span = land.boundary.min(axis=0), np.ptp(land.boundary, axis=0)
+    for _ in range(150):
+        position, number = low + rng.uniform(0, 1, 2) * span, rng.random()
+        size = 2.6 if number < 0.5 else 1.4
+        if not land.reserve(Rectangle(position, (size, size), 0.0), 0.4, 0.8):
+            continue
+        if number < 0.5:
+            plan.add(plan.plants.tree(), position, 0.0)
+        elif number < 0.8:
+            plan.add(plan.plants.bush(), position, 0.0)
+        else:
+            plan.add(
+                furniture.bench() if rng.random() < 0.7 else furniture.litter_bin(),
+                position,
+                rng.uniform(0, 6),
+                KERB_M + 0.2,
+            )
+
+
+def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
+    """Add a paved square: parking spaces, kiosks, planters, bollards along its edge, and one large building."""
+    rng, centre = plan.rng, land.boundary.mean(axis=0)
+    side = block.sides[int(rng.integers(len(block.sides)))]
+    footprint = Rectangle(centre + side.normal * 6, (float(rng.uniform(18, 26)), 13.0), side.yaw_rad)
+    if land.reserve(footprint, edge_m=3.0):
+        add_building(plan, footprint, float(rng.uniform(7, 14)), pitched=False)
+    for edge in block.sides:
+        offset = INNER_M + BAY_M * edge.has_bay
+        for at in np.arange(2.0, edge.length_m, 3.0):
+            position = edge.point(at, offset + 0.3)
+            if land.reserve(Rectangle(position, (0.25, 0.25), 0.0), 0.0):
+                plan.add(furniture.bollard(), position, 0.0)
+        for at in np.arange(4.0, edge.length_m - 3, 2.8):
+            position = edge.point(at, offset + 6.5)
+            if land.reserve(Rectangle(position, (2.2, 5.4), edge.yaw_rad), 0.2, 0.5):
+                turn = np.pi / 2 * float(rng.choice([-1, 1]))
+                pose = translation((*position, KERB_M)) @ rotation_z(edge.yaw_rad + turn)
+                plan.parking.append(pose)
+                line = edge.point(at + 1.4, offset + 6.5)
+                plan.builder.level_rectangles(ROAD_LINE, (*line, KERB_M + PAINT_M), (0.12, 4.8), edge.yaw_rad)
+    low, span = land.boundary.min(axis=0), np.ptp(land.boundary, axis=0)
+    makers: tuple[Callable[[], Mesh], ...] = (
+        furniture.kiosk,
+        lambda: furniture.planter(rng),
+        plan.plants.street_tree,
+        furniture.bench,
+        lambda: furniture.trash(rng),
+    )
+    for index in range(60):
+        position = low + rng.uniform(0, 1, 2) * span
+        if land.reserve(Rectangle(position, (3.2, 3.2), 0.0), 0.3, 1.0):
+            plan.add(makers[index % len(makers)](), position, float(rng.uniform(0, 6)))
 
 
 @dataclass(frozen=True)
@@ -40,20 +286,14 @@ def build_town(rng: np.random.Generator) -> Town:
     plan = TownPlan(rng, PlantCatalogue(rng))
     pave_roads(plan, streets)
     paint_markings(plan, streets)
-    uses = _draw_block_uses(rng, len(streets.blocks) - 1)
-    for block, use in zip(streets.blocks, uses, strict=False):
-        fill_block(plan, block, use)
+    extra = rng.integers(len(BLOCK_USES), size=max(len(streets.blocks) - 1 - len(BLOCK_USES), 0))
+    uses = [*BLOCK_USES, *(BLOCK_USES[int(i)] for i in extra)]  # every use occurs at least once
+    for block, use in zip(streets.blocks[:-1], rng.permutation(len(uses)), strict=False):
+        fill_block(plan, block, uses[int(use)])
     fill_outskirts(plan, streets.blocks[-1])
     add_traffic_signals(plan, streets)
     add_footbridge(plan, streets)
     return Town(streets, plan.builder.build(), tuple(plan.buildings), tuple(plan.parking))
-
-
-def _draw_block_uses(rng: np.random.Generator, count: int) -> list[str]:
-    """Draw the use of each block. Every use occurs at least once."""
-    extra = rng.integers(len(BLOCK_USES), size=max(count - len(BLOCK_USES), 0))
-    uses = [*BLOCK_USES, *(BLOCK_USES[int(i)] for i in extra)]
-    return [uses[int(i)] for i in rng.permutation(len(uses))][:count]
 
 
 OUTSKIRTS_M = 90.0  # width of the land around the town

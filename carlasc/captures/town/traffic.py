@@ -159,7 +159,7 @@ class Traffic:
             if distance < 10.0 + vehicle.speed_mps**2 / (2 * BRAKING):
                 self._crossings[node].waiting.setdefault(lane, step)
                 requests.setdefault(node, []).append((lane, index))
-        ego_lane = self._lane_of_ego(queues)
+        ego_lane = next((lane for lane, queue in queues.items() if 0 in queue), -1)
         for node in sorted(requests):
             self._grant(self._crossings[node], requests[node], ego_lane, queues)
 
@@ -187,9 +187,6 @@ class Traffic:
             crossing.waiting.pop(lane)
             vehicle.granted = vehicle.leg + 2
             self._exit_claims.setdefault(vehicle.route[vehicle.granted], []).append(index)
-
-    def _lane_of_ego(self, queues: Queues) -> int:
-        return next((lane for lane, queue in queues.items() if 0 in queue), -1)
 
     def _has_room_beyond(self, index: int, queues: Queues) -> bool:
         """Whether the lane beyond the crossing has room for the vehicle, and for those on the crossing that will enter it."""

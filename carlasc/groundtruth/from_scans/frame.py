@@ -10,9 +10,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.evidence import VoxelFlag
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
 from carlasc.groundtruth.inputs import GridPlan

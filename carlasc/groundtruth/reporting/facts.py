@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.evidence import VoxelFlag
 from carlasc.core.geometry import Transform, invert, thin, transform_points
-from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.storage import layout
 
 _MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured

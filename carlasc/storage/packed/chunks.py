@@ -21,9 +21,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import CarlascError, FormatError, describe, import_extra
+from carlasc.errors import CarlascError, FormatError, describe, import_extra, postponed_interrupts
 from carlasc.running import count_cores
-from carlasc.running.interrupts import postponed_interrupts
 from carlasc.storage.arrays import check_size
 from carlasc.storage.transport.trees import Tree
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from carlasc.errors import CarlascError, FormatError, MissingDataError, without_credentials
-from carlasc.running.interrupts import postponed_interrupts
+from carlasc.errors import CarlascError, FormatError, MissingDataError, postponed_interrupts, without_credentials
 from carlasc.storage.durability import remove_file, rename, sync_file
 from carlasc.storage.files import parse_json, storage_error, write_json, writing
 from carlasc.storage.transport.failures import WrongAnswerError, describe_failure, fail, is_temporary

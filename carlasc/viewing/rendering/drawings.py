@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
-from carlasc.core.evidence import VoxelFlag
-from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.scans import Scan
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
 from carlasc.metrics.grids import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
@@ -244,8 +243,7 @@ def check_color(color: GridColor, reader: SceneReader) -> None:
         ArgumentError: an unknown colour, or no grid is shown.
         MissingDataError: a frame lacks the field.
     """
-    if color not in GRID_COLORS:
-        raise ArgumentError("color", expected=f"one of {', '.join(GRID_COLORS)}", found=repr(color))
+    check_choice("color", color, GRID_COLORS)
     if color == "class":
         return
     if "grid" not in reader.contents:

@@ -14,7 +14,7 @@ from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_choice
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ClassColors, Entry, PaletteName, merge_legends
 from carlasc.viewing.rendering.cameras import VIEWS, View, Viewpoint, birdseye_camera, perspective_camera
@@ -84,8 +84,7 @@ def draw_panels(
     if axes not in get_args(Axes):
         raise ArgumentError("axes", expected=" or ".join(get_args(Axes)), found=repr(axes))
     for panel in panels:
-        if panel.view not in VIEWS:
-            raise ArgumentError("view", expected=f"one of {', '.join(VIEWS)}", found=repr(panel.view))
+        check_choice("view", panel.view, VIEWS)
     entries = (
         (merge_legends([p.drawing.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
     )

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from helpers.readers.pixels import BLUE, RED, grid_with
 
-from carlasc.core.evidence import VoxelFlag
 from carlasc.core.geometry import rotation_z, translation
-from carlasc.core.grids import GridSpec
+from carlasc.core.grids import GridSpec, VoxelFlag
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folder import FolderSink

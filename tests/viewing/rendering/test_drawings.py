@@ -3,8 +3,7 @@ import pytest
 from helpers.readers.pictures import Image
 from helpers.readers.pixels import grid_with, has_color, middle_of
 
-from carlasc.core.evidence import VoxelFlag
-from carlasc.core.grids import GridSpec
+from carlasc.core.grids import GridSpec, VoxelFlag
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
