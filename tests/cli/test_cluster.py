@@ -172,6 +172,7 @@ def test_jobs_of_slurm(capture, tmp_path):
     assert all("#SBATCH --cpus-per-task=1" in script.read_text() for script in fake.glob("job-*.sh"))
 
 
+@pytest.mark.slow
 def test_wrong_clusters_are_one_line(capture, tmp_path):
     root, _ = capture
     command = ("regrid", root, "-o", tmp_path, "--preset", "coarse", "--cluster")

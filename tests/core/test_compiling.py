@@ -66,6 +66,7 @@ def test_a_machine_compiles_once_for_all_environments(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("[ab]/__pycache__"))
 
 
+@pytest.mark.slow
 def test_a_change_of_a_file_whose_functions_are_compiled_in_compiles_again(tmp_path: Path) -> None:
     assert run(tmp_path / "a", tmp_path)[-1] == "7"
     assert run(tmp_path / "a", tmp_path, factor=5) == ["compiled outer", "compiled inner", "16"]
@@ -80,12 +81,14 @@ def test_where_the_folder_of_the_user_cannot_be_written_to_code_is_kept_beside_t
     assert run(tmp_path / "a", home) == ["7"]
 
 
+@pytest.mark.slow
 def test_a_file_in_the_place_of_the_folder_does_not_stop_the_program(tmp_path: Path) -> None:
     (tmp_path / ".cache").write_text("")
     assert run(tmp_path / "a", tmp_path)[-1] == "7"
     assert run(tmp_path / "a", tmp_path) == ["7"]
 
 
+@pytest.mark.slow
 def test_what_old_versions_compiled_is_removed(tmp_path: Path) -> None:
     run(tmp_path / "a", tmp_path)
     kept = sorted(tmp_path.glob(".cache/carlasc/*/outer/*"))
@@ -104,6 +107,7 @@ def test_checked_loops_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     assert compiling.cache_folder() != plain
 
 
+@pytest.mark.slow
 def test_processes_that_need_a_function_at_once_compile_it_once(tmp_path: Path) -> None:
     with ThreadPoolExecutor(3) as pool:
         made = list(pool.map(run, [tmp_path / name for name in "abc"], [tmp_path] * 3))

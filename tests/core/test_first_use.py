@@ -33,6 +33,7 @@ hits(mesh.corners, seen.reshape(-1), *camera.rays(8, 8, slice(0, 8)))
 """
 
 
+@pytest.mark.slow
 def test_loops_compile_without_the_messages_of_numpy(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     ran = subprocess.run(
@@ -68,6 +69,7 @@ def told(cache, after_s):
     return ran.stdout.split().count("told")
 
 
+@pytest.mark.slow
 def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_done_before(tmp_path):
     assert told(tmp_path / "long", 0.01) == 1
     assert told(tmp_path / "long", 0.01) == 0

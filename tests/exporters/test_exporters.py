@@ -133,6 +133,7 @@ def test_frames_that_fail_are_listed_and_the_exit_code_is_1(installed, tmp_path)
     assert (tmp_path / "out" / "town07_light" / "000002.npy").is_file()
 
 
+@pytest.mark.slow
 def test_workers_write_the_same_files(installed, tmp_path):
     for place, workers in (("one", 1), ("two", 2)):
         export("kitti", installed, tmp_path / place, run=Run(workers=workers))

@@ -214,6 +214,7 @@ def test_a_run_that_is_interrupted_leaves_no_file(tmp_path):
     assert export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made == 4
 
 
+@pytest.mark.slow
 def test_workers_write_the_same_file(tmp_path):
     write_drive(tmp_path / "in")
     for place, workers in (("one", 1), ("two", 2)):

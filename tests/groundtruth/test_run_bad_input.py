@@ -102,6 +102,7 @@ def test_files_cut_short_in_the_output_are_made_again(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.slow
 def test_a_full_disk_stops_the_run_in_one_line_and_leaves_whole_files(tmp_path, workers):
     """A limit on the size of files fails a write in its middle, as a full disk does."""
     write_capture(tmp_path, frames=4)

@@ -133,6 +133,7 @@ def test_processes_make_the_same_grids(street):
         assert (grid_of(street, "one", frame).labels == grid_of(street, "two", frame).labels).all()
 
 
+@pytest.mark.slow
 def test_an_executor_that_outlives_a_run_sees_the_files_of_the_next(tmp_path):
     street = passing_car.write_sequence(tmp_path)
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:

@@ -14,6 +14,7 @@ QUICK = ("convert", "download-extract")
 """Commands whose data are quickly made."""
 
 
+@pytest.mark.slow
 def test_a_failing_call_leaves_whole_files_and_the_next_run_finishes_them(tmp_path: Path) -> None:
     outcome = calls.run(10, 0, tmp_path, [name for name in QUICK if name in COMMANDS])
     assert outcome.found == []

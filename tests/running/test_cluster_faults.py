@@ -33,6 +33,7 @@ def test_two_numbers_of_workers_contradict_each_other():
         run("local:2", workers=3)
 
 
+@pytest.mark.slow
 def test_no_scheduler_at_the_address():
     import dask
     import distributed
@@ -99,6 +100,7 @@ def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
             list(results)
 
 
+@pytest.mark.slow
 def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
     with (
         dask_cluster.scheduler(tmp_path) as (address, process),

@@ -64,6 +64,7 @@ def test_workers_have_one_thread_each(cluster):
     assert set(cluster.client.nthreads().values()) == {1}
 
 
+@pytest.mark.slow
 def test_what_a_killed_worker_worked_on_is_done_by_another(cluster, tmp_path: Path):
     marks = [tmp_path / f"{number}" for number in range(4)]
     assert list(run_all(jobs.die_once, marks, run=Run(executor=cluster))) == ["0", "1", "2", "3"]

@@ -76,6 +76,7 @@ def test_workers_are_deaf_to_ctrl_c():
     assert list(run_all(jobs.ignores_interrupt, range(2), run=Run(workers=2))) == [True, True]
 
 
+@pytest.mark.slow
 def test_what_a_killed_worker_worked_on_is_done_by_another(tmp_path: Path):
     marks = [tmp_path / f"{number}" for number in range(4)]
     assert list(run_all(jobs.die_once, marks, run=Run(workers=2))) == ["0", "1", "2", "3"]

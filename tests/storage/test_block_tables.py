@@ -180,6 +180,7 @@ def test_a_process_that_is_killed_anywhere_is_continued(
 
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 @given(data=st.data(), block=st.integers(1, 5))
+@pytest.mark.slow
 def test_frames_written_in_any_order_together_or_alone_give_the_same_files(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, block: int
 ) -> None:
@@ -345,6 +346,7 @@ def test_a_grid_can_be_removed_and_made_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("small", [False, True])
 @pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.slow
 def test_packing_in_processes_gives_the_same_files(tmp_path: Path, small: bool, workers: int) -> None:
     writer = FolderSink(tmp_path / "data").sequence(PATH)
     writer.write_document("evaluation/params.json", params(SIZE))

@@ -284,6 +284,7 @@ getattr(packing, sys.argv[1])(sys.argv[2], sys.argv[3], run=Run(progress=kill))
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("files", [1, 30, 999])
+@pytest.mark.slow
 def test_a_killed_pack_leaves_no_store_and_a_second_run_finishes_it(
     data: Path, tmp_path: Path, kind: str, files: int
 ) -> None:

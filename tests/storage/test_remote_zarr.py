@@ -69,6 +69,7 @@ def files_in(target: Target) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("fault", [None, "503", "drop"])
+@pytest.mark.slow
 def test_a_store_in_a_bucket_has_the_files_of_one_on_disk(
     server: FaultyServer, reference: Path, tmp_path: Path, fault: str | None
 ) -> None:

@@ -401,6 +401,7 @@ view(sys.argv[1], sys.argv[2])
 
 
 @pytest.mark.parametrize("ending", [".rrd", ".mcap"])
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_an_error_and_leaves_nothing(ending, blocks, tmp_path):
     run = subprocess.run(
         [sys.executable, "-c", FULL_DISK, blocks, tmp_path / f"a{ending}"],

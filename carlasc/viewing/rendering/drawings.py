@@ -62,7 +62,14 @@ class Drawing:
     note: str | None = None
 
     def render(self, camera: Camera, width: int, height: int, *, axes: Axes = "left") -> NDArray[np.uint8]:
-        """Return the picture, (height, width, 3) uint8, without legend or title; `axes` is the handedness of the data."""
+        """Return the picture, (H, W, 3) uint8, without legend or title.
+
+        Args:
+            camera: where it is taken from.
+            width: W, pixels.
+            height: H, pixels.
+            axes: handedness of the data.
+        """
         canvas = empty_canvas(width, height)
         if self.mesh is not None:
             cast(self.mesh, camera, canvas, axes=axes)
@@ -92,6 +99,11 @@ def scan_extent(scan: Scan) -> Extent:
 def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawing:
     """Return the occupied voxels of a grid, without free and unknown ones.
 
+    Args:
+        grid: the grid.
+        colors: colours of the classes.
+        ego: whether a plain car is drawn at the sensor.
+
     Raises:
         FormatError: a label is not in the class table.
     """
@@ -110,6 +122,11 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
 def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
     """Return the voxels where a prediction is right, wrong, missed or invented, where the truth is known.
 
+    Args:
+        prediction: the predicted grid.
+        truth: the true grid, with the same geometry.
+        ego: whether a plain car is drawn at the sensor.
+
     Raises:
         ArgumentError: the grids differ in their geometry.
     """
@@ -122,6 +139,12 @@ def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing
 
 def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
     """Return the points of a scan, coloured by class; by height if there are no labels or the palette is "height".
+
+    Args:
+        scan: the scan.
+        colors: colours of the classes.
+        extent: what the picture shows; None takes most of the points.
+        ego: whether a plain car is drawn at the sensor.
 
     Raises:
         FormatError: a label is not in the class table.
@@ -147,6 +170,12 @@ def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
     """Return a scan with moving points in the colour of their class, static ones in grey, and an arrow for each moving actor.
 
     An arrow is as long as the distance that its actor moves in one second.
+
+    Args:
+        scan: the scan, with flow.
+        colors: colours of the classes.
+        extent: what the picture shows; None takes most of the points.
+        ego: whether a plain car is drawn at the sensor.
 
     Raises:
         FormatError: the scan has no flow, or a label is not in the class table.

@@ -152,6 +152,7 @@ def _claim(arguments: tuple[Target, int]) -> bool:
     return target.put("claims/one", f"claim {number}".encode(), create=True)
 
 
+@pytest.mark.slow
 def test_of_several_processes_that_create_one_object_one_succeeds(endpoint: str) -> None:
     target = target_of(f"s3://{BUCKET}/claims", **options_for(endpoint))
     with ProcessPoolExecutor(3, multiprocessing.get_context("forkserver")) as pool:
@@ -215,6 +216,7 @@ def calls(target: Target) -> dict[str, Callable[[], Any]]:
     }
 
 
+@pytest.mark.slow
 def test_a_server_that_always_fails_is_one_line_after_a_bounded_time(faulty: FaultyServer) -> None:
     target = target_of(f"s3://{BUCKET}/never", **options_for(faulty.url))
     for name, call in calls(target).items():
@@ -420,6 +422,7 @@ def _forked(target: Callable[[], bool]) -> Iterator[Any]:
     process.join(10)
 
 
+@pytest.mark.slow
 def test_a_tree_is_read_on_both_sides_of_a_fork(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "fork/a", b"12345").tree
     assert tree.read("a") == b"12345"
