@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from measuring.figures import FILE, HISTORY, PAGES, ROOT, STRICT, Figure, Figure
 from measuring.places import fill, keys, typed_by_hand
 from measuring.sizes import SIZES, by_turns
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT / "tests" / "tools")])}
 RUN = {"date": "2030-01-02", "size": "quick", "processor": "Abacus", "target": "beads", "cores": 2, "load": 0.1}
 RUN |= {"python": "3.11", "system": "wood", "versions": {"carlasc": "0.1.0"}}
 
@@ -175,7 +177,8 @@ def test_every_group_has_a_function() -> None:
 def test_tiny_figures_never_reach_the_pages() -> None:
     ran = subprocess.run(
         [sys.executable, "-m", "measuring", "--size", "tiny"],
-        cwd=ROOT / "tests" / "tools",
+        cwd=ROOT / "tests",
+        env=ENVIRONMENT,
         capture_output=True,
         text=True,
         check=False,
@@ -189,7 +192,7 @@ def test_a_group_measures_the_figures_that_the_file_has_of_it(group: str, tmp_pa
     file = tmp_path / "figures.json"
     before = FILE.read_bytes()
     command_line = [sys.executable, "-m", "measuring", "--size", "tiny", "--only", group, "--out", str(file)]
-    ran = subprocess.run(command_line, cwd=ROOT / "tests" / "tools", capture_output=True, text=True, check=False)
+    ran = subprocess.run(command_line, cwd=ROOT / "tests", env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     measured = Figures.read(file)
     first = {key.split(".")[0] for key in measured.figures}

@@ -267,6 +267,8 @@ class ReadAhead:
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
+        if not self._threads:
+            return  # as when the program ends, where the names of this module may be gone
         end = time.monotonic() + _STOP_S
         for thread in self._threads:
             if thread is not threading.current_thread():  # a thread that collects garbage may close an iterator

@@ -17,6 +17,7 @@ from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from carlasc.core.versions import carlasc_version
 from carlasc.errors import CarlascError, import_extra
 from carlasc.running.pools import ONE_THREAD, LostTaskError
 from carlasc.running.spreading import DaskClient, LazyClient
@@ -42,7 +43,7 @@ class Versions:
     def here(cls) -> Self:
         """Return the versions of this process."""
         return cls(
-            f"{version('carlasc')} (source {_digest_of_source()})",
+            f"{carlasc_version()} (source {_digest_of_source()})",
             ".".join(platform.python_version_tuple()[:2]),
             version("numpy"),
             version("numba"),

@@ -16,6 +16,11 @@ from carlasc.running import open_cluster, run_all
 
 pytestmark = pytest.mark.needs("distributed")
 
+OTHER_VERSION = (  # what a worker runs before anything else
+    "import importlib.metadata as metadata; version = metadata.version\n"
+    "metadata.version = lambda name: '0.0.1' if name == 'carlasc' else version(name)"
+)
+
 
 def run(where: str, count: int = 4, workers: int | None = None) -> list[int]:
     with open_cluster(where, workers=workers) as cluster:
@@ -74,7 +79,7 @@ def test_a_cluster_without_workers(tmp_path: Path):
 @pytest.mark.slow
 def test_workers_with_other_versions_and_workers_without_carlasc(tmp_path: Path):
     wrong = {
-        "import carlasc; carlasc.__version__ = '0.0.1'": r"carlasc 0\.0\.1",
+        OTHER_VERSION: r"carlasc 0\.0\.1",
         "sys.modules['carlasc'] = None": "none",
     }
     with dask_cluster.scheduler(tmp_path) as (address, _):
@@ -88,7 +93,6 @@ def test_workers_with_other_versions_and_workers_without_carlasc(tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
-    other = "import carlasc; carlasc.__version__ = '0.0.1'"
     with (
         dask_cluster.scheduler(tmp_path) as (address, _),
         dask_cluster.worker(address),
@@ -96,7 +100,7 @@ def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
     ):
         results = run_all(jobs.name_of_process, range(1000), run=Run(executor=cluster))
         next(results)
-        with dask_cluster.worker(address, other), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
+        with dask_cluster.worker(address, OTHER_VERSION), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
             list(results)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import check_rigid, transform_points
 from carlasc.core.grids import Grid
-from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
@@ -271,10 +271,16 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
 
     Raises:
         DependencyError: kiss-icp is not installed.
+        FormatError: a scan has too few points.
     """
     frames = sequence.frames("points")
     scans = (sequence.read("points", int(frame))[:, :3] for frame in frames)
-    poses = estimate_poses(scans, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
+    try:
+        poses = estimate_poses(scans, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
+    except ArgumentError as error:  # there the scans are an argument, here they are data
+        raise FormatError(
+            sequence.location, expected=f"poses, or {error.expected}", found=error.found, advice=error.advice
+        ) from error
     lines = np.clip(np.searchsorted(frames, np.arange(frames[-1] + 1), side="right") - 1, 0, None)
     return sequence.with_poses(poses[lines])
 

@@ -112,6 +112,7 @@ class PatientFile(io.RawIOBase):
         self._descriptor = -1  # until it is open
         try:
             make_folder(path.parent)
+            path.unlink(missing_ok=True)  # what an abandoned writer of this process still writes goes into its own file
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
             raise storage_error(place, error) from error
