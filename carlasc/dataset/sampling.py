@@ -215,6 +215,11 @@ class ReadAhead:
     no thread.
     """
 
+    # Held by the class: where a program ends in the middle of an iteration, the names of this module may be gone.
+    _clock = staticmethod(time.monotonic)
+    _this_thread = staticmethod(threading.current_thread)
+    _stop_s = _STOP_S
+
     def __init__(
         self, dataset: Dataset, order: NDArray[np.int64], shards: NDArray[np.int64], start: int, count: int
     ) -> None:
@@ -267,12 +272,10 @@ class ReadAhead:
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
-        if not self._threads:
-            return  # as when the program ends, where the names of this module may be gone
-        end = time.monotonic() + _STOP_S
+        end = self._clock() + self._stop_s
         for thread in self._threads:
-            if thread is not threading.current_thread():  # a thread that collects garbage may close an iterator
-                thread.join(max(0.0, end - time.monotonic()))
+            if thread is not self._this_thread():  # a thread that collects garbage may close an iterator
+                thread.join(max(0.0, end - self._clock()))
 
     def _run(self) -> None:
         while True:

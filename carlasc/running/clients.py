@@ -234,14 +234,15 @@ def _release(tasks: Iterable[tuple[Any, Any]]) -> None:
 def one_line_if_lost(client: DaskClient) -> Iterator[None]:
     """Raise an error of one line if the connection to the scheduler is lost in the block."""
     from distributed.client import CancelledError
+    from distributed.comm import CommClosedError
 
     try:
         yield
     except CarlascError:
         raise
     except Exception as error:
-        if client.status == "running" and not isinstance(error, CancelledError):
-            raise  # an error of the function
+        if client.status == "running" and not isinstance(error, CancelledError | CommClosedError):
+            raise  # an error of the function; a connection may be closed before the client knows it
         raise CarlascError(
             f"the scheduler {getattr(getattr(client, 'scheduler', None), 'address', '')}".rstrip(),
             problem="the connection was lost",
