@@ -102,7 +102,7 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         fail(_INTERRUPTED, INTERRUPTED)
     except (SystemError, ValueError) as error:
         # Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
-        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+        if not any(isinstance(one, KeyboardInterrupt) for one in _chain(error)):
             raise
         fail(_INTERRUPTED, INTERRUPTED)
     except BrokenPipeError:  # `carlasc info | head`
@@ -110,6 +110,13 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         raise typer.Exit(FAILED) from None
     except OSError as error:  # of a file that the library reads or writes in passing
         fail(f"{error.filename or 'the file system'}: {error.strerror or error}")
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error, what caused it, what caused that, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def _typed(parameter: Any) -> str:

@@ -44,9 +44,14 @@ def test_an_error_is_one_line_and_an_honest_exit_code(error, code):
 @pytest.mark.parametrize(
     "error", [SystemError("a result with an exception set"), ValueError("Can't close the ZIP file")]
 )
-def test_ctrl_c_that_another_error_hides_is_ctrl_c(error):
+@pytest.mark.parametrize("between", [False, True])
+def test_ctrl_c_that_another_error_hides_is_ctrl_c(error, between):
     def action():
-        raise error from KeyboardInterrupt()
+        cause = KeyboardInterrupt()
+        if between:  # one compiled loop was called by another
+            cause = SystemError("a result with an exception set")
+            cause.__cause__ = KeyboardInterrupt()
+        raise error from cause
 
     result = run(action)
     assert result.exit_code == 130
