@@ -5,7 +5,6 @@ from .metadata import Axes as Axes
 from .metadata import Metadata as Metadata
 from .opening import as_source as as_source
 from .opening import open as open
-from .packing import finish as finish
 from .packing import pack as pack
 from .protocol import Sequence as Sequence
 from .protocol import Source as Source
@@ -13,3 +12,4 @@ from .sinks import SequenceWriter as SequenceWriter
 from .sinks import Sink as Sink
 from .transport.caching import Cache as Cache
 from .unpacking import unpack as unpack
+from .zarr.zarr_finish import finish as finish

@@ -1,4 +1,4 @@
-"""Packing sequences into one store, which is several times smaller, and finishing one that was written in parts."""
+"""Packing sequences into one store, which is several times smaller."""
 
 from __future__ import annotations
 
@@ -33,11 +33,9 @@ from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions,
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence
 from carlasc.storage.sinks import SequenceWriter
-from carlasc.storage.transport.targets import target_of
 from carlasc.storage.transport.trees import is_url
 
 if TYPE_CHECKING:
-    from carlasc.storage.zarr.zarr_finish import FinishedStore
     from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
 _BLOCK = 8  # frames that are read together
@@ -240,26 +238,3 @@ def _read_ahead(sequence: Sequence, name: str, frames: list[int], threads: int) 
             while len(ahead) < threads and number + len(ahead) < len(blocks):
                 ahead.append(pool.submit(sequence.read_many, name, blocks[number + len(ahead)]))
             yield from zip(block, ahead.popleft().result(), strict=True)
-
-
-def finish(out: str | os.PathLike[str], *, incomplete: bool = False, **storage_options: Any) -> FinishedStore:
-    """Write the metadata of a zarr store by which it can be opened: of what several commands have written to it.
-
-    The last part of a run does so by itself. This is for stores of which a part failed, or was never run.
-
-    Args:
-        out: the store: a path, or a URL of an object store.
-        incomplete: finish it although frames are missing that a run has announced.
-        **storage_options: options of fsspec for a URL.
-
-    Returns:
-        What the store holds, and what is missing.
-
-    Raises:
-        ConflictError: announced frames are missing, and `incomplete` is not given.
-        FormatError: something in it is damaged.
-        MissingDataError: there is no zarr store of the present version.
-    """
-    from carlasc.storage.zarr.zarr_finish import finish as finish_target
-
-    return finish_target(target_of(out, **storage_options), incomplete=incomplete)
