@@ -17,7 +17,7 @@ from carlasc.cli.common import (
     place_argument,
     print_frames,
 )
-from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags
+from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
 from carlasc.core.choices import Axes, FlowSource, SplitName
 from carlasc.errors import ArgumentError
@@ -56,12 +56,7 @@ class LayoutFlags(Flags):
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
     """Return the options of the converter that the arguments name, if they name one."""
-    named = [argument for argument in arguments if not argument.startswith("-")]
-    if not named:  # of which the library need not be loaded
-        return ()
-    known = set(carlasc.converting.converter_names())
-    name = next((argument for argument in named if argument in known), None)
-    return () if name is None else carlasc.converting.option_declarations(carlasc.converting.load_converter(name))
+    return declared_by("converter", arguments)
 
 
 def _print_list(wanted: bool) -> None:

@@ -10,17 +10,12 @@ import typer
 
 import carlasc
 from carlasc.cli.common import Json, echo, file_argument, place_argument, print_frames
-from carlasc.cli.flags import DeclaredOptions, RunFlags
+from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
 
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
     """Return the options of the exporter that the arguments name, if they name one."""
-    named = [argument for argument in arguments if not argument.startswith("-")]
-    if not named:  # of which the library need not be loaded
-        return ()
-    known = set(carlasc.converting.exporter_names())
-    name = next((argument for argument in named if argument in known), None)
-    return () if name is None else carlasc.converting.option_declarations(carlasc.converting.load_exporter(name))
+    return declared_by("exporter", arguments)
 
 
 def _print_list(wanted: bool) -> None:

@@ -71,6 +71,22 @@ def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration]
     return command
 
 
+def declared_by(kind: Literal["converter", "exporter"], arguments: Sequence[str]) -> tuple[OptionDeclaration, ...]:
+    """Return the options of the converter or exporter that the arguments of a command name, if they name one."""
+    named = [argument for argument in arguments if not argument.startswith("-")]
+    if not named:  # of which the library need not be loaded
+        return ()
+    from carlasc import converting
+
+    known, load = (
+        (converting.converter_names(), converting.load_converter)
+        if kind == "converter"
+        else (converting.exporter_names(), converting.load_exporter)
+    )
+    name = next((argument for argument in named if argument in known), None)
+    return () if name is None else converting.option_declarations(load(name))
+
+
 def declared_name(parameter: str) -> str:
     """Return the name of the option that a parameter stands for."""
     return parameter.removeprefix(_DECLARED)

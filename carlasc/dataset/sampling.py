@@ -203,9 +203,6 @@ def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
 
 
 _THREADS = 3  # files that are fetched side by side, each in several ranges
-_STOP_S = (
-    5.0  # how long the end of an iteration waits for files being fetched: a server that is lost is asked for minutes
-)
 
 
 class ReadAhead:
@@ -218,7 +215,7 @@ class ReadAhead:
     # Held by the class: where a program ends in the middle of an iteration, the names of this module may be gone.
     _clock = staticmethod(time.monotonic)
     _this_thread = staticmethod(threading.current_thread)
-    _stop_s = _STOP_S
+    _stop_s = 5.0  # how long the end waits for files being fetched: a server that is lost is asked for minutes
 
     def __init__(
         self, dataset: Dataset, order: NDArray[np.int64], shards: NDArray[np.int64], start: int, count: int
