@@ -168,7 +168,7 @@ def test_workers_may_be_forked_while_files_are_fetched(served, truth, tmp_path):
 
 
 def test_a_server_that_is_lost_does_not_hold_up_the_end(served, tmp_path, monkeypatch):
-    monkeypatch.setattr(sampling, "_STOP_S", 0.1)
+    monkeypatch.setattr(sampling.ReadAhead, "_stop_s", 0.1)
     dataset = dataset_at(served, tmp_path)
     drawing = iter(ShardSampler(dataset, **SHAPE))
     lost, back = threading.Event(), threading.Event()
