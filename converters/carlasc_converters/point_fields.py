@@ -1,0 +1,120 @@
+"""The fields of points as files and messages of any origin name them, and the times of points in any unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError
+
+TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
+
+# The usual names, in lower case, of each field; the first that exists is taken.
+_NAMES: dict[str, tuple[str, ...]] = {
+    "x": ("x", "x_m"),
+    "y": ("y", "y_m"),
+    "z": ("z", "z_m"),
+    "intensity": ("intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "scalar_intensity"),
+    "time": ("t", "time", "timestamp", "time_stamp", "times", "offset_time", "gps_time", "scalar_time"),
+    "ring": ("ring", "channel", "line", "laser_id", "row"),
+    "label": ("label", "labels", "class", "semantic", "classification", "scalar_label"),
+    "instance": ("instance", "instances", "instance_id", "object_id", "track_id"),
+}
+_NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_SCAN_S = (0.004, 0.6)  # how long a LiDAR takes for a scan: 2 to 200 Hz
+_ABSOLUTE_S = 1e6  # a time of a clock, not one within a scan
+
+
+def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, NDArray[Any]]:
+    """Return the fields of some points by one name each.
+
+    Args:
+        columns: (N,) values by the names of a file or a message, in any case.
+        where: the file or the message, for errors.
+
+    Returns:
+        `points` (N, 4) float32, x, y, z and the intensity (0 if there is none), and those of `time` and `ring` (N,), as they were, and
+        `label` and `instance` (N,) uint32, that exist.
+
+    Raises:
+        FormatError: x, y or z does not exist, or a class or an instance is no whole number from 0 to 2^32 - 1.
+    """
+    lower = {name.lower(): values for name, values in columns.items()}
+    found = {field: next((lower[name] for name in names if name in lower), None) for field, names in _NAMES.items()}
+    if missing := [field for field in ("x", "y", "z") if found[field] is None]:
+        raise FormatError(
+            where, expected=f"points with {', '.join(missing)}", found=f"only {', '.join(columns) or 'no fields'}"
+        )
+    count = len(found["x"])  # type: ignore[arg-type]
+    points = np.zeros((count, 4), np.float32)
+    for axis, field in enumerate(("x", "y", "z", "intensity")):
+        if found[field] is not None:
+            points[:, axis] = found[field]
+    fields: dict[str, NDArray[Any]] = {"points": points}
+    for field in ("time", "ring"):
+        if (values := found[field]) is not None:
+            fields[field] = values
+    for field in ("label", "instance"):
+        if (values := found[field]) is not None:
+            fields[field] = whole_numbers(values, f"{where}: {field}")
+    return fields
+
+
+def whole_numbers(values: NDArray[Any], where: str) -> NDArray[np.uint32]:
+    """Return (N,) ids as uint32.
+
+    Raises:
+        FormatError: a value is no whole number from 0 to 2^32 - 1.
+    """
+    with np.errstate(invalid="ignore"):
+        whole = values.astype(np.uint32)
+    if not np.array_equal(whole, values):
+        worst = values[np.flatnonzero(whole != values)[0]]
+        raise FormatError(where, expected="whole numbers from 0 to 4294967295", found=str(worst))
+    return whole
+
+
+def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDArray[np.float64], int | None, str]:
+    """Return the times of the points of a scan in seconds.
+
+    Args:
+        times: (N,) times in the unit of the file: after the time of the scan, or those of a clock.
+        unit: "auto" finds it from how long a scan takes: 4 ms to 0.6 s.
+        where: the file or the message, for errors.
+
+    Returns:
+        (N,) float64 seconds; the nanoseconds of the clock after which these are, None if they are after the time of the scan;
+        the unit.
+
+    Raises:
+        FormatError: a time is not finite, or no unit gives a scan of a usual length.
+    """
+    if not len(times):
+        return np.empty(0), None, "s" if unit == "auto" else unit
+    if times.dtype.kind == "f" and not np.isfinite(times).all():
+        raise FormatError(f"{where}: times of points", expected="finite numbers", found="NaN or infinity")
+    first, last = times.min(), times.max()
+    span = int(last) - int(first) if times.dtype.kind in "iu" else float(last) - float(first)
+    if span == 0 and first == 0:
+        return np.zeros(len(times)), None, "s" if unit == "auto" else unit  # a column that nobody filled
+    if unit == "auto":
+        low, high = _SCAN_S
+        usual = next((name for name, scale in _NANOSECONDS.items() if low <= span * scale / 1e9 <= high), None)
+        if usual is None:
+            raise FormatError(
+                f"{where}: times of points",
+                expected="a scan of 4 ms to 0.6 s in seconds, milliseconds, microseconds or nanoseconds",
+                found=f"times from {first} to {last}",
+                advice="give their unit with `time_unit`",
+            )
+        unit = usual  # type: ignore[assignment]
+    scale = _NANOSECONDS[unit]
+    if abs(float(first)) * scale / 1e9 < _ABSOLUTE_S:
+        return np.asarray(times, np.float64) * (scale / 1e9), None, unit
+    # A clock's float64 seconds keep 0.2 microseconds; whole numbers keep all.
+    after = (times - first).astype(np.float64) * (scale / 1e9)
+    start = int(first) * scale if times.dtype.kind in "iu" else round(float(first) * scale)
+    return after, start, unit
