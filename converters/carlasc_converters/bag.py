@@ -85,7 +85,7 @@ class BagRecording(Recording):
 
     def __init__(self, files: BagFiles, options: BagOptions) -> None:
         self._files, self._options, self.location = files, options, files.location
-        self.name = re.sub(r"[^\w-]+", "_", files.paths[0].name.split(".")[0])
+        self.name = re.sub(r"[^\w-]+", "_", files.paths[0].name.split(".")[0].removesuffix("_0"))
         self._lidars = [LidarTopic(topic, options) for topic in files.clouds(options.topics)]
 
     @cached_property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc_converters import db3_file, mcap_file, ros1_bag
-from carlasc_converters.bag_index import Channel, FileIndex
+from carlasc_converters.bag_index import Channel, FileIndex, decompressed
 from carlasc_converters.bag_messages import CLOUDS, POSES, TRANSFORMS, is_readable
 from carlasc_converters.files import opening
 
@@ -21,6 +21,7 @@ _KINDS = (ros1_bag, mcap_file, db3_file)
 _ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
 _PACKED = (".db3.zstd", ".mcap.zstd")
 _LEVELS = 3  # how deep below the given folder a bag may be
+_ZSTD = b"\x28\xb5\x2f\xfd"  # a message of ROS 2 that was compressed alone: CDR never begins so
 _PART = re.compile(r"_(\d+)$")
 _EXPECTED = "a bag: .bag, .db3, .mcap"
 
@@ -49,7 +50,8 @@ class MessagePlace:
         """
         kind = _kind_of(Path(self.path))
         with opening(self.path, f"a message of {self.channel.topic}"):
-            return kind.read_message(self.path, self.chunk, self.offset)
+            data = kind.read_message(self.path, self.chunk, self.offset)
+        return decompressed(data, "zstd", str(self)) if data.startswith(_ZSTD) else data
 
     def __str__(self) -> str:
         return f"{self.path}: {self.channel.topic}"
@@ -135,11 +137,12 @@ class BagFiles:
         if names:
             return [self._named("topics", name.strip(), CLOUDS, found) for name in names.split(",")]
         if not found:
+            lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
             raise MissingDataError(
                 self.location,
                 expected="a topic of points: PointCloud2, CustomMsg of Livox, or PointCloud of Foxglove",
-                found=_listed(list(self.topics.values())),
-                advice="packets of a LiDAR become points where its driver replays them; record its topic of points",
+                found="; ".join([_listed(list(self.topics.values())), *lost]),
+                advice="" if lost else "packets of a LiDAR become points where its driver replays them",
             )
         if len(found) > 1:
             raise ArgumentError(

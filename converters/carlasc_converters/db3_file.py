@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.errors import FormatError
-from carlasc_converters.bag_index import Channel, FileIndex, decompressed
+from carlasc_converters.bag_index import Channel, FileIndex
 
 MAGIC = b"SQLite format 3\0"
-_ZSTD = b"\x28\xb5\x2f\xfd"  # a message that was compressed alone; CDR never begins so
 _EXPECTED = "a bag of ROS 2: a database with topics and messages"
 
 
@@ -35,7 +34,7 @@ def index_file(path: Path) -> FileIndex:
             index.lost = f"SQLite gives only {len(rows) // 3} messages of it ({error})"
         table = np.array(rows, np.int64).reshape(-1, 3)
         if size < whole:
-            table = table[: _count_whole(database, table[:, 2].tolist())]
+            table = table[[_is_whole(database, number) for number in table[:, 2].tolist()]]
             index.lost = f"it has {size} of {whole} bytes, and {len(table)} messages are whole"
     for number in np.unique(table[:, 0]).tolist():
         own = table[table[:, 0] == number]
@@ -53,20 +52,16 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
         row = database.execute("SELECT data FROM messages WHERE id = ?", (offset,)).fetchone()
     if row is None:
         raise FormatError(path, expected=f"message {offset}", found="none")
-    data = bytes(row[0])
-    return decompressed(data, "zstd", path) if data.startswith(_ZSTD) else data
+    return bytes(row[0])
 
 
-def _count_whole(database: sqlite3.Connection, numbers: list[int]) -> int:
-    """Return how many messages come before those at the end whose content is cut off."""
-    count = len(numbers)
-    while count:
-        try:
-            database.execute("SELECT data FROM messages WHERE id = ?", (numbers[count - 1],)).fetchone()
-            return count
-        except sqlite3.DatabaseError:
-            count -= 1
-    return 0
+def _is_whole(database: sqlite3.Connection, number: int) -> bool:
+    """Return whether the content of a message can be read."""
+    try:
+        database.execute("SELECT data FROM messages WHERE id = ?", (number,)).fetchone()
+    except sqlite3.DatabaseError:
+        return False
+    return True
 
 
 @contextmanager

@@ -1,0 +1,121 @@
+"""Bags that are compressed, cut short or damaged: what is whole is read, and what is lost is said."""
+
+import numpy as np
+import pytest
+from carlasc_converters.bag import Bag
+from carlasc_converters.bag_index import decompressed
+from helpers.converters.bags import KINDS, Messages, drive_messages, file_of, write_bag
+
+from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.testing import SimulatedDrive
+
+pytestmark = pytest.mark.needs("rosbags")
+DRIVE = SimulatedDrive(24, rolling=True, channels=32, columns=500)  # some scans in a chunk of 1 MB
+CODECS = [("bag", "bz2"), ("bag", "lz4"), ("db3", "message"), ("mcap", "message"), ("mcap", "storage")]
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    """The file of each kind, by kind and codec."""
+    found = {}
+    for kind, codec in [(kind, "") for kind in KINDS] + CODECS:
+        store = Messages(kind)
+        folder = tmp_path_factory.mktemp(f"{kind}{codec}")
+        found[kind, codec] = file_of(
+            write_bag(folder, kind, drive_messages(store, DRIVE, "tf"), store=store, compressed=codec)
+        )
+    return found
+
+
+def cut(path, share, folder):
+    """Write the first part of a file's bytes into a folder."""
+    whole = path.read_bytes()
+    copy = folder / path.name
+    copy.write_bytes(whole[: int(len(whole) * share)])
+    return copy
+
+
+def check_frames(recording):
+    """Compare every point that is read with that of the drive."""
+    for frame in recording.frames:
+        (cloud,) = frame.read()
+        assert cloud.points.tobytes() == DRIVE.scan(frame.number).points.tobytes()
+
+
+@pytest.mark.parametrize(("kind", "codec"), CODECS)
+def test_compressed_bags_hold_the_same_points(bags, kind, codec):
+    (recording,) = Bag(bags[kind, codec]).sequences()
+    assert len(recording.frames) == DRIVE.frames and recording.notes() == []
+    check_frames(recording)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("share", "least"), [(0.3, 3), (0.7, 12), (0.99, 19)])
+def test_a_bag_that_is_cut_short_gives_what_is_whole(bags, kind, share, least, tmp_path):
+    path = cut(bags[kind, ""], share, tmp_path)
+    (recording,) = Bag(path).sequences()
+    assert least <= len(recording.frames) <= DRIVE.frames
+    check_frames(recording)
+    (note,) = recording.notes()
+    assert note.startswith(f"{path}: ") and str(path.stat().st_size) in note
+    truth = DRIVE.world_T_vehicle(recording.times())
+    assert np.abs(recording.poses().at(recording.times()) - truth)[:least].max() < 1e-9
+
+
+@pytest.mark.parametrize(("kind", "codec"), CODECS)
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
+def test_a_compressed_bag_that_is_cut_short_gives_what_is_whole_or_says_why_not(bags, kind, codec, share, tmp_path):
+    path = cut(bags[kind, codec], share, tmp_path)
+    try:
+        (recording,) = Bag(path).sequences()
+    except CarlascError as error:
+        assert share == 0.3 and str(path.stat().st_size) in str(error) and "\n" not in str(error)
+        return
+    assert recording.frames
+    check_frames(recording)
+    assert len(recording.notes()) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [0, 5, 20, 100, 4096 + 20, 20000])
+def test_a_bag_of_which_little_is_left_is_named_in_one_line(bags, kind, size, tmp_path):
+    path = tmp_path / bags[kind, ""].name
+    path.write_bytes(bags[kind, ""].read_bytes()[:size])
+    with pytest.raises((FormatError, MissingDataError)) as raised:
+        Bag(path).sequences()
+    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_bag_whose_end_is_missing_loses_nothing_else(bags, kind, tmp_path):
+    path = tmp_path / bags[kind, ""].name
+    path.write_bytes(bags[kind, ""].read_bytes()[:-4])
+    (recording,) = Bag(path).sequences()
+    assert len(recording.frames) == DRIVE.frames
+    assert len(recording.notes()) == 1
+
+
+@pytest.mark.parametrize(("kind", "codec"), [("bag", "lz4"), ("mcap", "storage")])
+def test_a_damaged_chunk_costs_its_frames_only(bags, kind, codec, tmp_path):
+    data = bytearray(bags[kind, codec].read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 2000] = bytes(2000)
+    path = tmp_path / bags[kind, codec].name
+    path.write_bytes(data)
+    (recording,) = Bag(path).sequences()
+    assert len(recording.frames) == DRIVE.frames
+    failed = 0
+    for frame in recording.frames:
+        try:
+            (cloud,) = frame.read()
+        except FormatError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            failed += 1
+        else:
+            assert cloud.points.tobytes() == DRIVE.scan(frame.number).points.tobytes()
+    assert 1 <= failed <= DRIVE.frames // 4
+
+
+def test_a_codec_that_nobody_knows_is_named():
+    with pytest.raises(FormatError, match="drive.bag: expected chunks that are not compressed, or .*, found 'snappy'"):
+        decompressed(b"", "snappy", "drive.bag")
