@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from carlasc.core.classes import Remap
 from carlasc.core.geometry import transform_points
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc_converters.bag_messages import TRANSFORMS, CloudMessage, read_cloud, read_placed, read_stamp
+from carlasc_converters.bag_messages import PATH, TRANSFORMS, CloudMessage, read_cloud, read_placed, read_stamp
 from carlasc_converters.bag_topics import BagFiles, MessagePlace, Topic, find_bags
 from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
 from carlasc_converters.transforms import FrameTrack, FrameTree
@@ -86,6 +86,7 @@ class BagRecording(Recording):
     def __init__(self, files: BagFiles, options: BagOptions) -> None:
         self._files, self._options, self.location = files, options, files.location
         self.name = re.sub(r"[^\w-]+", "_", files.paths[0].name.split(".")[0].removesuffix("_0"))
+        self._pose_note = ""
         self._lidars = [LidarTopic(topic, options) for topic in files.clouds(options.topics)]
 
     @cached_property
@@ -137,7 +138,7 @@ class BagRecording(Recording):
             where = f"{self.location}: transforms"
         else:
             where = f"{self.location}: {topic.channel.topic}"
-            stamps, poses = _read_track(topic, where)[0].values
+            stamps, poses = _read_track(topic, where).values
         if not force and not all(sensor.calibrated for sensor in self.sensors):
             advice = "name the frame of the LiDAR, or of the poses, with `pose_frame`, or accept both as one with `force=True`"
             raise self._no_path(self._lidars[0].frame, self._vehicle, advice)
@@ -145,15 +146,15 @@ class BagRecording(Recording):
         if stamps[-1] < own[0] or stamps[0] > own[-1]:
             expected = f"poses between {own[0] / 1e9:.3f} and {own[-1] / 1e9:.3f} s, the times of the scans"
             raise FormatError(where, expected=expected, found=f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s")
+        self._pose_note = f"{where}: the poses are those of {self._vehicle}"
         return Trajectory(poses, self._seconds(stamps), where)
 
     def notes(self) -> list[str]:
         """Say what is not whole, and what was assumed."""
         notes = [*self._files.notes(), *(note for lidar in self._lidars for note in lidar.notes)]
-        if self._vehicle_assumed:
-            notes.append(
-                f"{self.location}: the messages of poses do not say of which frame they are: {self._vehicle} is taken"
-            )
+        if self._pose_note:
+            assumed = self._pose_child == "" and not self._options.pose_frame
+            notes.append(self._pose_note + (", as assumed: the messages do not say it" if assumed else ""))
         return notes
 
     @cached_property
@@ -177,10 +178,6 @@ class BagRecording(Recording):
         place = next(topic.places())
         placed = read_placed(place.read(), place.channel, str(place))
         return placed[0].child if placed else ""
-
-    @property
-    def _vehicle_assumed(self) -> bool:
-        return self._pose_child == "" and not self._options.pose_frame
 
     @cached_property
     def _vehicle(self) -> str:
@@ -281,9 +278,12 @@ class LidarTopic:
             if "time" not in fields or not np.any(fields["time"]):
                 continue
             try:
-                return message.time_unit or point_seconds(fields["time"], "auto", str(place))[2]  # type: ignore[return-value]
+                unit = message.time_unit or point_seconds(fields["time"], "auto", str(place))[2]
             except FormatError as error:
                 problem = error
+            else:
+                self.notes.append(f"{self.name}: the times of points are in {unit}")
+                return cast(TimeUnit, unit)
         if problem is not None:
             raise problem
         return "auto"
@@ -361,18 +361,12 @@ class BagFrame(FrameHandle):
         return seconds + late
 
 
-def _read_track(topic: Topic, where: str) -> tuple[FrameTrack, str]:
-    """Return the poses of a topic, and the frame in which they are. Of a topic of paths, the last message is read."""
-    track, frame = FrameTrack(where), ""
-    for place in _pose_places(topic):
+def _read_track(topic: Topic, where: str) -> FrameTrack:
+    """Return the poses of a topic. Of a topic of paths, the last message is read, which holds the whole path."""
+    track, places = FrameTrack(where), list(topic.places())
+    for place in places[-1:] if topic.channel.type == PATH else places:
         for placed in read_placed(place.read(), place.channel, str(place)):
             track.add(placed)
-            frame = placed.parent
     if not len(track):
         raise FormatError(where, expected="poses", found="none")
-    return track, frame
-
-
-def _pose_places(topic: Topic) -> Iterator[MessagePlace]:
-    places = list(topic.places())
-    return iter(places[-1:] if topic.channel.type == "nav_msgs/msg/Path" else places)
+    return track

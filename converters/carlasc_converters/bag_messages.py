@@ -24,13 +24,13 @@ from carlasc_converters.rigid import poses_of
 from carlasc_converters.transforms import PlacedFrame
 
 _LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-_PATH = "nav_msgs/msg/Path"
+PATH = "nav_msgs/msg/Path"
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *_LIVOX, "foxglove.PointCloud")
 POSES = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
-    _PATH,
+    PATH,
     "foxglove.PoseInFrame",
     "foxglove.PosesInFrame",
 )
@@ -133,7 +133,7 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
                 for one in message.transforms
             ]
         placed = []
-        for one in message.poses if channel.type == _PATH else [message]:
+        for one in message.poses if channel.type == PATH else [message]:
             pose = one.pose if hasattr(one.pose, "position") else one.pose.pose  # the other one has a covariance
             header = one.header if one.header.frame_id else message.header
             placed.append(

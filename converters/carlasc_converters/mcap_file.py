@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from struct import unpack, unpack_from
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,12 @@ def index_file(path: Path) -> FileIndex:
             at += _HEAD + length
         file.seek(max(size - len(MAGIC), 0))
         if walk.index.lost is None and file.read() != MAGIC:
-            walk.index.lost = "its end is missing, but no message is lost" if kind == _END else "it was not finished"
-    walk.end_chunk(whole=kind == _END)
+            walk.index.lost = "it lacks its end, but no message is lost" if kind == _END else "it was not finished"
+    try:
+        walk.end_chunk(whole=kind == _END)
+    except FormatError:
+        if walk.index.lost is None:
+            raise  # otherwise the last chunk is lost too
     walk.index.channels = {
         number: Channel(topic, walk.schemas.get(schema, "no schema"), encoding)
         for number, (topic, schema, encoding) in walk.channels.items()
@@ -143,7 +148,13 @@ def _read_chunk(path: str, at: int) -> bytes:
         (length,) = unpack_from("<Q", content, begin)
     except (struct.error, UnicodeDecodeError) as error:
         raise FormatError(path, expected=f"a chunk at byte {at}", found=f"damage ({error})") from error
-    return decompressed(content[begin + 8 : begin + 8 + length], codec, path)
+    data, (checksum,) = (
+        decompressed(content[begin + 8 : begin + 8 + length], codec, path),
+        unpack_from("<I", content, 24),
+    )
+    if checksum and crc32(data) != checksum:
+        raise FormatError(path, expected=f"a chunk at byte {at} that fits its checksum", found="damage")
+    return data
 
 
 def _records(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -53,7 +53,11 @@ def index_file(path: Path) -> FileIndex:
             at = end
     if index.lost is None and not closed:
         index.lost = "its recorder did not close it, and what was not written yet is lost"
-    _add_chunk(index, chunk, entries)
+    try:
+        _add_chunk(index, chunk, entries)
+    except FormatError:
+        if index.lost is None:
+            raise  # otherwise the last chunk is lost too
     return index
 
 

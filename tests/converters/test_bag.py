@@ -1,5 +1,8 @@
 """Bags as recordings: the points, times, extrinsics and poses of a simulated drive in each kind, and whole conversions."""
 
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -64,8 +67,10 @@ def test_points_times_and_poses_come_back(tmp_path, kind, poses):
         (sensor,) = recording.sensors
         np.testing.assert_allclose(sensor.vehicle_T_sensor, DRIVE.sensors[0].vehicle_T_sensor, atol=1e-12)
         assert sensor.calibrated and not sensor.deskewed
-        assumed = poses in ("pose", "path")
-        assert any(f"{BASE} is taken" in note for note in recording.notes()) == assumed
+        units, said = recording.notes()
+        assert units == "/lidar/points: the times of points are in s"
+        assert "the poses are those of base_link" in said
+        assert said.endswith(", as assumed: the messages do not say it") == (poses in ("pose", "path"))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -214,3 +219,39 @@ class TestSqliteBag(BagContract):
 
 class TestMcapBag(BagContract):
     kind = "mcap"
+
+
+def write_large(folder, kind, count, size):
+    """Write a bag of a vehicle that stands still, with `count` scans of `size` points: 32 bytes each."""
+    store, random = Messages(kind), np.random.default_rng(0)
+    angles, down = random.uniform(0, 2 * np.pi, size), random.uniform(0.02, 0.4, size)
+    reach = np.minimum(1.7 / np.sin(down), 40)
+    rays = np.stack([np.cos(down) * np.cos(angles), np.cos(down) * np.sin(angles), -np.sin(down)], axis=1)
+    points = np.column_stack([rays * reach[:, None], angles]).astype(np.float32)
+
+    def messages():
+        for stamp in range(START_NS, START_NS + count * 100_000_000, 100_000_000):
+            yield store.cloud("/points", stamp, velodyne(points, angles / 70), LIDAR)
+            yield store.odometry("/odom", stamp, np.eye(4), LIDAR)
+
+    return write_bag(folder, kind, messages(), store=store)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_memory_does_not_grow_with_the_bag(tmp_path, kind):
+    peaks = []
+    for count in (25, 100):  # 80 and 320 MB
+        (tmp_path / str(count)).mkdir()
+        bag = write_large(tmp_path / str(count), kind, count, 100_000)
+        code = (
+            "import resource; from carlasc.converting import convert; from carlasc.running import Run\n"
+            f"result = convert('bag', {str(bag)!r}, {str(tmp_path / f'out{count}')!r}, grids=None, run=Run(workers=1))\n"
+            f"assert len(result.failures) == 0\n"
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+        )
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        peaks.append(int(run.stdout) / 1024)
+        shutil.rmtree(bag.parent)
+    assert peaks[1] < 500, peaks
+    assert peaks[1] - peaks[0] < 60, peaks

@@ -1,16 +1,29 @@
 """Bags that are compressed, cut short or damaged: what is whole is read, and what is lost is said."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from carlasc_converters.bag import Bag
 from carlasc_converters.bag_index import decompressed
+from carlasc_converters.bag_topics import BagFiles
 from helpers.converters.bags import KINDS, Messages, drive_messages, file_of, write_bag
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.testing import SimulatedDrive
 
 pytestmark = pytest.mark.needs("rosbags")
-DRIVE = SimulatedDrive(24, rolling=True, channels=32, columns=500)  # some scans in a chunk of 1 MB
+
+
+class RandomDrive(SimulatedDrive):
+    """A drive whose scans are random points: 0.4 MB each, of which some are in a chunk."""
+
+    def scan(self, frame, sensor=0):
+        points = np.random.default_rng(frame).uniform(1, 50, (12_000, 4)).astype(np.float32)
+        return SimpleNamespace(points=points, seconds=np.linspace(0, 0.1, len(points)))
+
+
+DRIVE = RandomDrive(24, rolling=True)
 CODECS = [("bag", "bz2"), ("bag", "lz4"), ("db3", "message"), ("mcap", "message"), ("mcap", "storage")]
 
 
@@ -35,6 +48,11 @@ def cut(path, share, folder):
     return copy
 
 
+def lost_of(recording):
+    """Return what the recording says of its file."""
+    return [note for note in recording.notes() if note.startswith(f"{recording.location}: it ")]
+
+
 def check_frames(recording):
     """Compare every point that is read with that of the drive."""
     for frame in recording.frames:
@@ -45,7 +63,7 @@ def check_frames(recording):
 @pytest.mark.parametrize(("kind", "codec"), CODECS)
 def test_compressed_bags_hold_the_same_points(bags, kind, codec):
     (recording,) = Bag(bags[kind, codec]).sequences()
-    assert len(recording.frames) == DRIVE.frames and recording.notes() == []
+    assert len(recording.frames) == DRIVE.frames and lost_of(recording) == []
     check_frames(recording)
 
 
@@ -56,7 +74,7 @@ def test_a_bag_that_is_cut_short_gives_what_is_whole(bags, kind, share, least, t
     (recording,) = Bag(path).sequences()
     assert least <= len(recording.frames) <= DRIVE.frames
     check_frames(recording)
-    (note,) = recording.notes()
+    (note,) = lost_of(recording)
     assert note.startswith(f"{path}: ") and str(path.stat().st_size) in note
     truth = DRIVE.world_T_vehicle(recording.times())
     assert np.abs(recording.poses().at(recording.times()) - truth)[:least].max() < 1e-9
@@ -73,7 +91,7 @@ def test_a_compressed_bag_that_is_cut_short_gives_what_is_whole_or_says_why_not(
         return
     assert recording.frames
     check_frames(recording)
-    assert len(recording.notes()) == 1
+    assert len(lost_of(recording)) == 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,14 +110,15 @@ def test_a_bag_whose_end_is_missing_loses_nothing_else(bags, kind, tmp_path):
     path.write_bytes(bags[kind, ""].read_bytes()[:-4])
     (recording,) = Bag(path).sequences()
     assert len(recording.frames) == DRIVE.frames
-    assert len(recording.notes()) == 1
+    assert len(lost_of(recording)) == 1
 
 
 @pytest.mark.parametrize(("kind", "codec"), [("bag", "lz4"), ("mcap", "storage")])
 def test_a_damaged_chunk_costs_its_frames_only(bags, kind, codec, tmp_path):
     data = bytearray(bags[kind, codec].read_bytes())
-    middle = len(data) // 2
-    data[middle : middle + 2000] = bytes(2000)
+    chunks = np.unique(BagFiles([bags[kind, codec]]).topics["/lidar/points"].parts[0][2]["chunk"])
+    begin = int(chunks[len(chunks) // 2]) + 200
+    data[begin : begin + 300_000] = bytes(300_000)
     path = tmp_path / bags[kind, codec].name
     path.write_bytes(data)
     (recording,) = Bag(path).sequences()
@@ -114,6 +133,35 @@ def test_a_damaged_chunk_costs_its_frames_only(bags, kind, codec, tmp_path):
         else:
             assert cloud.points.tobytes() == DRIVE.scan(frame.number).points.tobytes()
     assert 1 <= failed <= DRIVE.frames // 4
+
+
+def test_damage_between_chunks_loses_what_follows(bags, tmp_path):
+    """The header of a record is overwritten, and with it the end of the chunk before."""
+    data = bytearray(bags["bag", "lz4"].read_bytes())
+    chunks = np.unique(BagFiles([bags["bag", "lz4"]]).topics["/lidar/points"].parts[0][2]["chunk"])
+    begin = int(chunks[len(chunks) // 2])
+    data[begin - 3000 : begin + 200] = bytes(3200)
+    path = tmp_path / "drive.bag"
+    path.write_bytes(data)
+    (recording,) = Bag(path).sequences()
+    assert DRIVE.frames // 4 < len(recording.frames) < DRIVE.frames
+    check_frames(recording)
+    (note,) = lost_of(recording)
+    assert "cut short or damaged at byte" in note
+
+
+def test_a_chunk_that_does_not_fit_its_checksum_is_named(tmp_path):
+    writer_of = pytest.importorskip("mcap.writer")
+    path = tmp_path / "drive.mcap"
+    with path.open("wb") as file:
+        writer = writer_of.Writer(file, compression=writer_of.CompressionType.NONE)
+        writer.start()
+        schema = writer.register_schema("foxglove.PointCloud", "protobuf", b"")
+        writer.add_message(writer.register_channel("/points", "protobuf", schema), 1, b"points", 1)
+        writer.finish()
+    path.write_bytes(path.read_bytes().replace(b"points", b"damage"))
+    with pytest.raises(FormatError, match="checksum"):
+        Bag(path).sequences()[0].frames[0].read()
 
 
 def test_a_codec_that_nobody_knows_is_named():
