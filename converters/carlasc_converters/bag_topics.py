@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ class MessagePlace:
         """
         kind = _kind_of(Path(self.path))
         with opening(self.path, f"a message of {self.channel.topic}"):
-            data = kind.read_message(self.path, self.chunk, self.offset)
+            data: bytes = kind.read_message(self.path, self.chunk, self.offset)
         return decompressed(data, "zstd", str(self)) if data.startswith(_ZSTD) else data
 
     def __str__(self) -> str:
@@ -105,7 +106,7 @@ class BagFiles:
         self.topics: dict[str, Topic] = {}
         for path in paths:
             with opening(path, _EXPECTED):
-                index = _kind_of(path).index_file(path)
+                index: FileIndex = _kind_of(path).index_file(path)
             self.indexes.append(index)
             for number, channel in index.channels.items():
                 rows = index.places(number)
@@ -216,7 +217,7 @@ def find_bags(source: Path) -> list[list[Path]]:
     return found
 
 
-def _kind_of(path: Path) -> _Kind:
+def _kind_of(path: Path) -> ModuleType:
     """Return the module that reads a file, by its first bytes.
 
     Raises:
@@ -229,15 +230,7 @@ def _kind_of(path: Path) -> _Kind:
     if kind is None:
         advice = f"unpack it with `zstd -d {path.name}`" if path.name.endswith(_PACKED) else ""
         raise FormatError(path, expected=_EXPECTED, found="another kind of file", advice=advice)
-    return _Kind(kind.index_file, kind.read_message)
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """How a kind of file is read."""
-
-    index_file: Callable[[Path], FileIndex]
-    read_message: Callable[[str, int, int], bytes]
+    return kind
 
 
 def _listed(topics: Sequence[Topic]) -> str:

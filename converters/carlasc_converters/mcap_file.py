@@ -23,7 +23,7 @@ _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 def index_file(path: Path) -> FileIndex:
     """Return where the messages of a file are."""
-    walk, size = _Walk(path), path.stat().st_size
+    walk, size = _McapRecords(path), path.stat().st_size
     at, kind = len(MAGIC), 0
     with path.open("rb") as file:
         while at < size and kind != _END:
@@ -77,7 +77,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     return data[_MESSAGE_HEAD:]
 
 
-class _Walk:
+class _McapRecords:
     """The records of a file so far.
 
     Attributes:

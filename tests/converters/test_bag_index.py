@@ -1,5 +1,6 @@
 """Bags that are compressed, cut short or damaged: what is whole is read, and what is lost is said."""
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ from carlasc_converters.bag_index import decompressed
 from carlasc_converters.bag_topics import BagFiles
 from helpers.converters.bags import KINDS, Messages, drive_messages, file_of, write_bag
 
-from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
 from carlasc.testing import SimulatedDrive
 
 pytestmark = pytest.mark.needs("rosbags")
@@ -167,3 +168,9 @@ def test_a_chunk_that_does_not_fit_its_checksum_is_named(tmp_path):
 def test_a_codec_that_nobody_knows_is_named():
     with pytest.raises(FormatError, match="drive.bag: expected chunks that are not compressed, or .*, found 'snappy'"):
         decompressed(b"", "snappy", "drive.bag")
+
+
+def test_a_codec_that_is_not_installed_is_named_with_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "lz4.frame", None)
+    with pytest.raises(DependencyError, match=r"install it with `pip install 'carlasc\[bags\]'`"):
+        decompressed(b"", "lz4", "drive.bag")

@@ -80,6 +80,32 @@ def test_points_and_their_times_are_those_of_the_driver(kind, driver, tmp_path):
         assert np.abs(cloud.seconds - SECONDS).max() < 1e-6
 
 
+def test_times_of_another_clock_count_from_the_first_point(tmp_path):
+    store = Messages("db3")
+    since_boot = store.cloud("/points", START_NS, packed(LIVOX, 0, "timestamp", 5e15 + SECONDS * 1e9))
+    (recording,) = Bag(write_bag(tmp_path, "db3", [since_boot], store=store)).sequences()
+    (cloud,) = recording.frames[0].read()
+    assert np.abs(cloud.seconds - SECONDS).max() < 1e-6
+
+
+def test_an_mcap_of_ros_1_is_read(tmp_path):
+    writer_of = pytest.importorskip("mcap.writer")
+    store = Messages("bag")
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = writer_of.Writer(file)
+        writer.start("ros1")
+        schema = writer.register_schema("sensor_msgs/PointCloud2", "ros1msg", b"")
+        channel = writer.register_channel("/velodyne_points", "ros1", schema)
+        for _, kind, stamp, message in clouds(store, "velodyne"):
+            writer.add_message(channel, stamp, bytes(store.store.serialize_ros1(message, kind)), stamp)
+        writer.finish()
+    (recording,) = Bag(tmp_path / "drive.mcap").sequences()
+    assert [frame.read()[0].points.tobytes() for frame in recording.frames] == [
+        xyz_of(frame).tobytes() for frame in range(FRAMES)
+    ]
+    np.testing.assert_allclose(recording.times(), np.arange(FRAMES) * 0.1, atol=1e-9)
+
+
 def test_times_in_no_known_unit_are_named_until_the_unit_is_given(tmp_path):
     store = Messages("db3")
     cloud = store.cloud("/points", START_NS, packed(OUSTER, 0, "t", np.arange(COUNT) * 10))

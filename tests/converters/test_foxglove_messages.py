@@ -40,11 +40,15 @@ def pose_json(pose):
     return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": i, "y": j, "z": k, "w": w}}
 
 
-def write_json(path, poses_topic, points, cloud_pose):
+def write_json(path, poses_topic, points, cloud_pose, **options):
     """Write points and poses with the library of the format, as JSON."""
     writer_of = pytest.importorskip("mcap.writer")
+    if "compression" in options:
+        options["compression"] = writer_of.CompressionType[options["compression"]]
+    if "index_types" in options:
+        options["index_types"] = writer_of.IndexType[options["index_types"]]
     with path.open("wb") as file:
-        writer = writer_of.Writer(file)
+        writer = writer_of.Writer(file, **options)
         writer.start()
         channels = {}
         for topic, kind in (("/points", "PointCloud"), (poses_topic, "PoseInFrame")):
@@ -76,6 +80,25 @@ def test_json_is_read_and_the_pose_of_a_cloud_is_applied(tmp_path, moved):
         assert cloud.points[:, 3].tobytes() == points[:, 3].tobytes()
     np.testing.assert_allclose(recording.poses().world_T_vehicle, POSES, atol=1e-12)
     assert any("are those of lidar, as assumed" in note for note in recording.notes())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": "LZ4"},
+        {"compression": "NONE"},
+        {"use_chunking": False},
+        {"index_types": "NONE"},
+        {"chunk_size": 1},
+    ],
+)
+def test_files_of_any_structure_hold_the_same(tmp_path, options):
+    points = np.random.default_rng(0).uniform(-20, 20, (100, 4)).astype(np.float32)
+    write_json(tmp_path / "drive.mcap", "/pose", points, pose_json(np.eye(4)), **options)
+    (recording,) = Bag(tmp_path / "drive.mcap").sequences()
+    assert [frame.read()[0].points.tobytes() for frame in recording.frames] == [points.tobytes()] * FRAMES
+    np.testing.assert_allclose(recording.poses().world_T_vehicle, POSES, atol=1e-12)
+    assert not any("cut short" in note or "finished" in note for note in recording.notes())
 
 
 def test_protobuf_that_is_cut_short_is_no_message():
