@@ -155,6 +155,10 @@ class BagRecording(Recording):
         if self._pose_note:
             assumed = self._pose_child == "" and not self._options.pose_frame
             notes.append(self._pose_note + (", as assumed: the messages do not say it" if assumed else ""))
+        if not all(sensor.calibrated for sensor in self.sensors):
+            notes.append(
+                f"{self.location}: no transforms lead from {self._lidars[0].frame} to {self._vehicle}: both are taken as one"
+            )
         return notes
 
     @cached_property

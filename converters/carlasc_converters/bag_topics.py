@@ -194,8 +194,8 @@ def find_bags(source: Path) -> list[list[Path]]:
     """
     if source.is_file():
         return [[source]]
-    levels = ("*/" * level + "*" for level in range(_LEVELS))
-    files = sorted(path for pattern in levels for path in source.glob(pattern) if path.is_file())
+    patterns = ("*/" * level + f"*{ending}" for level in range(_LEVELS) for ending in (*_ENDINGS, *_PACKED))
+    files = sorted(path for pattern in patterns for path in source.glob(pattern) if path.is_file())
     bags = [path for path in files if path.name.endswith(_ENDINGS)]
     if not bags:
         packed = next((path.name for path in files if path.name.endswith(_PACKED)), None)

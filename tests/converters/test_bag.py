@@ -148,6 +148,7 @@ def test_poses_of_a_frame_that_the_lidar_has_no_path_to_are_refused_or_forced(tm
         recording.poses()
     assert not recording.sensors[0].calibrated
     assert recording.poses(force=True).world_T_vehicle[2, 0, 3] == 2
+    assert any("from lidar to imu: both are taken as one" in note for note in recording.notes())
     (recording,) = Bag(tmp_path / "drive.bag", pose_frame="lidar").sequences()
     assert recording.poses().world_T_vehicle[2, 0, 3] == 2
 

@@ -165,6 +165,28 @@ def test_a_chunk_that_does_not_fit_its_checksum_is_named(tmp_path):
         Bag(path).sequences()[0].frames[0].read()
 
 
+@pytest.mark.parametrize(
+    ("kind", "codec"), [("bag", ""), ("bag", "lz4"), ("db3", ""), ("mcap", ""), ("mcap", "storage")]
+)
+def test_damage_anywhere_is_an_error_of_one_line_or_harmless(kind, codec, tmp_path):
+    store, random, drive = Messages(kind), np.random.default_rng(7), SimulatedDrive(4, channels=6, columns=40)
+    path = file_of(write_bag(tmp_path, kind, drive_messages(store, drive, "tf"), store=store, compressed=codec))
+    whole = path.read_bytes()
+    harmless = 0
+    for _ in range(60):
+        data = np.frombuffer(whole, np.uint8).copy()
+        data[random.integers(0, min(len(data), 8000), 3)] = random.integers(0, 256, 3)
+        path.write_bytes(data[: random.integers(len(data) // 2, 2 * len(data))].tobytes())
+        try:
+            (recording,) = Bag(path).sequences()
+            assert recording.poses() is not None or recording.notes()
+            assert all(len(frame.read()) == len(recording.sensors) for frame in recording.frames)
+            harmless += 1
+        except CarlascError as error:
+            assert "\n" not in str(error)
+    assert 0 < harmless < 60
+
+
 def test_a_codec_that_nobody_knows_is_named():
     with pytest.raises(FormatError, match="drive.bag: expected chunks that are not compressed, or .*, found 'snappy'"):
         decompressed(b"", "snappy", "drive.bag")
