@@ -146,7 +146,7 @@ def test_poses_of_a_frame_that_the_lidar_has_no_path_to_are_refused_or_forced(tm
     )
     with pytest.raises(MissingDataError, match="expected transforms from lidar to imu, found only no frames"):
         recording.poses()
-    assert not recording.sensors[0].calibrated
+    np.testing.assert_array_equal(recording.sensors[0].vehicle_T_sensor, np.eye(4))
     assert recording.poses(force=True).world_T_vehicle[2, 0, 3] == 2
     assert any("from lidar to imu: both are taken as one" in note for note in recording.notes())
     (recording,) = Bag(tmp_path / "drive.bag", pose_frame="lidar").sequences()

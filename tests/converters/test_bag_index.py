@@ -134,6 +134,9 @@ def test_a_damaged_chunk_costs_its_frames_only(bags, kind, codec, tmp_path):
         else:
             assert cloud.points.tobytes() == DRIVE.scan(frame.number).points.tobytes()
     assert 1 <= failed <= DRIVE.frames // 4
+    truth = DRIVE.world_T_vehicle(recording.times())
+    assert np.abs(recording.poses().at(recording.times()) - truth)[: DRIVE.frames // 3].max() < 1e-9
+    assert any("messages are left out" in note for note in recording.notes())
 
 
 def test_damage_between_chunks_loses_what_follows(bags, tmp_path):
