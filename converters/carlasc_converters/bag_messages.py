@@ -32,7 +32,6 @@ POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     PATH,
     "foxglove.PoseInFrame",
-    "foxglove.PosesInFrame",
 )
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
@@ -116,10 +115,9 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
     """
     message = _decode(data, channel, where)
     with reading(where, f"a message of type {channel.type}"):
-        if channel.type in ("foxglove.PoseInFrame", "foxglove.PosesInFrame"):
-            poses = message.poses if channel.type.endswith("PosesInFrame") else [message.pose]
-            stamp, frame = _stamp(message.timestamp), _frame(message.frame_id)
-            return [PlacedFrame(stamp, frame, "", _numbers(pose.position, pose.orientation)) for pose in poses]
+        if channel.type == "foxglove.PoseInFrame":
+            numbers = _numbers(message.pose.position, message.pose.orientation)
+            return [PlacedFrame(_stamp(message.timestamp), _frame(message.frame_id), "", numbers)]
         if channel.type.startswith("foxglove."):
             return [
                 PlacedFrame(

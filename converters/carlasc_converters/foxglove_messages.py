@@ -21,7 +21,6 @@ _MESSAGES: dict[str, dict[int, tuple[str, str]]] = {
     "pose": {1: ("position", "vector"), 2: ("orientation", "quaternion")},
     "field": {1: ("name", "text"), 2: ("offset", "fixed32"), 3: ("type", "number")},
     "foxglove.PoseInFrame": _STAMPED | {2: ("frame_id", "text"), 3: ("pose", "pose")},
-    "foxglove.PosesInFrame": _STAMPED | {2: ("frame_id", "text"), 3: ("poses", "pose[]")},
     "foxglove.FrameTransforms": {1: ("transforms", "foxglove.FrameTransform[]")},
     "foxglove.FrameTransform": _STAMPED
     | {

@@ -23,7 +23,9 @@ from helpers.converters.bags import (
 import carlasc
 from carlasc.converting import Sensor, convert
 from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.groundtruth import GridOptions
 from carlasc.running import Run
 from carlasc.testing import ConverterContract, SimulatedDrive
 
@@ -49,7 +51,7 @@ def recording_of(folder, kind, messages, **options):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("poses", ["odometry", "pose", "path", "tf"])
+@pytest.mark.parametrize("poses", ["odometry", "pose", "covariance", "path", "tf"])
 def test_points_times_and_poses_come_back(tmp_path, kind, poses):
     bag = write(tmp_path, kind, poses=poses)
     for source in {bag, file_of(bag), tmp_path}:
@@ -70,7 +72,7 @@ def test_points_times_and_poses_come_back(tmp_path, kind, poses):
         units, said = recording.notes()
         assert units == "/lidar/points: the times of points are in s"
         assert "the poses are those of base_link" in said
-        assert said.endswith(", as assumed: the messages do not say it") == (poses in ("pose", "path"))
+        assert said.endswith(", as assumed: the messages do not say it") == (poses in ("pose", "covariance", "path"))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -220,6 +222,20 @@ class TestSqliteBag(BagContract):
 
 class TestMcapBag(BagContract):
     kind = "mcap"
+
+
+def test_every_kind_of_bag_gives_the_same_grids_byte_for_byte(tmp_path):
+    drive, spec = SimulatedDrive(5, rolling=True, channels=12, columns=120), GridSpec.published().with_size((32, 32, 4))
+    grids = []
+    for kind in KINDS:
+        (tmp_path / kind).mkdir()
+        bag = write(tmp_path / kind, kind, drive)
+        result = convert("bag", bag, tmp_path / f"{kind}.out", grids=GridOptions(spec), run=Run(workers=1))
+        assert result.failures == ()
+        files = sorted((tmp_path / f"{kind}.out").glob("**/evaluation*/0*"))
+        grids.append({file.name: file.read_bytes() for file in files})
+    assert len(grids[0]) >= 2 * drive.frames and any(any(data) for data in grids[0].values())
+    assert grids[0] == grids[1] == grids[2]
 
 
 def write_large(folder, kind, count, size):

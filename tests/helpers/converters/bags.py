@@ -78,6 +78,11 @@ class Messages:
         kind = "geometry_msgs/msg/PoseStamped"
         return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, WORLD), self.pose(pose))
 
+    def pose_with_covariance(self, topic, stamp_ns, pose):
+        kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        placed = self.make("geometry_msgs/msg/PoseWithCovariance", self.pose(pose), np.zeros(36))
+        return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, WORLD), placed)
+
     def path(self, topic, stamps, poses):
         kind = "nav_msgs/msg/Path"
         placed = [self.pose_stamped("", stamp, pose)[3] for stamp, pose in zip(stamps, poses, strict=True)]
@@ -159,7 +164,7 @@ def velodyne(points, seconds=None):
 def drive_messages(store: Messages, drive: SimulatedDrive, poses: str = "odometry") -> Sequence[tuple]:
     """Return the messages of a drive: a topic of points a sensor, its transform, and poses of `base_link`, by time.
 
-    Poses: "odometry", "pose", "path", "tf" or "none".
+    Poses: "odometry", "pose", "covariance", "path", "tf" or "none".
     """
     messages = []
     stamps = [START_NS + round(seconds * 1e9) for seconds in drive.times.tolist()]
@@ -181,6 +186,8 @@ def drive_messages(store: Messages, drive: SimulatedDrive, poses: str = "odometr
         for tick, pose in zip(ticks, placed, strict=True):
             if poses == "odometry":
                 messages.append(store.odometry("/odom", tick, pose))
+            elif poses == "covariance":
+                messages.append(store.pose_with_covariance("/pose", tick, pose))
             elif poses == "pose":
                 messages.append(store.pose_stamped("/pose", tick, pose))
             else:
