@@ -88,7 +88,10 @@ class Topic:
         """Say the name, type, count and rate."""
         span = float(np.ptp(self.times)) / 1e9 if len(self) > 1 else 0.0
         rate = f", {(len(self) - 1) / span:.3g} Hz" if span else ""
-        return f"{self.channel.topic} ({self.channel.type.rpartition('/')[2]}, {len(self)} messages{rate})"
+        kind = self.channel.type.rpartition("/")[2] + (
+            "" if is_readable(self.channel) else f" as {self.channel.encoding}"
+        )
+        return f"{self.channel.topic} ({kind}, {len(self)} messages{rate})"
 
 
 class BagFiles:
@@ -136,7 +139,7 @@ class BagFiles:
         """
         found = self.of_types(CLOUDS)
         if names:
-            return [self._named("topics", name.strip(), CLOUDS, found) for name in names.split(",")]
+            return [self._named("topics", name.strip(), found) for name in names.split(",")]
         if not found:
             lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
             raise MissingDataError(
@@ -162,7 +165,7 @@ class BagFiles:
         """
         found = self.of_types(POSES)
         if name:
-            return self._named("pose_topic", name, (*POSES, *TRANSFORMS), found + self.of_types(TRANSFORMS))
+            return self._named("pose_topic", name, found + self.of_types(TRANSFORMS))
         if len(found) > 1:
             expected = f"one of {_listed(found)} in {self.location}"
             raise ArgumentError("pose_topic", expected=expected, found="none")
@@ -175,14 +178,11 @@ class BagFiles:
             lost.append(f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and the next")
         return lost
 
-    def _named(self, option: str, name: str, types: Sequence[str], found: Sequence[Topic]) -> Topic:
+    def _named(self, option: str, name: str, found: Sequence[Topic]) -> Topic:
         if (topic := next((topic for topic in found if topic.channel.topic == name), None)) is not None:
             return topic
         other = self.topics.get(name)
-        if other is not None and other.channel.type in types:
-            encoding = other.channel.encoding
-            raise FormatError(self.location, expected=f"{name} in ROS or Foxglove encoding", found=repr(encoding))
-        said = f"{name!r}" if other is None else f"{name!r} of the unknown type {other.channel.type}"
+        said = f"{name!r}" if other is None else f"{other}, which is not read"
         raise ArgumentError(option, expected=f"one of {_listed(found)} in {self.location}", found=said)
 
 

@@ -36,7 +36,7 @@ def index_file(path: Path) -> FileIndex:
                 if end > size:
                     raise EOFError
                 if kind == _HEADER:
-                    closed = any(fields[b"index_pos"])
+                    closed = 0 < _number(fields, b"index_pos") <= size
                 elif kind == _CHUNK:
                     _add_chunk(index, chunk, entries)
                     chunk, entries = at, []

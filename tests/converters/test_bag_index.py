@@ -1,5 +1,6 @@
 """Bags that are compressed, cut short or damaged: what is whole is read, and what is lost is said."""
 
+import re
 import sys
 from types import SimpleNamespace
 
@@ -51,7 +52,7 @@ def cut(path, share, folder):
 
 def lost_of(recording):
     """Return what the recording says of its file."""
-    return [note for note in recording.notes() if note.startswith(f"{recording.location}: it ")]
+    return [note for note in recording.notes() if re.match(r".*: (it|its) ", note)]
 
 
 def check_frames(recording):
@@ -112,6 +113,19 @@ def test_a_bag_whose_end_is_missing_loses_nothing_else(bags, kind, tmp_path):
     (recording,) = Bag(path).sequences()
     assert len(recording.frames) == DRIVE.frames
     assert len(lost_of(recording)) == 1
+
+
+def test_a_bag_that_its_recorder_did_not_close_is_read(bags, tmp_path):
+    data = bytearray(bags["bag", ""].read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    end = int.from_bytes(data[at : at + 8], "little")
+    data[at : at + 8] = bytes(8)
+    (tmp_path / "drive.bag.active").write_bytes(data[:end])
+    (recording,) = Bag(tmp_path).sequences()
+    assert recording.name == "drive" and len(recording.frames) == DRIVE.frames
+    check_frames(recording)
+    (note,) = lost_of(recording)
+    assert "its recorder did not close it" in note
 
 
 @pytest.mark.parametrize(("kind", "codec"), [("bag", "lz4"), ("mcap", "storage")])

@@ -6,7 +6,7 @@ from carlasc_converters.bag import Bag
 from carlasc_converters.bag_topics import find_bags
 from helpers.converters.bags import KINDS, START_NS, Messages, file_of, velodyne, write_bag
 
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 
 pytestmark = pytest.mark.needs("rosbags")
 POINTS = np.random.default_rng(0).uniform(1, 50, (50, 4)).astype(np.float32)
@@ -56,10 +56,23 @@ def test_a_topic_that_does_not_exist_or_has_another_type_is_named(tmp_path):
     message = refused(ArgumentError, lambda: Bag(bag, topics="/lidar").sequences())
     assert "topics: expected one of /points (PointCloud2, 3 messages, 10 Hz) in" in message and "'/lidar'" in message
     message = refused(ArgumentError, lambda: Bag(bag, topics="/chatter").sequences())
-    assert "found '/chatter' of the unknown type std_msgs/msg/String" in message
+    assert "found /chatter (String, 3 messages, 10 Hz), which is not read" in message
     (recording,) = Bag(bag, pose_topic="/chatter").sequences()
     message = refused(ArgumentError, recording.poses)
     assert "pose_topic: expected one of /odom (Odometry, 3 messages, 10 Hz) in" in message
+
+
+def test_points_in_an_encoding_that_is_not_read_are_named(tmp_path):
+    writer_of = pytest.importorskip("mcap.writer")
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = writer_of.Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.PointCloud", "flatbuffer", b"")
+        writer.add_message(writer.register_channel("/points", "flatbuffer", schema), 1, b"", 1)
+        writer.finish()
+    for options in ({}, {"topics": "/points"}):
+        message = refused(CarlascError, lambda options=options: Bag(tmp_path / "drive.mcap", **options).sequences())
+        assert "found /points (foxglove.PointCloud as flatbuffer, 1 messages)" in message
 
 
 def test_several_topics_of_poses_are_listed(tmp_path):
