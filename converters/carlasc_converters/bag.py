@@ -138,7 +138,7 @@ class BagRecording(Recording):
             for placed in self._placed(topic):
                 track.add(placed)
             if not len(track):
-                raise FormatError(where, expected="poses", found="none")
+                raise FormatError(where, expected="poses", found="none that can be read")
             stamps, poses = track.values
         if self._unplaced and not force:
             advice = (
@@ -198,19 +198,13 @@ class BagRecording(Recording):
         return wanted if wanted and not self._unplaced else next(bases, lidar)
 
     def _placed(self, topic: Topic) -> Iterator[PlacedFrame]:
-        """Yield the poses or transforms of a topic. Of a topic of paths, the last message is read, which holds the whole path.
-
-        Raises:
-            FormatError: no message can be read.
-        """
+        """Yield the poses or transforms of a topic. Of a topic of paths, the last message is read, which holds the whole path."""
         places, errors = list(topic.places()), list[FormatError]()
         for place in places[-1:] if topic.channel.type == PATH else places:
             try:
                 yield from read_placed(place.read(), place.channel, str(place))
             except FormatError as error:
                 errors.append(error)
-        if errors and len(errors) == len(places):
-            raise errors[0]
         if errors:
             self._notes.append(f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out")
 

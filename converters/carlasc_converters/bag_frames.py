@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
@@ -71,8 +71,25 @@ class LidarTopic:
     @cached_property
     def frame(self) -> str:
         """The frame of the sensor."""
-        place = self.places[0]
-        return read_cloud(place.read(), place.channel, str(place)).frame
+        return next(self._readable()).frame
+
+    def _readable(self) -> Iterator[CloudMessage]:
+        """Yield the first messages that can be read.
+
+        Raises:
+            FormatError: none can.
+        """
+        problem, count = None, 0
+        for place in self.places:
+            try:
+                yield read_cloud(place.read(), place.channel, str(place))
+                count += 1
+            except FormatError as error:
+                problem = problem or error
+            if count == _PROBES:
+                return
+        if problem is not None and not count:
+            raise problem
 
     @cached_property
     def unit(self) -> TimeUnit:
@@ -80,13 +97,12 @@ class LidarTopic:
         if self._time_unit != "auto":
             return self._time_unit
         problem: FormatError | None = None
-        for place in self.places[:_PROBES]:
-            message = read_cloud(place.read(), place.channel, str(place))
-            fields = named_fields(message.columns, str(place))
+        for message in self._readable():
+            fields = named_fields(message.columns, self.name)
             if "time" not in fields or not np.any(fields["time"]):
                 continue
             try:
-                unit = message.time_unit or point_seconds(fields["time"], "auto", str(place))[2]
+                unit = message.time_unit or point_seconds(fields["time"], "auto", self.name)[2]
             except FormatError as error:
                 problem = error
             else:

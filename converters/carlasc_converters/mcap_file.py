@@ -24,26 +24,28 @@ _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 def index_file(path: Path) -> FileIndex:
     """Return where the messages of a file are."""
     walk, size = _McapRecords(path), path.stat().st_size
-    at, kind = len(MAGIC), 0
+    at, ended = len(MAGIC), False
     with path.open("rb") as file:
-        while at < size and kind != _END:
+        while at < size - len(MAGIC) or not ended:
             file.seek(at)
             head = file.read(_HEAD)
             kind, length = unpack("<BQ", head) if len(head) == _HEAD else (0, size)
             if at + _HEAD + length > size or not kind:
-                walk.index.lost = f"it is cut short at byte {at} of {size}, and what follows is lost"
+                if not ended:
+                    walk.index.lost = f"it is cut short at byte {at} of {size}, and what follows is lost"
                 break
+            ended = ended or kind == _END
             if kind == _CHUNK:
                 walk.end_chunk()
                 walk.chunk = at
-            else:
+            elif kind in (_SCHEMA, _CHANNEL, _MESSAGE, _INDEX):
                 walk.take(kind, file.read(length if kind != _MESSAGE else _MESSAGE_HEAD), at)
             at += _HEAD + length
         file.seek(max(size - len(MAGIC), 0))
-        if walk.index.lost is None and file.read() != MAGIC:
-            walk.index.lost = "it lacks its end, but no message is lost" if kind == _END else "it was not finished"
+        if ended and file.read() != MAGIC:
+            walk.index.lost = "it lacks its end, but no message is lost"
     try:
-        walk.end_chunk(whole=kind == _END)
+        walk.end_chunk(whole=ended)
     except FormatError:
         if walk.index.lost is None:
             raise  # otherwise the last chunk is lost too
@@ -113,11 +115,16 @@ class _McapRecords:
         if chunk < 0:
             return
         if whole and entries and all(number in self.channels for number, _ in entries):
-            for number, rows in entries:
-                self.index.add(number, chunk, rows["time"].astype(np.int64), rows["offset"].astype(np.int64))
+            self._add(chunk, entries)
             return
         found: dict[int, list[tuple[int, int]]] = {}
-        data = _read_chunk(self.index.path, chunk)
+        try:
+            data = _read_chunk(self.index.path, chunk)
+        except FormatError:
+            if not (whole and entries):
+                raise
+            self._add(chunk, entries)  # the channels may be known later; its frames say that it is damaged
+            return
         for kind, begin, end in _records(data):
             if kind == _MESSAGE:
                 number, _, time = unpack_from("<HIQ", data, begin)
@@ -127,6 +134,10 @@ class _McapRecords:
         for number, places in found.items():
             times, offsets = np.array(places, np.int64).T
             self.index.add(number, chunk, times, offsets)
+
+    def _add(self, chunk: int, entries: list[tuple[int, NDArray[np.void]]]) -> None:
+        for number, rows in entries:
+            self.index.add(number, chunk, rows["time"].astype(np.int64), rows["offset"].astype(np.int64))
 
     def _learn(self, kind: int, content: bytes) -> None:
         if kind == _SCHEMA:

@@ -82,22 +82,32 @@ def _add_chunk(index: FileIndex, chunk: int, entries: list[tuple[int, NDArray[np
     if chunk < 0:
         return
     if not entries or any(connection not in index.channels for connection, _ in entries):
-        times, offsets = dict[int, list[int]](), dict[int, list[int]]()
-        data, at = _read_chunk(index.path, chunk), 0
-        for kind, fields, begin, end in _records(data, 0):
-            number = _number(fields, b"conn")
-            if kind == _CONNECTION:
-                _learn(index, fields, data[begin:end])
-            elif kind == _MESSAGE:
-                seconds, rest = unpack("<II", fields[b"time"])
-                times.setdefault(number, []).append(seconds * 10**9 + rest)
-                offsets.setdefault(number, []).append(at)
-            at = end
-        for number in times:
-            index.add(number, chunk, times[number], offsets[number])
-        return
+        try:
+            _scan_chunk(index, chunk)
+            return
+        except FormatError:
+            if not entries:
+                raise
+            # The connections may be known later; its frames say that it is damaged.
     for number, rows in entries:
         index.add(number, chunk, rows["s"].astype(np.int64) * 10**9 + rows["ns"], rows["offset"])
+
+
+def _scan_chunk(index: FileIndex, chunk: int) -> None:
+    """Add the messages of a chunk from its content."""
+    times, offsets = dict[int, list[int]](), dict[int, list[int]]()
+    data, at = _read_chunk(index.path, chunk), 0
+    for kind, fields, begin, end in _records(data, 0):
+        number = _number(fields, b"conn")
+        if kind == _CONNECTION:
+            _learn(index, fields, data[begin:end])
+        elif kind == _MESSAGE:
+            seconds, rest = unpack("<II", fields[b"time"])
+            times.setdefault(number, []).append(seconds * 10**9 + rest)
+            offsets.setdefault(number, []).append(at)
+        at = end
+    for number in times:
+        index.add(number, chunk, times[number], offsets[number])
 
 
 def _learn(index: FileIndex, fields: _Fields, data: bytes) -> None:
