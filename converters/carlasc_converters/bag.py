@@ -162,7 +162,7 @@ class BagRecording(Recording):
             notes.append(
                 f"{self.location}: no transforms lead from {self._lidars[0].frame} to {self._unplaced}: both are taken as one"
             )
-        return notes
+        return list(dict.fromkeys(notes))
 
     @cached_property
     def _tree(self) -> FrameTree:

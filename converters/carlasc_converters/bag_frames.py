@@ -44,14 +44,19 @@ class LidarTopic:
     @cached_property
     def _read(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
         """The time and place of each message, by time. One that cannot be read comes after the one before it: its frame says why."""
-        stamps, places = list[int](), list[MessagePlace]()
-        for recorded, place in zip(self._topic.times.tolist(), self._topic.places(), strict=True):
+        found, places = list[int | None](), list(self._topic.places())
+        for place in places:
             try:
-                stamps.append(read_stamp(place.read(), place.channel, str(place)) or recorded)
+                found.append(read_stamp(place.read(), place.channel, str(place)))
             except FormatError:
-                stamps.append(stamps[-1] + 1 if stamps else recorded)
-            places.append(place)
-        times, first = np.unique(np.array(stamps, np.int64), return_index=True)
+                found.append(None)
+        lead = next((row for row, stamp in enumerate(found) if stamp is not None), 0)
+        stamps = [(found[lead] or 0) - lead - 1]
+        for stamp in found:
+            stamps.append(stamps[-1] + 1 if stamp is None else stamp)
+        del stamps[0]
+        known = np.array(stamps, np.int64) if any(found) else self._topic.times  # nobody filled them
+        times, first = np.unique(known, return_index=True)
         if len(times) < len(stamps):
             self.notes.append(
                 f"{self.name}: {len(stamps) - len(times)} messages have the time of another one, and are left out"

@@ -112,6 +112,19 @@ def test_the_message_nearest_in_time_belongs_to_a_frame_and_its_points_keep_thei
     np.testing.assert_allclose(frames[3][1].seconds, 0.03, atol=1e-9)
 
 
+@pytest.mark.parametrize(("stamps", "expected"), [([0, 0, 0], [0, 0.2, 0.4]), ([0, 10**8, 2 * 10**8], [0, 0.1, 0.2])])
+def test_times_of_a_simulator_begin_at_0_and_those_that_nobody_filled_are_when_it_was_recorded(
+    tmp_path, stamps, expected
+):
+    def messages(store):
+        for frame, stamp in enumerate(stamps):
+            topic, kind, _, message = store.cloud("/points", stamp, velodyne(POINTS))
+            yield topic, kind, START_NS + frame * 200_000_000, message
+
+    recording = recording_of(tmp_path, "db3", messages)
+    np.testing.assert_allclose(recording.times(), expected, atol=1e-9)
+
+
 def test_several_lidars_without_transforms_between_them_are_refused(tmp_path):
     def messages(store):
         for stamp in range(START_NS, START_NS + 300_000_000, 100_000_000):
