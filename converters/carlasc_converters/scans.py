@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -13,38 +12,22 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Trajectory
+from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core.classes import Remap
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc_converters.calibration_file import axes_named, in_axes, read_calibration
-from carlasc_converters.files import opening, read_bytes
 from carlasc_converters.given_classes import classes_given
-from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds, whole_numbers
+from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
 from carlasc_converters.point_files import FORMATS, read_columns
 from carlasc_converters.pose_files import PoseRows, nanoseconds, read_poses, read_stamps
+from carlasc_converters.scan_files import ScanFile, ScanOptions
 
 _TABLES = (".csv", ".txt")  # suffixes that files of poses and times have too
 _STAMPED = re.compile(r"\d{9,}(\.\d+)?|\d+\.\d{6,}")  # the name of a file that is the time of its scan
 _LABELS = (".label", ".npy", ".txt")
 _SLACK_NS = 10**9  # a scan so long before the first pose or after the last one gets a pose
-
-
-@dataclass(frozen=True)
-class ScanOptions:
-    """The options of `Scans`, which says what they mean."""
-
-    columns: tuple[str, ...] | None
-    pose_file: Path | None
-    pose_of: Literal["auto", "sensor", "vehicle"]
-    calibration: Path | None
-    time_file: Path | None
-    time_unit: TimeUnit
-    label_dir: Path | None
-    has_classes: bool
-    axes: Transform
-    deskewed: bool
 
 
 class Scans(Converter):
@@ -315,86 +298,6 @@ class ScanFolder(Recording):
         if "label" in self._first and not options.has_classes:
             notes.append("points have a field of classes, which was not read: `source_classes` says what they mean")
         return notes
-
-
-@dataclass(frozen=True)
-class ScanFile(FrameHandle):
-    """A scan: one file, or one for each LiDAR.
-
-    Attributes:
-        number: its place in the order of the files.
-        paths: a file for each LiDAR.
-        labels: the file of the classes of its points, of the first LiDAR.
-        fields: fields that each file must have, those of the first one.
-        options: what the caller said of the files.
-        unit: unit of the times of points; empty if they have none.
-        stamp: nanoseconds of the scan, where times of points are those of a clock.
-    """
-
-    number: int
-    paths: tuple[str, ...]
-    labels: str | None
-    fields: tuple[str, ...]
-    options: ScanOptions
-    unit: str
-    stamp: int | None
-
-    @property
-    def location(self) -> str:  # type: ignore[override]
-        """The first file."""
-        return self.paths[0]
-
-    def read(self) -> Sequence[Cloud]:
-        """Read the points; those that are not finite are left out: a ray that hit nothing."""
-        return [self._read(index, path) for index, path in enumerate(self.paths)]
-
-    def _read(self, index: int, path: str) -> Cloud:
-        found = named_fields(read_columns(Path(path), self.options.columns), path)
-        if set(found) != set(self.fields):
-            raise FormatError(
-                path, expected=f"the fields of the first scan ({', '.join(self.fields)})", found=", ".join(found)
-            )
-        points, seconds = found["points"], None
-        if self.unit:
-            seconds, start, _ = point_seconds(found["time"], self.unit, path)  # type: ignore[arg-type]
-            if start is not None and self.stamp is not None:
-                seconds = seconds + (start - self.stamp) / 1e9
-        labels = found.get("label") if self.options.has_classes else None
-        if self.labels is not None and index == 0:
-            labels = read_labels(Path(self.labels), len(points))
-        instances = found.get("instance") if self.options.has_classes else None
-        finite = np.isfinite(points).all(axis=1)
-        if not finite.any():
-            raise FormatError(path, expected="points", found="none that is finite", advice="remove the scan")
-        points = points[finite]
-        if not np.array_equal(self.options.axes, np.eye(4)):
-            points = points.copy()
-            points[:, :3] = points[:, :3] @ self.options.axes[:3, :3].T.astype(np.float32)
-        return Cloud(
-            points,
-            labels=None if labels is None else labels[finite],
-            instances=None if instances is None else instances[finite],
-            seconds=None if seconds is None else seconds[finite],
-            sensor=index,
-        )
-
-
-def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
-    """Return the (N,) class ids of a file: .label (uint32, of which the lower 16 bits count), .npy, or .txt with one per line.
-
-    Raises:
-        FormatError: it has not `count` of them, or others than whole numbers.
-    """
-    if path.suffix == ".label":
-        with opening(path, "uint32 values"):
-            labels = np.frombuffer(read_bytes(path), "<u4") & np.uint32(0xFFFF)
-    else:
-        with opening(path, "a class id for each point"):
-            values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=1)
-        labels = whole_numbers(values.reshape(-1), str(path))
-    if len(labels) != count:
-        raise FormatError(path, expected=f"a label for each of {count} points", found=str(len(labels)))
-    return labels.astype(np.uint32)
 
 
 def _natural(path: Path) -> list[Any]:

@@ -7,12 +7,13 @@ import json
 import numpy as np
 import pytest
 from carlasc_converters.scans import Scans
-from helpers.converters.scan_files import PCD, write_poses, write_scan
+from helpers.converters import bags
+from helpers.converters.scan_writers import PCD, write_poses, write_scan
 
 import carlasc
 from carlasc import GridSpec, Run
 from carlasc.converting import LayoutOptions, Sensor, convert
-from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.geometry import quaternions_of, rotation_z, translation
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth import GridOptions
 from carlasc.motion import PoseOptions
@@ -50,9 +51,8 @@ def write_drive(folder, drive, suffix, ids=None, poses="tum", **how):
 class ScansContract(ConverterContract):
     converter = "scans"
     ids = IDS
-    drive = SimulatedDrive(8, rolling=True)
+    drive = SimulatedDrive(8)
     keeps = frozenset({"labels", "instances", "poses", "times", "seconds"})
-    points_m = 2e-2  # moved to the time of the frame by poses at 10 Hz
     suffix, kind, how = ".npy", "tum", {}
 
     def write(self, folder):
@@ -70,6 +70,9 @@ class TestNpy(ScansContract):
 
 @pytest.mark.needs("open3d")
 class TestPcd(ScansContract):
+    drive = SimulatedDrive(8, rolling=True)
+    keeps = frozenset({"labels", "poses", "times", "seconds"})
+    points_m = 2e-2  # moved to the time of the frame by poses at 10 Hz
     suffix, kind, how = ".pcd", "csv", PCD["compressed"]
 
 
@@ -209,6 +212,31 @@ def test_the_folder_and_the_poses_of_any_format_give_the_same_grids_byte_for_byt
         given = {"pose_file": str(folder / f"poses.{kind}"), "time_file": str(folder / "times.txt")}
         out = tmp_path / f"{suffix[1:]}.out"
         assert convert("scans", scans, out, grids=GridOptions(spec), options=given, run=Run(workers=1)).failures == ()
+        grids.append({file.name: file.read_bytes() for file in out.glob("**/evaluation*/0*")})
+    assert len(grids[0]) >= 2 * DRIVE.frames
+    assert grids[0] == grids[1]
+
+
+@pytest.mark.needs("rosbags")
+def test_the_folder_and_the_bag_give_the_same_grids_byte_for_byte(tmp_path):
+    store, spec = bags.Messages("mcap"), GridSpec.published().with_size((32, 32, 4))
+    (sensor,) = DRIVE.sensors
+    bag = bags.write_bag(tmp_path, "mcap", bags.drive_messages(store, DRIVE), store=store)
+    stamps = bags.START_NS + np.round(DRIVE.times * 1e9).astype(np.int64)
+    for frame, stamp in enumerate(stamps.tolist()):
+        fields = fields_of(DRIVE, frame)
+        write_scan(tmp_path / f"scans/{stamp}.npy", fields | {"time": fields["time"].astype(np.float32)})
+    times = np.arange(-0.1, DRIVE.times[-1] + 0.2, DRIVE.period_s / 2)
+    times[np.abs(times[:, None] - DRIVE.times).argmin(axis=0)] = DRIVE.times
+    write_poses(tmp_path / "poses.euroc", DRIVE.world_T_vehicle(times), times, "euroc", bags.START_NS)
+    w, x, y, z = quaternions_of(sensor.vehicle_T_sensor[None, :3, :3])[0].tolist()
+    place = {"translation": sensor.vehicle_T_sensor[:3, 3].tolist(), "rotation": [x, y, z, w]}
+    (tmp_path / "rig.json").write_text(json.dumps({"sensors": {sensor.name: place}}))
+    given = {"pose_file": str(tmp_path / "poses.euroc"), "calibration": str(tmp_path / "rig.json")}
+    grids = []
+    for name, source, options in (("bag", bag, {}), ("scans", tmp_path / "scans", given)):
+        out = tmp_path / f"{name}.out"
+        assert convert(name, source, out, grids=GridOptions(spec), options=options, run=Run(workers=1)).failures == ()
         grids.append({file.name: file.read_bytes() for file in out.glob("**/evaluation*/0*")})
     assert len(grids[0]) >= 2 * DRIVE.frames
     assert grids[0] == grids[1]

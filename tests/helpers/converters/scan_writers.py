@@ -62,8 +62,8 @@ def write_with_laspy(path: Path, fields: dict[str, np.ndarray]) -> None:
     cloud.write(str(path))
 
 
-def write_poses(path: Path, poses: np.ndarray, seconds: np.ndarray, kind: str) -> None:
-    """Write (K, 4, 4) poses at some times as a file of a kind: tum, kitti, euroc, csv or npy."""
+def write_poses(path: Path, poses: np.ndarray, seconds: np.ndarray, kind: str, start_ns: int = 0) -> None:
+    """Write (K, 4, 4) poses at some times as a file of a kind: tum, kitti, euroc, csv or npy; `start_ns` is added to nanoseconds."""
     w, x, y, z = quaternions_of(poses[:, :3, :3]).T
     places = poses[:, :3, 3].T
     if kind == "npy":
@@ -73,7 +73,7 @@ def write_poses(path: Path, poses: np.ndarray, seconds: np.ndarray, kind: str) -
     elif kind == "tum":
         np.savetxt(path, np.stack([seconds, *places, x, y, z, w], axis=1), "%.17g", header="t x y z qx qy qz qw")
     else:
-        stamps = [str(round(second * 1e9)) for second in seconds.tolist()]
+        stamps = [str(start_ns + round(second * 1e9)) for second in seconds.tolist()]
         rows = np.stack([*places, w, x, y, z], axis=1).tolist()
         euroc = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
         lines = [euroc if kind == "euroc" else "time_ns,x,y,z,qw,qx,qy,qz"]

@@ -1,0 +1,230 @@
+"""Bags of ROS 1, ROS 2 and Foxglove: see the page `docs/sets/bag.md`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Trajectory
+from carlasc.core.classes import Remap
+from carlasc.core.tables import CARLA
+from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc_converters.bag_frames import BagFrame, CloudPlace, LidarTopic
+from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
+from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
+from carlasc_converters.point_fields import TimeUnit
+from carlasc_converters.transforms import FrameTrack, FrameTree, PlacedFrame
+
+_BASES = ("base_link", "base_footprint")  # names of the frame of a vehicle, by ROS' REP 105
+_WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
+
+
+class Bag(Converter):
+    """Reads bags of ROS 1 (.bag), ROS 2 (.db3, .mcap) and Foxglove (.mcap), without ROS."""
+
+    title: ClassVar[str] = "a bag of ROS 1, ROS 2 or Foxglove"
+    classes = CARLA
+    to_carla = Remap("carla", CARLA, CARLA, {label: label for label in CARLA.names})
+
+    def __init__(
+        self,
+        source: Path,
+        *,
+        topics: Annotated[
+            str, "Topics of points, one a LiDAR, by commas; the messages of the first are the frames."
+        ] = "",
+        pose_topic: Annotated[str, "Topic of the poses, or /tf; otherwise the only one of its kind."] = "",
+        pose_frame: Annotated[str, "Frame whose poses these are, where the messages do not say it."] = "",
+        world_frame: Annotated[str, "Frame in which poses from /tf are: odom, map, world, or the root."] = "",
+        time_unit: Annotated[TimeUnit, "Unit of the times of points; auto: from how long a scan takes."] = "auto",
+        deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
+    ) -> None:
+        super().__init__(source)
+        self.options = BagOptions(topics, pose_topic, pose_frame, world_frame, time_unit, deskewed)
+
+    def sequences(self) -> list[Recording]:
+        """Return the recordings, by name.
+
+        Raises:
+            MissingDataError: no bag exists, or one has no points.
+            ArgumentError: one has several topics of points, and none is named.
+            FormatError: a file is no bag.
+        """
+        return [BagRecording(BagFiles(paths), self.options) for paths in find_bags(self.source)]
+
+
+@dataclass(frozen=True)
+class BagOptions:
+    """The options of `Bag`, which says what they mean."""
+
+    topics: str = ""
+    pose_topic: str = ""
+    pose_frame: str = ""
+    world_frame: str = ""
+    time_unit: TimeUnit = "auto"
+    deskewed: bool = False
+
+
+class BagRecording(Recording):
+    """A bag. The messages of the first LiDAR are its frames; of other LiDARs, the message that is nearest in time belongs to a frame.
+
+    Its times begin at the first frame. The vehicle is the frame whose poses are given, or `base_link`, or the first LiDAR.
+    """
+
+    split = "Train"
+
+    def __init__(self, files: BagFiles, options: BagOptions) -> None:
+        self._files, self._options, self.location = files, options, files.location
+        self.name = re.sub(r"[^\w-]+", "_", files.paths[0].name.split(".")[0].removesuffix("_0"))
+        self._pose_note, self._notes = "", list[str]()
+        self._lidars = [LidarTopic(topic, options.time_unit) for topic in files.clouds(options.topics)]
+
+    @cached_property
+    def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
+        """The messages of the first LiDAR, each with the nearest of the others."""
+        first, *others = self._lidars
+        near = [lidar.nearest(first.stamps) for lidar in others]
+        frames = list[FrameHandle]()
+        for number, (place, stamp) in enumerate(zip(first.places, first.stamps.tolist(), strict=True)):
+            parts = [(0, place, first.unit), *((k, rows[number], others[k - 1].unit) for k, rows in enumerate(near, 1))]
+            given = tuple(CloudPlace(k, found, unit) for k, found, unit in parts if found is not None)
+            frames.append(BagFrame(number, f"{place}: message {number}", stamp, given))
+        return frames
+
+    @cached_property
+    def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
+        """The LiDARs, where the bag's transforms say that they are on the vehicle.
+
+        Raises:
+            MissingDataError: there are several, and no transforms between them.
+        """
+        tree, at, sensors = self._tree, self._lidars[0].stamps[:1], list[Sensor]()
+        for lidar in self._lidars:
+            if not tree.connected(lidar.frame, self._vehicle):
+                raise self._no_path(lidar.frame, self._vehicle, "convert one LiDAR with `topics`")
+            place = tree.lookup(self._vehicle, lidar.frame, at)[0]
+            sensors.append(Sensor(lidar.name, place, deskewed=self._options.deskewed))
+        return sensors
+
+    def times(self) -> NDArray[np.float64]:
+        """Return seconds after the first frame."""
+        return self._seconds(self._lidars[0].stamps)
+
+    def poses(self, *, force: bool = False) -> Trajectory | None:
+        """Return the poses of the topic of poses, or of the tree of transforms; None if the bag has neither.
+
+        Raises:
+            ArgumentError: there are several topics of poses, and none is named.
+            MissingDataError: no transforms lead from the LiDAR to the frame whose poses these are, or from there to the world.
+            FormatError: a pose is none, or poses and scans were not recorded at the same time.
+        """
+        topic = self._files.poses(self._options.pose_topic)
+        if topic is None or topic.channel.type in TRANSFORMS:
+            found = self._poses_of_tree(required=topic is not None)
+            if found is None:
+                return None
+            stamps, poses = found
+            where = f"{self.location}: transforms"
+        else:
+            where = f"{self.location}: {topic.channel.topic}"
+            track = FrameTrack(where)
+            for placed in self._placed(topic):
+                track.add(placed)
+            if not len(track):
+                raise FormatError(where, expected="poses", found="none that can be read")
+            stamps, poses = track.values
+        if self._unplaced and not force:
+            advice = (
+                "name a frame that the LiDAR has a path to with `pose_frame`, or accept both as one with `force=True`"
+            )
+            raise self._no_path(self._lidars[0].frame, self._unplaced, advice)
+        own = self._lidars[0].stamps
+        if stamps[-1] < own[0] or stamps[0] > own[-1]:
+            expected = f"poses between {own[0] / 1e9:.3f} and {own[-1] / 1e9:.3f} s, the times of the scans"
+            raise FormatError(where, expected=expected, found=f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s")
+        self._pose_note = f"{where}: the poses are those of {self._unplaced or self._vehicle}"
+        return Trajectory(poses, self._seconds(stamps), where)
+
+    def notes(self) -> list[str]:
+        """Say what is not whole, and what was assumed."""
+        notes = [*self._files.notes(), *self._notes, *(note for lidar in self._lidars for note in lidar.notes)]
+        if self._pose_note:
+            assumed = self._pose_child == "" and not self._options.pose_frame
+            notes.append(self._pose_note + (", as assumed: the messages do not say it" if assumed else ""))
+        if self._pose_note and self._unplaced:
+            notes.append(
+                f"{self.location}: no transforms lead from {self._lidars[0].frame} to {self._unplaced}: both are taken as one"
+            )
+        return list(dict.fromkeys(notes))
+
+    @cached_property
+    def _tree(self) -> FrameTree:
+        tree = FrameTree(self.location)
+        for topic in self._files.of_types(TRANSFORMS):
+            for placed in self._placed(topic):
+                tree.add(placed)
+        return tree
+
+    @cached_property
+    def _pose_child(self) -> str | None:
+        """The frame of the poses as their messages say it, empty if they do not; None if there is no topic of poses, or no single one."""
+        try:
+            topic = self._files.poses(self._options.pose_topic)
+            if topic is None or topic.channel.type in TRANSFORMS:
+                return None
+            return next((placed.child for placed in self._placed(topic)), "")
+        except CarlascError:
+            return None  # `poses` says it, if poses are asked for
+
+    @cached_property
+    def _unplaced(self) -> str | None:
+        """The frame of the poses, if no transforms lead there from the first LiDAR."""
+        wanted = self._options.pose_frame or self._pose_child
+        return wanted if wanted and not self._tree.connected(self._lidars[0].frame, wanted) else None
+
+    @cached_property
+    def _vehicle(self) -> str:
+        """The frame of the vehicle: that of the poses, if it is known where it is."""
+        lidar = self._lidars[0].frame
+        bases = (base for base in _BASES if base != lidar and self._tree.connected(lidar, base))
+        wanted = self._options.pose_frame or self._pose_child
+        return wanted if wanted and not self._unplaced else next(bases, lidar)
+
+    def _placed(self, topic: Topic) -> Iterator[PlacedFrame]:
+        """Yield the poses or transforms of a topic. Of a topic of paths, the last message is read, which holds the whole path."""
+        places, errors = list(topic.places()), list[FormatError]()
+        for place in places[-1:] if topic.channel.type == PATH else places:
+            try:
+                yield from read_placed(place.read(), place.channel, str(place))
+            except FormatError as error:
+                errors.append(error)
+        if errors:
+            self._notes.append(f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out")
+
+    def _poses_of_tree(self, *, required: bool) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Return times and poses of the vehicle in the world; None if the tree does not say how it moves."""
+        line, wanted = self._tree.ancestors(self._vehicle), self._options.world_frame
+        world = next((name for name in ((wanted,) if wanted else (*_WORLDS, line[-1])) if name in line), None)
+        edges = [] if world is None else self._tree.edges(self._vehicle, world)
+        moving = [edge for edge in edges if edge.moves]
+        if world is not None and moving:
+            stamps = max(moving, key=len).values[0]
+            return stamps, self._tree.lookup(world, self._vehicle, stamps)
+        if required or wanted:
+            raise self._no_path(self._lidars[0].frame, wanted or _WORLDS[0], 'estimate poses with `poses="kiss-icp"`')
+        return None
+
+    def _no_path(self, frame: str, target: str, advice: str) -> MissingDataError:
+        expected = f"transforms from {frame} to {target}"
+        return MissingDataError(self.location, expected=expected, found=f"only {self._tree}", advice=advice)
+
+    def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return seconds after the first frame. Nanoseconds are subtracted as integers, because float64 would round them to 256 ns."""
+        return (stamps - self._lidars[0].stamps[0]) * 1e-9

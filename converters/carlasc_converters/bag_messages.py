@@ -1,0 +1,195 @@
+"""Messages of bags that hold points, poses or transforms: which types there are, and what is read of them.
+
+Definitions: sensor_msgs, nav_msgs and geometry_msgs of ROS as rosbags has them; tf2_msgs/TFMessage of
+https://docs.ros.org/en/noetic/api/tf2_msgs/html/msg/TFMessage.html; CustomMsg and CustomPoint of Livox of the read-me pages of
+https://github.com/Livox-SDK/livox_ros_driver and https://github.com/Livox-SDK/livox_ros_driver2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from struct import unpack_from
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import Transform
+from carlasc.errors import import_extra, reading
+from carlasc_converters import foxglove_messages
+from carlasc_converters.bag_index import EXTRA, Channel
+from carlasc_converters.point_cloud2 import read_columns, unpack_fields
+from carlasc_converters.rigid import poses_of
+from carlasc_converters.transforms import PlacedFrame
+
+_LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+PATH = "nav_msgs/msg/Path"
+CLOUDS = ("sensor_msgs/msg/PointCloud2", *_LIVOX, "foxglove.PointCloud")
+POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    PATH,
+    "foxglove.PoseInFrame",
+)
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
+
+_TRANSFORM_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
+_POINT_TEXT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+_CUSTOM_TEXT = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+)
+_TEXTS = dict.fromkeys(TRANSFORMS[:2], _TRANSFORM_TEXT) | {
+    f"{package}/msg/{name}": text
+    for package in ("livox_ros_driver", "livox_ros_driver2")
+    for name, text in (("CustomPoint", _POINT_TEXT), ("CustomMsg", _CUSTOM_TEXT))
+}
+_POINT = np.dtype([("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")])  # fmt: skip
+_ENCODINGS = {"ros1": "ros", "cdr": "ros", "protobuf": "foxglove", "json": "foxglove"}
+
+
+@dataclass(frozen=True)
+class CloudMessage:
+    """A message of points.
+
+    Attributes:
+        stamp_ns: its time.
+        frame: of the sensor.
+        columns: (N,) values by the names of its fields.
+        pose: (4, 4) from the points to the frame; None if they are in it.
+        time_unit: of the times of points; None if its type does not say it.
+    """
+
+    stamp_ns: int
+    frame: str
+    columns: dict[str, NDArray[Any]]
+    pose: Transform | None = None
+    time_unit: str | None = None
+
+
+def is_readable(channel: Channel) -> bool:
+    """Return whether messages of a type in CLOUDS, POSES or TRANSFORMS have an encoding in which it exists."""
+    return _ENCODINGS.get(channel.encoding) == ("foxglove" if channel.type.startswith("foxglove.") else "ros")
+
+
+def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
+    """Return a message of one of the types `CLOUDS`.
+
+    Raises:
+        FormatError: it is none.
+    """
+    message = _decode(data, channel, where)
+    with reading(where, f"a message of type {channel.type}"):
+        if channel.type.startswith("foxglove."):
+            return _foxglove_cloud(message, where)
+        stamp, frame = _stamp(message.header.stamp), _frame(message.header.frame_id)
+        if channel.type in _LIVOX:
+            rows = [(p.offset_time, p.x, p.y, p.z, p.reflectivity, p.tag, p.line) for p in message.points]
+            points = np.array(rows, _POINT)
+            return CloudMessage(stamp, frame, {name: points[name] for name in _POINT.names or ()}, time_unit="ns")
+        return CloudMessage(stamp, frame, read_columns(message, where))
+
+
+def read_stamp(data: bytes, channel: Channel, where: str) -> int:
+    """Return the time of a message of points in nanoseconds, without its points.
+
+    Raises:
+        FormatError: it is cut short.
+    """
+    with reading(where, f"a message of type {channel.type}"):
+        if channel.encoding == "ros1":
+            seconds, rest = unpack_from("<II", data, 4)
+        elif channel.encoding == "cdr":
+            seconds, rest = unpack_from("<iI" if data[1] else ">iI", data, 4)
+        else:
+            return _stamp(_decode(data, channel, where).timestamp)
+        return seconds * 10**9 + rest
+
+
+def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
+    """Return the poses or transforms of a message of one of the types `POSES` and `TRANSFORMS`.
+
+    Raises:
+        FormatError: it is none.
+    """
+    message = _decode(data, channel, where)
+    with reading(where, f"a message of type {channel.type}"):
+        if channel.type == "foxglove.PoseInFrame":
+            numbers = _numbers(message.pose.position, message.pose.orientation)
+            return [PlacedFrame(_stamp(message.timestamp), _frame(message.frame_id), "", numbers)]
+        if channel.type.startswith("foxglove."):
+            return [
+                PlacedFrame(
+                    _stamp(one.timestamp), _frame(one.parent_frame_id), _frame(one.child_frame_id), _numbers(one.translation, one.rotation)
+                )
+                for one in (message.transforms if channel.type.endswith("s") else [message])
+            ]  # fmt: skip
+        if channel.type in TRANSFORMS:
+            return [
+                _placed(one.header, one.child_frame_id, one.transform.translation, one.transform.rotation)
+                for one in message.transforms
+            ]
+        placed = []
+        for one in message.poses if channel.type == PATH else [message]:
+            pose = one.pose if hasattr(one.pose, "position") else one.pose.pose  # the other one has a covariance
+            header = one.header if one.header.frame_id else message.header
+            placed.append(
+                _placed(
+                    one.header, getattr(one, "child_frame_id", ""), pose.position, pose.orientation, header.frame_id
+                )
+            )
+        return placed
+
+
+def _decode(data: bytes, channel: Channel, where: str) -> Any:
+    """Return a message with its fields as attributes."""
+    with reading(where, f"a message of type {channel.type}"):
+        if _ENCODINGS.get(channel.encoding) == "foxglove":
+            return foxglove_messages.read_message(data, channel.type, channel.encoding)
+        store = _store(channel.encoding)
+        read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
+        return read(data, channel.type)
+
+
+@cache
+def _store(encoding: str) -> Any:
+    """Return rosbags' types of messages, and those that it does not have."""
+    types = import_extra("rosbags.typesys", EXTRA)
+    store = types.get_typestore(types.Stores.ROS1_NOETIC if encoding == "ros1" else types.Stores.ROS2_HUMBLE)
+    for name, text in _TEXTS.items():
+        store.register(
+            {key: value for key, value in types.get_types_from_msg(text, name).items() if key not in store.fielddefs}
+        )
+    return store
+
+
+def _foxglove_cloud(message: Any, where: str) -> CloudMessage:
+    fields = [
+        (field.name, field.offset, foxglove_messages.FIELD_TYPES.get(field.type, "V"), 1) for field in message.fields
+    ]
+    data = np.frombuffer(message.data, np.uint8)
+    columns = unpack_fields(data, fields, message.point_stride, where)
+    x, y, z, *quaternion = _numbers(message.pose.position, message.pose.orientation)
+    placed = (x, y, z) != (0, 0, 0) or quaternion not in ([1, 0, 0, 0], [0, 0, 0, 0])
+    pose = poses_of(np.array([quaternion]), np.array([[x, y, z]]), where)[0] if placed else None
+    return CloudMessage(_stamp(message.timestamp), _frame(message.frame_id), columns, pose)
+
+
+def _placed(header: Any, child: str, position: Any, rotation: Any, parent: str | None = None) -> PlacedFrame:
+    parent = header.frame_id if parent is None else parent
+    return PlacedFrame(_stamp(header.stamp), _frame(parent), _frame(child), _numbers(position, rotation))
+
+
+def _numbers(position: Any, rotation: Any) -> tuple[float, float, float, float, float, float, float]:
+    return position.x, position.y, position.z, rotation.w, rotation.x, rotation.y, rotation.z
+
+
+def _stamp(stamp: Any) -> int:
+    """Return the nanoseconds of a time of ROS or of Foxglove."""
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec if hasattr(stamp, "nanosec") else stamp.nsec)
+
+
+def _frame(name: str) -> str:
+    """Return the name of a frame: early versions of ROS put a slash before it."""
+    return name.removeprefix("/")

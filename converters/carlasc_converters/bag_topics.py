@@ -1,0 +1,237 @@
+"""The topics of a bag: what its files hold together, and which of them are used."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc_converters import db3_file, mcap_file, ros1_bag
+from carlasc_converters.bag_index import Channel, FileIndex, decompressed
+from carlasc_converters.bag_messages import CLOUDS, POSES, TRANSFORMS, is_readable
+from carlasc_converters.files import opening
+
+_KINDS = (ros1_bag, mcap_file, db3_file)
+_ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
+_PACKED = (".db3.zstd", ".mcap.zstd")
+_LEVELS = 3  # how deep below the given folder a bag may be
+_ZSTD = b"\x28\xb5\x2f\xfd"  # a message of ROS 2 that was compressed alone: CDR never begins so
+_PART = re.compile(r"_(\d+)$")
+_EXPECTED = "a bag: .bag, .db3, .mcap"
+
+
+@dataclass(frozen=True)
+class MessagePlace:
+    """Where a message is: all that a worker needs to read it.
+
+    Attributes:
+        path: the file.
+        channel: what the message is.
+        chunk: the position of its chunk, -1 if it is in none.
+        offset: its place in the chunk or file.
+    """
+
+    path: str
+    channel: Channel
+    chunk: int
+    offset: int
+
+    def read(self) -> bytes:
+        """Return the content of the message.
+
+        Raises:
+            FormatError: the file does not hold it.
+        """
+        kind = _kind_of(Path(self.path))
+        with opening(self.path, f"a message of {self.channel.topic}"):
+            data: bytes = kind.read_message(self.path, self.chunk, self.offset)
+        return decompressed(data, "zstd", str(self)) if data.startswith(_ZSTD) else data
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.channel.topic}"
+
+
+@dataclass
+class Topic:
+    """The messages of a topic, in the order of the files.
+
+    Attributes:
+        channel: what they are.
+        parts: the path of each file, the channel there, and (N,) `PLACE` of its messages.
+    """
+
+    channel: Channel
+    parts: list[tuple[str, Channel, NDArray[np.void]]] = field(default_factory=list)
+
+    @cached_property
+    def times(self) -> NDArray[np.int64]:
+        """(N,) when each message was recorded, nanoseconds."""
+        return np.concatenate([np.empty(0, np.int64), *(rows["time"] for _, _, rows in self.parts)])
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def places(self) -> Iterator[MessagePlace]:
+        """Yield where each message is."""
+        for path, channel, rows in self.parts:
+            for _, chunk, offset in rows.tolist():
+                yield MessagePlace(path, channel, chunk, offset)
+
+    def __str__(self) -> str:
+        """Say the name, type, count and rate."""
+        span = float(np.ptp(self.times)) / 1e9 if len(self) > 1 else 0.0
+        rate = f", {(len(self) - 1) / span:.3g} Hz" if span else ""
+        kind = self.channel.type.rpartition("/")[2] + (
+            "" if is_readable(self.channel) else f" as {self.channel.encoding}"
+        )
+        return f"{self.channel.topic} ({kind}, {len(self)} messages{rate})"
+
+
+class BagFiles:
+    """The files of one recording.
+
+    Attributes:
+        paths: the files.
+        indexes: what each holds.
+        topics: those that have messages, by name.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(paths)
+        self.indexes: list[FileIndex] = []
+        self.topics: dict[str, Topic] = {}
+        for path in paths:
+            with opening(path, _EXPECTED):
+                index: FileIndex = _kind_of(path).index_file(path)
+            self.indexes.append(index)
+            for number, channel in index.channels.items():
+                rows = index.places(number)
+                if len(rows):
+                    self.topics.setdefault(channel.topic, Topic(channel)).parts.append((str(path), channel, rows))
+
+    @property
+    def location(self) -> str:
+        """The name of the recording in errors."""
+        first = self.paths[0]
+        return str(first if len(self.paths) == 1 else first.parent)
+
+    def of_types(self, types: Sequence[str]) -> list[Topic]:
+        """Return the topics of some types, by name, in an encoding that is read."""
+        found = sorted(self.topics.items())
+        return [topic for _, topic in found if topic.channel.type in types and is_readable(topic.channel)]
+
+    def clouds(self, names: str) -> list[Topic]:
+        """Return the topics of points: those that are named, or the only one that there is.
+
+        Args:
+            names: separated by commas; empty for the only one.
+
+        Raises:
+            MissingDataError: there is none.
+            ArgumentError: there are several, or one that is named does not exist or does not hold points.
+        """
+        found = self.of_types(CLOUDS)
+        if names:
+            return [self._named("topics", name.strip(), found) for name in names.split(",")]
+        if not found:
+            lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
+            raise MissingDataError(
+                self.location,
+                expected="a topic of points: PointCloud2, CustomMsg of Livox, or PointCloud of Foxglove",
+                found="; ".join([_listed(list(self.topics.values())), *lost]),
+                advice="" if lost else "packets of a LiDAR become points where its driver replays them",
+            )
+        if len(found) > 1:
+            raise ArgumentError(
+                "topics",
+                expected=f"one or several of {_listed(found)} in {self.location}",
+                found="none",
+                advice="name the LiDARs, first the one whose messages are the frames, separated by commas",
+            )
+        return found
+
+    def poses(self, name: str) -> Topic | None:
+        """Return the topic of poses: the one that is named, or the only one that there is; None if there is none.
+
+        Raises:
+            ArgumentError: there are several, or the one that is named does not exist or does not hold poses.
+        """
+        found = self.of_types(POSES)
+        if name:
+            return self._named("pose_topic", name, found + self.of_types(TRANSFORMS))
+        if len(found) > 1:
+            expected = f"one of {_listed(found)} in {self.location}"
+            raise ArgumentError("pose_topic", expected=expected, found="none")
+        return found[0] if found else None
+
+    def notes(self) -> list[str]:
+        """Say which files are not whole."""
+        lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
+        if len(self.paths) > 1:
+            lost.append(f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and the next")
+        return lost
+
+    def _named(self, option: str, name: str, found: Sequence[Topic]) -> Topic:
+        if (topic := next((topic for topic in found if topic.channel.topic == name), None)) is not None:
+            return topic
+        other = self.topics.get(name)
+        said = f"{name!r}" if other is None else f"{other}, which is not read"
+        raise ArgumentError(option, expected=f"one of {_listed(found)} in {self.location}", found=said)
+
+
+def find_bags(source: Path) -> list[list[Path]]:
+    """Return the files of each recording in a file or a folder: parts _0, _1, ... of one bag belong together.
+
+    Raises:
+        MissingDataError: there is none.
+    """
+    if source.is_file():
+        return [[source]]
+    patterns = ("*/" * level + f"*{ending}" for level in range(_LEVELS) for ending in (*_ENDINGS, *_PACKED))
+    files = sorted(path for pattern in patterns for path in source.glob(pattern) if path.is_file())
+    bags = [path for path in files if path.name.endswith(_ENDINGS)]
+    if not bags:
+        packed = next((path.name for path in files if path.name.endswith(_PACKED)), None)
+        raise MissingDataError(
+            source,
+            expected=_EXPECTED,
+            found=packed or ("none" if source.is_dir() else "no such folder"),
+            advice=f"unpack it with `zstd -d {packed}`" if packed else "",
+        )
+    groups: dict[tuple[Path, str], list[tuple[int, Path]]] = {}
+    for path in bags:
+        part = _PART.search(path.stem)
+        name = (path.parent, path.stem if part is None else path.stem[: part.start()])
+        groups.setdefault(name, []).append((-1 if part is None else int(part[1]), path))
+    found: list[list[Path]] = []
+    for parts in groups.values():
+        paths = [path for _, path in sorted(parts)]
+        found.extend([paths] if min(parts)[0] == 0 else [[path] for path in paths])
+    return found
+
+
+def _kind_of(path: Path) -> ModuleType:
+    """Return the module that reads a file, by its first bytes.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it is no bag.
+    """
+    with opening(path, _EXPECTED), path.open("rb") as file:
+        head = file.read(16)
+    kind = next((kind for kind in _KINDS if head.startswith(kind.MAGIC)), None)
+    if kind is None:
+        advice = f"unpack it with `zstd -d {path.name}`" if path.name.endswith(_PACKED) else ""
+        raise FormatError(path, expected=_EXPECTED, found="another kind of file", advice=advice)
+    return kind
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    return ", ".join(map(str, topics)) or "no topics with messages"

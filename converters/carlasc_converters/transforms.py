@@ -1,0 +1,130 @@
+"""The tree of frames of a bag: which frame is where in which, at which time."""
+
+from __future__ import annotations
+
+from array import array
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import inverse_of, multiply, slerp
+from carlasc.errors import FormatError
+from carlasc_converters.rigid import poses_of
+
+_STILL = 1e-9  # what a transform changes by although nothing moves
+
+
+@dataclass(frozen=True)
+class PlacedFrame:
+    """A frame in another one at some time.
+
+    Attributes:
+        stamp_ns: the time.
+        parent: the other frame.
+        child: the frame; empty if the message does not say it.
+        pose: x, y, z in metres, and a quaternion w, x, y, z: parent_T_child.
+    """
+
+    stamp_ns: int
+    parent: str
+    child: str
+    pose: tuple[float, float, float, float, float, float, float]
+
+
+class FrameTrack:
+    """One frame in another over time."""
+
+    def __init__(self, where: str) -> None:
+        self._where, self._stamps, self._poses = where, array("q"), array("d")
+
+    def add(self, placed: PlacedFrame) -> None:
+        """Add a time."""
+        self._stamps.append(placed.stamp_ns)
+        self._poses.extend(placed.pose)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @cached_property
+    def values(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """(K,) increasing times in nanoseconds, and (K, 4, 4) poses: the last of each time.
+
+        Raises:
+            FormatError: a quaternion is no rotation.
+        """
+        stamps, numbers = np.array(self._stamps, np.int64), np.array(self._poses, np.float64).reshape(-1, 7)
+        poses = poses_of(numbers[:, 3:], numbers[:, :3], self._where)
+        times, last = np.unique(stamps[::-1], return_index=True)
+        return times, poses[::-1][last]
+
+    @cached_property
+    def moves(self) -> bool:
+        """Whether the pose changes."""
+        poses = self.values[1]
+        return bool(np.abs(poses - poses[0]).max() > _STILL)
+
+    def at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return (M, 4, 4) poses at some times: interpolated, and before the first and after the last those."""
+        times, poses = self.values
+        after = (np.clip(stamps, times[0], times[-1]) - times[0]) * 1e-9
+        return slerp(poses, (times - times[0]) * 1e-9, after)
+
+
+class FrameTree:
+    """The frames of a bag, each in its parent."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._tracks: dict[str, dict[str, FrameTrack]] = defaultdict(dict)
+
+    def add(self, placed: PlacedFrame) -> None:
+        """Add a transform."""
+        parents = self._tracks[placed.child]
+        if placed.parent not in parents:
+            parents[placed.parent] = FrameTrack(f"{self._where}: {placed.parent} to {placed.child}")
+        parents[placed.parent].add(placed)
+
+    def ancestors(self, frame: str) -> list[str]:
+        """Return a frame, its parent, and so on up to the root.
+
+        Raises:
+            FormatError: the frames form a circle.
+        """
+        found = [frame]
+        while parents := self._tracks.get(found[-1]):
+            found.append(max(parents, key=lambda parent: len(parents[parent])))
+            if found[-1] in found[:-1]:
+                raise FormatError(self._where, expected="a tree of frames", found=f"a circle: {', '.join(found)}")
+        return found
+
+    def edges(self, frame: str, ancestor: str) -> list[FrameTrack]:
+        """Return the tracks from a frame up to one of its ancestors."""
+        line = self.ancestors(frame)
+        line = line[: line.index(ancestor) + 1]
+        return [self._tracks[child][parent] for child, parent in pairwise(line)]
+
+    def connected(self, one: str, other: str) -> bool:
+        """Return whether there is a path between two frames."""
+        return self.ancestors(one)[-1] == self.ancestors(other)[-1]
+
+    def lookup(self, target: str, source: str, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return (M, 4, 4) target_T_source at some times, of two frames that are connected."""
+        above = self.ancestors(target)
+        common = next(frame for frame in self.ancestors(source) if frame in above)
+        up, down = self._climb(source, common, stamps), self._climb(target, common, stamps)
+        return up if target == common else np.array([multiply(inverse_of(a), b) for a, b in zip(down, up, strict=True)])
+
+    def _climb(self, frame: str, ancestor: str, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+        for track in self.edges(frame, ancestor):
+            poses = multiply(track.at(stamps), poses)
+        return poses
+
+    def __str__(self) -> str:
+        """Name the frames, each with its parent."""
+        named = [f"{parent} > {child}" for child, parents in self._tracks.items() for parent in parents]
+        return ", ".join(sorted(named)) or "no frames"
