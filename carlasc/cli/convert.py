@@ -16,6 +16,7 @@ from carlasc.cli.common import (
     file_argument,
     place_argument,
     print_frames,
+    print_json,
 )
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
@@ -66,6 +67,33 @@ def _print_list(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _print_preview(
+    found: tuple[carlasc.converting.RecordingPreview, ...], out: str, poses: str, grids: str, *, json: bool
+) -> None:
+    """Print what a conversion would read and write."""
+    if json:
+        print_json([recording.to_dict() for recording in found])
+        return
+    for one in found:
+        rate = "no times" if one.rate_hz is None else f"{one.rate_hz:g} Hz"
+        echo(f"{one.location}: {one.frames} scans, {rate}, of {', '.join(one.sensors)}")
+        bounds = " ".join(
+            f"{axis} {low:g}..{high:g}" for axis, low, high in zip("xyz", one.lower, one.upper, strict=True)
+        )
+        echo(f"  first scan: {one.points} points, {bounds} m; fields {', '.join(one.fields)}")
+        ground = "no ground is seen in it" if one.up is None else f"the sensor is {one.height_m:g} m above the ground"
+        wrong = one.up not in (None, "+z")
+        echo(f"  {ground}" + (f", but up is {one.up}: other axes than x forward, y left, z up" if wrong else ""))
+        given = one.poses == "file" and poses != "kiss-icp"
+        echo(f"  poses: {'those of the recording' if given else 'estimated from the scans with KISS-ICP'}")
+        for note in one.notes:
+            echo(f"  {note}")
+        echo(
+            f"  would become {out}/{one.split}/{one.name}, with {'no grids' if grids == 'none' else f'grids from {grids}'}"
+        )
+    echo("nothing was written")
+
+
 def convert(
     options: DeclaredOptions,
     layout: LayoutFlags,
@@ -92,6 +120,10 @@ def convert(
             " none: no grids."
         ),
     ] = "scans",
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Say what is found and what would be done; write nothing."),
+    ] = False,
     json: Json = False,
     _list: Annotated[
         bool,
@@ -102,6 +134,11 @@ def convert(
 
     Run it again to continue where it stopped: frames that exist are skipped.
     """
+    chosen = None if sequences is None else sequences.split(",")
+    if dry_run:
+        found = carlasc.converting.preview(name, source, sequences=chosen, split=split, options=options.values)
+        _print_preview(found, out, poses.options().source, grids, json=json)
+        return
     if making.is_given and grids != "scans":
         raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids)
     bounded = making.grid.bounds is not None
@@ -122,7 +159,7 @@ def convert(
             name,
             source,
             out,
-            sequences=None if sequences is None else sequences.split(","),
+            sequences=chosen,
             split=split,
             layout=layout.options(),
             poses=poses.options(),

@@ -1,0 +1,126 @@
+"""What a conversion would read and do: found by reading one scan of each recording. Nothing is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.converting.assembling import Rig, read_scan
+from carlasc.converting.plans import SplitName, choose_recordings
+from carlasc.converting.protocol import Converter, Recording
+from carlasc.converting.registry import find_recordings, open_converter
+from carlasc.groundtruth.heights import find_ground
+
+_REACH_M = 25.0
+_LEAST_M = 0.3  # a ground that is nearer to the sensor is none
+_UP = {"+z": (0, 1, 2), "-z": (0, 1, 2), "+y": (2, 0, 1), "-y": (2, 0, 1), "+x": (1, 2, 0), "-x": (1, 2, 0)}
+
+
+@dataclass(frozen=True)
+class RecordingPreview:
+    """A recording that a conversion would read.
+
+    Attributes:
+        name: name of the sequence that it would become.
+        split: the split that it belongs to.
+        location: where it is.
+        frames: number of frames.
+        rate_hz: frames per second; None if it has no times.
+        sensors: names of its LiDARs.
+        fields: what its first scan has: fields of the layout.
+        points: number of points of the first scan.
+        lower: least x, y, z of these points, metres, right-handed, in the frame of the scan.
+        upper: greatest x, y, z.
+        up: the direction away from the ground, "+z" if axes are as they must be; None if no ground is seen.
+        height_m: height of the first sensor above the ground, guessed from the first scan; None if no ground is seen.
+        poses: "file", or "kiss-icp" if they would be estimated from the scans.
+        notes: what users must know, one line each.
+    """
+
+    name: str
+    split: str
+    location: str
+    frames: int
+    rate_hz: float | None
+    sensors: tuple[str, ...]
+    fields: tuple[str, ...]
+    points: int
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    up: str | None
+    height_m: float | None
+    poses: str
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the values as JSON has them."""
+        return asdict(self)
+
+
+def preview(
+    name: str | type[Converter],
+    source: str | os.PathLike[str],
+    *,
+    sequences: Collection[str] | None = None,
+    split: SplitName = "all",
+    options: Mapping[str, Any] | None = None,
+) -> tuple[RecordingPreview, ...]:
+    """Return what `convert` with the same arguments would read.
+
+    Args:
+        name: the converter: its name, or a class that inherits `Converter`.
+        source: folder of the data set, or of one of its sequences.
+        sequences: names of sequences or the last parts of them; None for all.
+        split: only sequences of this split.
+        options: what the converter takes beside the source, by name.
+
+    Raises:
+        ArgumentError: an argument has a wrong value, or no converter has that name.
+        MissingDataError: the source or a sequence does not exist.
+        FormatError: a file does not hold what it must.
+    """
+    converter = open_converter(name, Path(source), options)
+    recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)
+    return tuple(_preview(recording) for recording in recordings)
+
+
+def _preview(recording: Recording) -> RecordingPreview:
+    times, has_poses = recording.times(), recording.poses() is not None
+    scan = read_scan(recording.frames[0], Rig(tuple(recording.sensors), recording.vehicle_T_scan), None)
+    steps = np.zeros(0) if times is None else np.diff(times[[handle.number for handle in recording.frames]])
+    given = {"labels": scan.labels, "instances": scan.instances}
+    points = scan.points[:, :3]
+    up, height_m = _ground(points)
+    lower, upper = (tuple(round(float(value), 2) for value in edge(points, axis=0)) for edge in (np.min, np.max))
+    return RecordingPreview(
+        recording.name,
+        recording.split,
+        recording.location,
+        len(recording.frames),
+        round(float(1 / np.median(steps)), 2) if len(steps) and np.median(steps) > 0 else None,
+        tuple(sensor.name for sensor in recording.sensors),
+        ("points", *(field for field, values in given.items() if values is not None), *scan.fields),
+        len(points),
+        lower,  # type: ignore[arg-type]
+        upper,  # type: ignore[arg-type]
+        up,
+        height_m,
+        "file" if has_poses else "kiss-icp",
+        tuple(recording.notes()),
+    )
+
+
+def _ground(points: NDArray[np.float32]) -> tuple[str | None, float | None]:
+    """Return the direction away from the ground, and the height of the sensor above it, of (N, 3) points."""
+    for up, order in _UP.items():
+        turned = points[:, order] * np.array([1, 1, -1 if up.startswith("-") else 1], np.float32)
+        ground = find_ground([turned], _REACH_M)
+        if ground is not None and ground.below_m > _LEAST_M:
+            return up, round(ground.below_m, 2)
+    return None, None
