@@ -35,7 +35,9 @@ WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2"
 # Level 6, zlib's own, takes 6 times as long, and saves 3 %: voxels are in order, so what repeats is always four bytes back.
 _VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
-CERTAIN = 65535  # the number that means a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
+CERTAIN = (
+    65535  # the number that means a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
+)
 
 
 Per = Literal["point", "voxel", "vote", "box", "scan"]

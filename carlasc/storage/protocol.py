@@ -335,6 +335,17 @@ class Source(ABC):
         return f"<{type(self).__name__} {self.location}>"
 
 
+class ChosenSequences(Source):
+    """Some of the sequences of a source, or others in their place."""
+
+    def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
+        self.location, self.chosen = location, sequences
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences."""
+        return self.chosen
+
+
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
     """Return the split, the name and the coordinates of a sequence from its path.
 

@@ -1,0 +1,67 @@
+"""`carlasc label`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import carlasc
+from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
+from carlasc.cli.flags import RunFlags
+
+
+def label(
+    run: RunFlags,
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")],
+    out: Annotated[str, place_option("-o", "--out", text="Folder of the labelled data set.")],
+    predictions: Annotated[
+        str,
+        typer.Option(
+            "--from",
+            metavar="FILES",
+            help="Folder of the predictions: 000000.label, .npy or .npz for each frame, in SPLIT/SEQUENCE/ or SEQUENCE/.",
+        ),
+    ],
+    classes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TABLE",
+            help="Class table of the predictions: a name such as semantickitti, or a JSON file; that of SOURCE if not given.",
+        ),
+    ] = None,
+    logits: Annotated[
+        bool, typer.Option("--logits", help="Arrays of a column per class hold scores from before the softmax.")
+    ] = False,
+    by: Annotated[
+        str | None, typer.Option(metavar="NAME", help="What made the labels; the name of FILES if not given.")
+    ] = None,
+    frames: FramesOption = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace what an earlier run of this command has made.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Write a copy of SOURCE with the labels that a network predicted. SOURCE is not changed.
+
+    Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
+    """
+    with run.spread("Labelling", "files") as spread:
+        result = carlasc.label(
+            source,
+            out,
+            predictions,
+            classes=classes,
+            logits=logits,
+            by=by,
+            frames=frames,
+            overwrite=overwrite,
+            run=spread,
+        )
+    if json:
+        print_json(result)
+        return
+    if result.left_out:
+        echo(f"note: without {', '.join(result.left_out)}, which belong to other labels")
+    files = f"{result.linked} files linked, {result.files} written"
+    echo(f"{result.out}: labels of {result.frames} frames predicted by {result.by} ({result.classes}); {files}")
