@@ -251,7 +251,7 @@ def _mark(folder: Path, settings: Mapping[str, Any], files: Iterable[PredictedFi
 
 
 def _link_files(sequence: _LabelledSequence, folder: Path) -> int:
-    """Make the unchanged files of a local folder hard links, as far as the file system allows, and return the number of new ones."""
+    """Make the unchanged files of a local folder hard links, as far as the file system allows, and count those of frames that are new."""
     whole, count = sequence.whole, 0
     if not isinstance(whole, FolderSequence):
         return 0
@@ -264,7 +264,7 @@ def _link_files(sequence: _LabelledSequence, folder: Path) -> int:
     for path in paths:
         try:
             os.link(os.path.realpath(whole.folder / path), folder / path)
-            count += 1
+            count += "/" in path  # text files are not counted
         except FileExistsError:  # of a run that was interrupted, or of another part of this one
             continue
         except OSError as error:

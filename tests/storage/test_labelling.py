@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 import carlasc
 from carlasc import Run
 from carlasc.cli import app
-from carlasc.core.tables import CARLASC11, SEMANTICKITTI, remap_named
+from carlasc.core.tables import remap_named
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.inspection import card, report, validate
 from carlasc.storage import open as open_store
-from carlasc.testing import published_bytes, write_dataset
+from carlasc.testing import write_dataset
 from carlasc.testing.data import SCANS, WHOLE
 
 ALONE = Run(workers=1)
@@ -120,7 +120,7 @@ def test_files_some_of_which_have_probabilities_are_refused(data, predictions, t
 
 
 def test_labels_of_another_table_are_converted_where_that_is_known(data, tmp_path):
-    ids = np.array(sorted(remap_named("semantickitti-to-carla").mapping), np.uint32)
+    ids = np.array(sorted(remap_named("semantickitti_to_carla").mapping), np.uint32)
     for path in SEQUENCES:
         (tmp_path / "net" / path).mkdir(parents=True)
         sequence = open_store(data).sequences()[path]
@@ -130,7 +130,7 @@ def test_labels_of_another_table_are_converted_where_that_is_known(data, tmp_pat
     result = carlasc.label(data, tmp_path / "out", tmp_path / "net", classes="semantickitti", run=ALONE)
     made = open_store(tmp_path / "out").sequences()[WHOLE]
     assert result.classes == made.metadata.classes.name == "carla" and "boxes" in made.fields()
-    wanted = remap_named("semantickitti-to-carla")(np.resize(ids, 1001))
+    wanted = remap_named("semantickitti_to_carla")(np.resize(ids, 1001))
     assert_array_equal(made.read("labels", 5), wanted)
 
 
@@ -143,7 +143,7 @@ def test_a_table_that_cannot_be_converted_becomes_that_of_the_result(data, tmp_p
     made = open_store(tmp_path / "out").sequences()[WHOLE]
     assert made.metadata.classes == OTHER and result.classes == "mine"
     assert "boxes" not in made.fields() and "boxes" in result.left_out  # their classes are those of the other table
-    findings = [one for one in validate(tmp_path / "out", run=ALONE).findings if one.rule == "class-ids"]
+    findings = [one for one in validate(tmp_path / "out", run=ALONE).findings if one.check == "class-ids"]
     assert not findings
 
 
@@ -227,7 +227,7 @@ def test_files_are_copied_where_the_file_system_has_no_hard_links(data, predicti
 def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_path):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", by="SPVCNN", run=ALONE)
     sequence = tmp_path / "out" / WHOLE
-    spec = carlasc.GridSpec(lower=(-4, -4, -2), upper=(4, 4, 2), size=(8, 8, 4))
+    spec = carlasc.GridSpec(lower=(-4, -4, -2), upper=(4, 4, 2), size=(8, 8, 4), coordinates="cartesian")
     carlasc.regrid(sequence, spec, observe=carlasc.FromScans(), name="mine", run=ALONE)
     record = open_store(sequence).sequences()[""].params("mine")["carlasc"]
     assert record["labels"] == "predicted by SPVCNN"
@@ -235,7 +235,7 @@ def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_p
     assert made.settings["carlasc"]["labels"] == "predicted by SPVCNN"
     shown = CliRunner().invoke(app, ["report", str(sequence)])
     assert "labels predicted by SPVCNN" in " ".join(shown.output.split())
-    card(tmp_path / "out", tmp_path / "card", pictures=False, run=ALONE)
+    card(tmp_path / "out", tmp_path / "card", about=carlasc.CardDetails(license="cc-by-4.0"), pictures=False, run=ALONE)
     text = (tmp_path / "card/README.md").read_text()
     assert "Labels of points are predicted by SPVCNN" in text and "labels predicted by SPVCNN" in text
     assert "Labels of points are those of the simulator" not in text

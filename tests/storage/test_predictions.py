@@ -192,7 +192,9 @@ def test_a_data_set_in_the_layout_is_a_folder_of_predictions(sequences, tmp_path
 def test_frames_without_a_file_are_named_unless_they_are_left_out(sequences, tmp_path):
     write(tmp_path / "Town07_Heavy")
     write(tmp_path / "Town01_Light", (0, 1, 7))
-    message = r"expected a file for each frame, found none for 2 of 4 frames of .*cartesian \(000002, 000005\): .*`frames`"
+    message = (
+        r"expected a file for each frame, found none for 2 of 4 frames of .*cartesian \(000002, 000005\): .*`frames`"
+    )
     with pytest.raises(MissingDataError, match=message):
         find_predictions(tmp_path, sequences, ALL)
     assert find_predictions(tmp_path, sequences, FrameRange(None, 2))[WHOLE].frames == (0, 1)
@@ -201,7 +203,9 @@ def test_frames_without_a_file_are_named_unless_they_are_left_out(sequences, tmp
 def test_files_of_another_split_or_of_another_sequence_are_not_taken(sequences, tmp_path):
     write(tmp_path / "Test/Town07_Heavy")
     write(tmp_path / "Val/Town03_Light")
-    with pytest.raises(MissingDataError, match=r"one folder of files such as Town07_Heavy/.*found Test/Town07_Heavy, Val"):
+    with pytest.raises(
+        MissingDataError, match=r"one folder of files such as Town07_Heavy/.*found Test/Town07_Heavy, Val"
+    ):
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
 
 
