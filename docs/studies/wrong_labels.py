@@ -15,8 +15,8 @@ import carlasc
 from carlasc.core.geometry import transform_points
 from carlasc.testing import wrong_labels
 
-SEEDS, FRAMES, MIDDLE = (0, 1, 2), 61, 30
-SPEC = carlasc.GridSpec.cubic(carlasc.GridSpec.published("cartesian"), 0.2) if hasattr(carlasc.GridSpec, "cubic") else None
+SEEDS, FIRST, FRAMES, MIDDLE = (0, 1, 2), 100, 61, 130  # a drive starts at rest
+SPEC = carlasc.GridSpec.published("cartesian").with_resolution(0.2)
 CASES = {
     "20 % of the points, at random": (0.2, None, False),
     "20 %, in clumps of 1 m, others in each scan": (0.2, 1.0, False),
@@ -44,7 +44,9 @@ def write_predictions(drive: Path, out: Path, share: float, clump_m: float | Non
 def merged(drive: Path, out: Path, window: int) -> carlasc.Grid:
     """Return the grid of the middle frame, made from the scans of a window."""
     observe = carlasc.FromScans(window=(-window, window))
-    carlasc.regrid(drive, SPEC, out, observe=observe, frames=(MIDDLE, MIDDLE + 1), name="made", run=carlasc.Run(workers=1))
+    carlasc.regrid(
+        drive, SPEC, out, observe=observe, frames=(MIDDLE, MIDDLE + 1), name="made", run=carlasc.Run(workers=1)
+    )
     (sequence,) = carlasc.open(out).sequences().values()
     return sequence.grid("made", MIDDLE)
 
@@ -54,8 +56,8 @@ def main(work: Path) -> None:
     rows: dict[str, list[list[float]]] = {name: [] for name in CASES}
     for seed in SEEDS:
         drive = work / f"Drive{seed}"
-        carlasc.simulate(drive, count=FRAMES, seed=seed, sensors=1)
-        drive = drive / "cartesian"
+        capture = carlasc.captures.SimulatedCapture(count=FRAMES, first_frame=FIRST, seed=seed, sensors=1, bev=False)
+        carlasc.regrid(capture, SPEC, drive)
         truth = {window: merged(drive, work / f"truth{seed}-{window}", window) for window in (0, 30)}
         for number, (name, (share, clump_m, fixed)) in enumerate(CASES.items()):
             place = work / f"{seed}-{number}"

@@ -67,14 +67,14 @@ def test_labels_are_those_of_the_network_and_everything_else_is_the_same_file(da
         assert not made[path].grids
         for name in kept:
             for file in (data / path / made[path]._entry(name).folder).iterdir():
-                assert os.path.samefile(file, tmp_path / "out" / file.relative_to(data))
+                assert file.samefile(tmp_path / "out" / file.relative_to(data))
         for frame in source[path].frames("points").tolist():
             wanted = predictions[path, frame]
             assert_array_equal(made[path].read("labels", frame), wanted.argmax(axis=1))
             pairs = made[path].read("probabilities", frame)
             assert_array_equal(pairs[:, 0], wanted.argmax(axis=1))
             assert np.abs(pairs[:, 1] / 65535 - wanted.max(axis=1, initial=0)).max(initial=0) < 1e-5
-    assert os.path.samefile(data / WHOLE / "poses.txt", tmp_path / "out" / WHOLE / "poses.txt")
+    assert (data / WHOLE / "poses.txt").samefile(tmp_path / "out" / WHOLE / "poses.txt")
     assert result.frames == 7 and result.linked > 20 and result.files == 14 and result.kept == 0
     assert result.classes == "carla" and "evaluation/labels" in result.left_out
     assert not (tmp_path / "out.part").exists() and not (tmp_path / "out.part.json").exists()
