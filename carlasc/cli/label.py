@@ -62,6 +62,6 @@ def label(
         print_json(result)
         return
     if result.left_out:
-        echo(f"note: without {', '.join(result.left_out)}, which belong to other labels")
+        echo(f"note: without {', '.join(result.left_out)}, of other labels or classes")
     files = f"{result.linked} files linked, {result.files} written"
     echo(f"{result.out}: labels of {result.frames} frames predicted by {result.by} ({result.classes}); {files}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import time
@@ -23,7 +22,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import refuse_overlap
 from carlasc.storage.durability import make_folder, sync_all
-from carlasc.storage.files import storage_error, to_json, write_atomic
+from carlasc.storage.files import to_json, write_atomic
 from carlasc.storage.folder import FolderSequence, FolderSource
 from carlasc.storage.metadata import PREDICTED
 from carlasc.storage.opening import as_source
@@ -32,14 +31,13 @@ from carlasc.storage.predictions import (
     PredictedFiles,
     PredictionReader,
     find_predictions,
-    has_probabilities,
+    load,
     read_table,
 )
-from carlasc.storage.protocol import ChosenSequences, Sequence, Source
+from carlasc.storage.protocol import ChosenSequences, Sequence, SequenceView, Source
 from carlasc.storage.transport.trees import is_url
 from carlasc.storage.unpacking import UnpackResult, unpack
 
-_NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS}
 _PREDICTED = ("labels", "probabilities")
 
 
@@ -52,7 +50,7 @@ class LabelResult(UnpackResult):
         classes: name of the class table of the labels.
         frames: number of frames with labels.
         linked: number of files that are hard links to those of the source.
-        left_out: fields of the source that the data set lacks, because they were made from other labels or have other classes.
+        left_out: what the data set lacks, because it was made from other labels or has other classes: grids, as "evaluation/", and "boxes".
     """
 
     by: str = ""
@@ -142,28 +140,26 @@ def label(
     )
 
 
-class _LabelledSequence(Sequence):
+class _LabelledSequence(SequenceView):
     """A sequence with predicted labels instead of its own.
 
     Attributes:
-        whole: the sequence.
         files: the files of predictions.
         reader: reads them.
         kept: fields of the sequence that do not change.
-        left_out: fields of the sequence that this one does not have.
+        left_out: what this sequence does not have: grids, and boxes of other classes.
     """
 
     def __init__(self, whole: Sequence, files: PredictedFiles, reader: PredictionReader, by: str) -> None:
-        self.whole, self.files, self.reader = whole, files, reader
-        self.path, self.location = whole.path, whole.location
-        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
+        super().__init__(whole)
+        self.files, self.reader = files, reader
         extra = {**whole.metadata.extra, "labels": f"{PREDICTED}{by}"}
         self._metadata = replace(whole.metadata, classes=reader.target, extra=extra).to_json()
         first = files.path(files.frames[0]) if files.frames else None  # the others are like the first
-        self._own = frozenset(_PREDICTED[: 1 + has_probabilities(first)] if first else ())
+        self._own = frozenset(_PREDICTED[: 1 + (load(first)[1] is not None)] if first else ())
         stale = {"boxes"} if reader.target != whole.metadata.classes else set()  # their classes are of the other table
         self.kept = frozenset(name for name in whole.fields() - stale - {*_PREDICTED} if "/" not in name)
-        self.left_out = whole.fields() - self.kept - {*_PREDICTED}
+        self.left_out = stale & whole.fields() | {f"{grid}/" for grid in whole.grids}
         self._pairs: dict[int, NDArray[np.uint16]] = {}  # of frames whose labels have been read
 
     def fields(self) -> frozenset[str]:
@@ -219,13 +215,12 @@ def _clear(out: Path, *, overwrite: bool) -> None:
     """
     if not out.exists():
         return
-    found = "a folder" if out.is_dir() else "a file"
     if not overwrite:
         advice = "choose another name, or give `overwrite=True`"
-        raise ConflictError(out, expected="nothing there", found=found, advice=advice)
+        raise ConflictError(out, expected="nothing there", found="a folder or a file", advice=advice)
     if not out.is_dir() or not all(one.metadata.predicted for one in FolderSource(out).sequences().values()):
-        expected = "a data set with predicted labels to overwrite"
-        raise ConflictError(out, expected=expected, found=f"{found} of something else", advice="choose another name")
+        expected, advice = "a data set with predicted labels to overwrite", "choose another name"
+        raise ConflictError(out, expected=expected, found="something else", advice=advice)
     shutil.rmtree(out)
 
 
@@ -267,9 +262,7 @@ def _link_files(sequence: _LabelledSequence, folder: Path) -> int:
             count += "/" in path  # text files are not counted
         except FileExistsError:  # of a run that was interrupted, or of another part of this one
             continue
-        except OSError as error:
-            if error.errno not in _NO_LINKS:
-                raise storage_error(folder / path, error) from error
-            break  # the others are copied
+        except OSError:  # the file system has no hard links, or not to that place: the other files are copied
+            break
     sync_all(folders)
     return count

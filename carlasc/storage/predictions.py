@@ -54,7 +54,8 @@ def find_predictions(root: Path, sequences: Mapping[str, Sequence], chosen: Fram
     found: dict[tuple[str, ...], PredictedFiles] = {}
     for folder, _, names in os.walk(root):
         for suffix in SUFFIXES:
-            if numbers := sorted(n for name in names if (n := layout.frame_of(name, suffix)) is not None):
+            stems = [name.removesuffix(suffix) for name in names if layout.frame_of(name, suffix) is not None]
+            if numbers := sorted(int(stem) for stem in stems if stem == f"{int(stem):06d}"):
                 parts = Path(folder).relative_to(root).parts
                 if parts in found:
                     raise FormatError(
@@ -124,7 +125,7 @@ class PredictionReader:
             MissingDataError: the file does not exist.
             FormatError: it is damaged, has not one row for each point, other classes than the table, or rows that are no probabilities.
         """
-        labels, scores = _load(path)
+        labels, scores = load(path)
         for rows in (labels, scores):
             if rows is not None and len(rows) != count:
                 raise FormatError(path, expected=f"{count} rows, one for each point", found=str(len(rows)))
@@ -177,12 +178,7 @@ class PredictionReader:
         return pairs
 
 
-def has_probabilities(path: Path) -> bool:
-    """Whether a file of predictions has probabilities."""
-    return _load(path)[1] is not None
-
-
-def _load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
     """Return the labels, (N,) whole numbers, and the scores, (N, C) floats, of a file, each if it has some."""
     labels: NDArray[Any] | None = None
     scores: NDArray[Any] | None = None

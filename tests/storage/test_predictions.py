@@ -219,6 +219,13 @@ def test_two_folders_of_a_sequence_and_two_kinds_of_files_are_refused(sequences,
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
 
 
+def test_names_of_frames_have_six_digits_as_those_of_the_layout(sequences, tmp_path):
+    write(tmp_path)
+    (tmp_path / "000001.label").rename(tmp_path / "0000000001.label")
+    with pytest.raises(MissingDataError, match=r"none for 1 of 3 frames .*\(000001\)"):
+        find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
+
+
 @pytest.mark.parametrize("make", [lambda path: None, lambda path: path.write_text("x"), lambda path: path.mkdir()])
 def test_a_folder_without_predictions_is_one_line(sequences, tmp_path, make):
     make(tmp_path / "x")
