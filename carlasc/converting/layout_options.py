@@ -43,7 +43,7 @@ class LayoutOptions:
         check_choice("axes", self.axes, Axes)
         check_choice("flow", self.flow, FlowSource)
 
-    def of(self, converter: type[Converter]) -> AxesAndClasses:
+    def of(self, converter: Converter) -> AxesAndClasses:
         """Return the axes and the classes in which the data of a converter are written.
 
         Raises:

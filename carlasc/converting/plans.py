@@ -158,7 +158,7 @@ def sequence_path(recording: Recording) -> str:
 
 def plan_recording(
     recording: Recording,
-    converter: type[Converter],
+    converter: Converter,
     sink: Sink,
     target: AxesAndClasses,
     options: PoseOptions,
@@ -170,7 +170,7 @@ def plan_recording(
 
     Args:
         recording: the recording.
-        converter: its kind of data set.
+        converter: what reads the data set.
         sink: where it is written.
         target: the axes and classes in which it is written.
         options: where poses come from.
@@ -191,7 +191,8 @@ def plan_recording(
     if not recording.rays:
         notes.append("nobody knows where points were seen from, so no grids are made from them")
     elif poses is None:
-        notes.append("there are no poses: they were estimated from the scans with KISS-ICP")
+        why = "as asked for" if options.source == KISS_ICP else "because the recording has none"
+        notes.append(f"poses were estimated from the scans with KISS-ICP, {why}")
     else:
         if not options.force and writer.read_document(layout.POSES) is None:
             notes.append(check_poses(recording, converter, poses))

@@ -72,7 +72,8 @@ class Cloud:
     """The points that one sensor took for a frame.
 
     Attributes:
-        points: (N, 4) float32: x, y, z in metres, right-handed, in the frame that the sensor says, and remission (0 if unknown).
+        points: (N, 4) float32: x, y, z in metres, right-handed, in the frame that the sensor says, and remission. (N, 3) points get a
+            remission of 0.
         labels: (N,) class ids of the data set, 0 unlabelled; None if the points have no labels.
         instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same number in all frames of the
             recording, whether it moves or not, and in its boxes. None if the points have no instances.
@@ -89,6 +90,11 @@ class Cloud:
     origins: NDArray[np.float32] | None = None
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     sensor: int = 0
+
+    def __post_init__(self) -> None:
+        if self.points.ndim == 2 and self.points.shape[1] == 3:
+            remission = np.zeros((len(self.points), 1), self.points.dtype)
+            object.__setattr__(self, "points", np.concatenate([self.points, remission], axis=1))
 
 
 @dataclass(frozen=True)
@@ -252,6 +258,8 @@ class Converter(ABC):
     Options are keyword parameters of the constructor, each with its type, its default and its help:
     `sweeps: Annotated[bool, "Read all scans, not only key frames."] = True`. `carlasc convert NAME --help` shows them.
 
+    All but `title` may be set in the constructor, where options decide them.
+
     Attributes:
         source: folder of the data set, or of one of its sequences.
         title: what it reads, in a few words.
@@ -266,14 +274,14 @@ class Converter(ABC):
     """
 
     title: ClassVar[str]
-    classes: ClassVar[ClassTable]
-    to_carla: ClassVar[Remap]
-    sensor: ClassVar[str | None] = None
-    min_range_m: ClassVar[float | None] = None
-    max_range_m: ClassVar[float | None] = None
-    license: ClassVar[str | None] = None
-    citation: ClassVar[str | None] = None
-    simulated: ClassVar[bool] = False
+    classes: ClassTable
+    to_carla: Remap
+    sensor: str | None = None
+    min_range_m: float | None = None
+    max_range_m: float | None = None
+    license: str | None = None
+    citation: str | None = None
+    simulated: bool = False
 
     def __init__(self, source: Path) -> None:
         self.source = source

@@ -11,14 +11,15 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from carlasc.converting.exporter import Exporter
-from carlasc.converting.protocol import Converter
+from carlasc.converting.protocol import Converter, Recording
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.tables import CARLA, remaps_between
-from carlasc.errors import ArgumentError, DependencyError, check_choice
+from carlasc.errors import ArgumentError, DependencyError, MissingDataError, check_choice
 
 GROUP = "carlasc.converters"
 EXPORTERS = "carlasc.exporters"
@@ -75,6 +76,47 @@ def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
         if converter.classes == table:
             return (converter.to_carla,)
     return None
+
+
+def open_converter(name: str | type[Converter], source: Path, options: Mapping[str, Any] | None = None) -> Converter:
+    """Return a converter of a data set.
+
+    Args:
+        name: the name of an installed converter, or a class that inherits `Converter`.
+        source: folder of the data set.
+        options: what the converter takes beside the source, by name; text is read as the type of the option.
+
+    Raises:
+        ArgumentError: no converter has that name, it has no such option, or the option cannot have that value.
+        DependencyError: it cannot be loaded.
+    """
+    kind = load_converter(name) if isinstance(name, str) else name
+    return kind(source, **read_options(kind, options))
+
+
+def find_recordings(converter: Converter) -> list[Recording]:
+    """Return the recordings of a converter.
+
+    Raises:
+        MissingDataError: it finds none; names the converters that find some in the same place.
+        FormatError: a file does not hold what it must.
+    """
+    try:
+        return converter.sequences()
+    except MissingDataError as error:
+        others = [name for name in converter_names() if _finds(name, type(converter), converter.source)]
+        if others:
+            error.advice = f"this is what {' or '.join(f'`carlasc convert {name}`' for name in others)} reads"
+        raise
+
+
+def _finds(name: str, other_than: type[Converter], source: Path) -> bool:
+    """Return whether an installed converter finds recordings in a place."""
+    try:
+        kind = load_converter(name)
+        return kind is not other_than and any(recording.frames for recording in kind(source).sequences())
+    except Exception:  # noqa: BLE001 (another data set's: code of another distribution may fail in any way, and is not asked for)
+        return False
 
 
 @dataclass(frozen=True)

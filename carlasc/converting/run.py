@@ -16,7 +16,7 @@ import numpy as np
 from carlasc.converting.layout_options import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
 from carlasc.converting.protocol import Converter, Recording
-from carlasc.converting.registry import load_converter, read_options
+from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.converting.results import ConvertResult, Failure, StepCounter, check_outside
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
@@ -81,13 +81,13 @@ def convert(
         StorageError: the output cannot be written. The files written so far are complete.
     """
     start = time.perf_counter()
-    converter = load_converter(name) if isinstance(name, str) else name
-    target, given = layout.of(converter), read_options(converter, options)
-    root, sink = Path(source), as_sink(out, part=run.part)
+    root = Path(source)
+    converter = open_converter(name, root, options)
+    target, sink = layout.of(converter), as_sink(out, part=run.part)
     check_shared(sink.location, run)
     _check(root, sink, split, grids, run.part)
 
-    recordings = choose_recordings(converter(root, **given).sequences(), root, sequences, split)
+    recordings = choose_recordings(find_recordings(converter), root, sequences, split)
     recordings = _deal(recordings, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)

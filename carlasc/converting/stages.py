@@ -40,7 +40,7 @@ class Conversion:
 
     Attributes:
         plan: what is read, and where it is written.
-        converter: its kind of data set.
+        converter: what reads the data set.
         target: how frames are written.
         run_options: how the work is spread.
         steps: is called after each frame of each stage.
@@ -50,7 +50,7 @@ class Conversion:
     """
 
     plan: RecordingPlan
-    converter: type[Converter]
+    converter: Converter
     target: AxesAndClasses
     run_options: Run
     steps: StepCounter

@@ -123,7 +123,7 @@ def jitter_note(poses: NDArray[np.float64]) -> str | None:
 
 
 def estimate_poses(
-    recording: Recording, converter: type[Converter], times: NDArray[np.float64], step: Callable[[], object]
+    recording: Recording, converter: Converter, times: NDArray[np.float64], step: Callable[[], object]
 ) -> NDArray[np.float64]:
     """Estimate the pose of each scan with KISS-ICP. A frame without a scan gets the pose of the scan before it.
 
@@ -174,7 +174,7 @@ def estimate_poses(
     return fill_gaps(found, np.array(poses), recording)
 
 
-def odometry_range(converter: type[Converter]) -> tuple[float, float]:
+def odometry_range(converter: Converter) -> tuple[float, float]:
     """Return the least and the greatest range of the points that odometry uses, in metres."""
     return converter.min_range_m or 0.0, converter.max_range_m or 100.0
 
@@ -200,7 +200,7 @@ def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recordin
     return poses[np.clip(lines, 0, None)]
 
 
-def check_poses(recording: Recording, converter: type[Converter], poses: NDArray[np.float64]) -> str | None:
+def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.float64]) -> str | None:
     """Check that the scans overlap under their poses, which reads some scans.
 
     Poses of another point of the vehicle, or some frames late, are accepted with a note, which is returned.

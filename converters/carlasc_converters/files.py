@@ -14,6 +14,7 @@ from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.arrays import ArrayFormat, open_npz
 
 COPY = "the file may be cut short: copy it again"
+_MISSING = "copy it, or unpack the archive of the data set that has it"
 
 
 @contextmanager
@@ -23,7 +24,7 @@ def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> 
     Args:
         path: the file.
         expected: what it should hold.
-        advice: what to do if it does not, or does not exist.
+        advice: what to do if it does not.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -33,7 +34,7 @@ def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> 
         try:
             yield
         except FileNotFoundError:
-            raise MissingDataError(path, expected=expected, found="nothing", advice=advice) from None
+            raise MissingDataError(path, expected=expected, found="nothing", advice=_MISSING) from None
 
 
 def read_bytes(path: str | os.PathLike[str], expected: str = "a file", advice: str = COPY) -> bytes:

@@ -258,7 +258,7 @@ def test_clouds_of_several_sensors_are_put_together_in_the_axes_of_the_vehicle()
 @pytest.mark.parametrize(
     ("cloud", "problem"),
     [
-        (Cloud(np.zeros((2, 3), np.float32)), r"scan: points: expected shape \(N, 4\) float32"),
+        (Cloud(np.zeros((2, 5), np.float32)), r"scan: points: expected shape \(N, 4\) float32"),
         (Cloud(np.zeros((2, 4), np.float32), np.zeros(3, np.uint8)), "scan: labels: expected one for each of 2 points"),
         (Cloud(np.zeros((2, 4), np.float32), sensor=1), "scan: expected a sensor 0..0, found 1"),
     ],

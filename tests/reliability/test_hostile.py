@@ -7,19 +7,20 @@ from pathlib import Path
 
 import pytest
 from faults.hostile import Case, run, try_case
+from helpers.processes.fresh import in_fresh_process
 
 pytest.importorskip("h5py")
 
 
 def test_a_slice_of_the_cases_does_no_harm(tmp_path: Path) -> None:
-    outcome = run(10, 2, tmp_path)
+    outcome = in_fresh_process(run, 10, 2, tmp_path)
     assert outcome.found == []
     assert outcome.tried == 10
 
 
 @pytest.mark.slow
 def test_no_case_does_harm(tmp_path: Path) -> None:
-    outcome = run(10_000, 0, tmp_path)
+    outcome = in_fresh_process(run, 10_000, 0, tmp_path)
     assert outcome.found == []
     assert outcome.tried > 200
 
