@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,29 +17,17 @@ def label(
     out: Annotated[str, place_option("-o", "--out", text="Folder of the labelled data set.")],
     predictions: Annotated[
         str,
-        typer.Option(
-            "--from",
-            metavar="FILES",
-            help="Folder of the predictions: 000000.label, .npy or .npz for each frame, in SPLIT/SEQUENCE/ or SEQUENCE/.",
-        ),
+        typer.Option("--from", metavar="FILES", help="Folder of the predictions: a file for each frame, by sequence."),
     ],
     classes: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TABLE",
-            help="Class table of the predictions: a name such as semantickitti, or a JSON file; that of SOURCE if not given.",
-        ),
+        str | None, typer.Option(metavar="TABLE", help="Class table of the predictions, by name or in a JSON file.")
     ] = None,
     logits: Annotated[
-        bool, typer.Option("--logits", help="Arrays of a column per class hold scores from before the softmax.")
+        bool, typer.Option("--logits", help="Scores of classes are those from before the softmax.")
     ] = False,
-    by: Annotated[
-        str | None, typer.Option(metavar="NAME", help="What made the labels; the name of FILES if not given.")
-    ] = None,
+    by: Annotated[str | None, typer.Option(help="What made the labels; the name of FILES if not given.")] = None,
     frames: FramesOption = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what an earlier run of this command has made.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
     json: Json = False,
 ) -> None:
     """Write a copy of SOURCE with the labels that a network predicted. SOURCE is not changed.
@@ -47,17 +35,14 @@ def label(
     Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
     """
     with run.spread("Labelling", "files") as spread:
-        result = carlasc.label(
-            source,
-            out,
-            predictions,
-            classes=classes,
-            logits=logits,
-            by=by,
-            frames=frames,
-            overwrite=overwrite,
-            run=spread,
-        )
+        options: dict[str, Any] = {
+            "classes": classes,
+            "logits": logits,
+            "by": by,
+            "frames": frames,
+            "overwrite": overwrite,
+        }
+        result = carlasc.label(source, out, predictions, **options, run=spread)
     if json:
         print_json(result)
         return

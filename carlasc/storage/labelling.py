@@ -26,7 +26,7 @@ from carlasc.storage.files import to_json, write_atomic
 from carlasc.storage.folder import FolderSequence, FolderSource
 from carlasc.storage.metadata import PREDICTED
 from carlasc.storage.opening import as_source
-from carlasc.storage.packed.output import unfinished
+from carlasc.storage.packed.output import remove, replaced, unfinished
 from carlasc.storage.predictions import (
     PredictedFiles,
     PredictionReader,
@@ -130,6 +130,8 @@ def label(
     copied = unpack(ChosenSequences(source.location, sequences), out, overwrite=overwrite and mark is None, run=run)
     if mark is not None:
         mark.unlink(missing_ok=True)
+        if overwrite:
+            remove(replaced(Path(out)))
     return LabelResult(
         **vars(copied) | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
         by=by,
@@ -208,7 +210,7 @@ def _reader(given: ClassTable | None, sequence: Sequence, logits: bool) -> Predi
 
 
 def _clear(out: Path, *, overwrite: bool) -> None:
-    """Remove a data set that `label` made, if it may be replaced.
+    """Set aside a data set that `label` made, if it may be replaced: it is removed when the new one is whole.
 
     Raises:
         ConflictError: something exists that may not.
@@ -221,7 +223,8 @@ def _clear(out: Path, *, overwrite: bool) -> None:
     if not out.is_dir() or not all(one.metadata.predicted for one in FolderSource(out).sequences().values()):
         expected, advice = "a data set with predicted labels to overwrite", "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
-    shutil.rmtree(out)
+    remove(replaced(out))
+    out.rename(replaced(out))
 
 
 def _mark(folder: Path, settings: Mapping[str, Any], files: Iterable[PredictedFiles], *, overwrite: bool) -> Path:

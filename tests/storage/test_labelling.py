@@ -164,6 +164,7 @@ def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_fo
     carlasc.label(data, tmp_path / "out", tmp_path / "net", by="x", overwrite=True, frames=(0, 3), run=ALONE)
     made = open_store(tmp_path / "out").sequences()[WHOLE]
     assert made.metadata.predicted == "predicted by x" and made.frames("labels").tolist() == [0, 1, 2]
+    assert not (tmp_path / "out.replaced").exists()
     before = shutil.copytree(data, tmp_path / "other")
     with pytest.raises(ConflictError, match="a data set with predicted labels to overwrite"):
         carlasc.label(data, tmp_path / "other", tmp_path / "net", overwrite=True, run=ALONE)
