@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from carlasc.converting.protocol import Converter
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.errors import FormatError, check_choice
+from carlasc.errors import ArgumentError, FormatError, check_choice
 from carlasc.storage.metadata import Axes
 
 _IDS = np.iinfo(np.uint16).max + 1
@@ -50,6 +50,12 @@ class LayoutOptions:
             ArgumentError: `classes` is neither "carla" nor the name of the converter's class table.
         """
         check_choice("classes", self.classes, ("carla", converter.classes.name))
+        if self.classes == "carla" and converter.to_carla is None:
+            raise ArgumentError(
+                "classes",
+                expected=f"{converter.classes.name}, because nothing maps this table to CarlaSC's",
+                found="carla",
+            )
         remap = converter.to_carla if self.classes == "carla" else None
         return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
 

@@ -73,7 +73,7 @@ def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
             converter = load_converter(name)
         except DependencyError:
             continue  # another distribution's, which is broken, but is not asked for
-        if converter.classes == table:
+        if getattr(converter, "classes", None) == table and converter.to_carla is not None:
             return (converter.to_carla,)
     return None
 

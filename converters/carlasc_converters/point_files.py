@@ -1,0 +1,155 @@
+"""Files of points, one scan each, as columns by name: .bin, .npy, .npz, .csv, .txt, .ply, .pcd, .las and .laz."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import ArgumentError, FormatError, import_extra
+from carlasc_converters.files import COPY, opening, read_bytes
+from carlasc_converters.pcd import read_pcd
+from carlasc_converters.ply import PlyVertices
+
+_FIRST = ("x", "y", "z", "intensity")  # the columns of an array without names
+_MOST_COLUMNS = 12
+_FLOAT = 4
+
+
+def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
+    """Return the values of the points of a file, (N,) each, by the names that the file or the caller gives.
+
+    Args:
+        path: the file; its suffix says its format.
+        columns: names of the columns of a file that names none: of .bin and .npy. None: x, y, z and intensity, as far as a file
+            without names has so many.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: the file does not hold what its format says, or has no points, or other columns.
+        ArgumentError: `columns` is needed.
+        DependencyError: laspy is needed, and not installed.
+    """
+    found = _READERS[path.suffix.lower()](path, columns)
+    if not next(iter(found.values()), np.empty(0)).size:
+        raise FormatError(path, expected="points", found="none", advice="remove the file, or record it again")
+    return found
+
+
+def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    data = read_bytes(path)
+    count, left = divmod(len(data), _FLOAT)
+    if left:
+        raise FormatError(path, expected="float32 values", found=f"{len(data)} bytes", advice=COPY)
+    values = np.frombuffer(data, "<f4")
+    if columns is None:
+        fits = [number for number in range(3, _MOST_COLUMNS + 1) if count % number == 0]
+        raise ArgumentError(
+            "columns",
+            expected="the names of the columns, such as x,y,z,intensity",
+            found="none",
+            advice=f"the {len(data)} bytes of {path} are points of {' or '.join(map(str, fits)) or 'no number of'} float32 columns",
+        )
+    if count % len(columns):
+        raise FormatError(
+            path,
+            expected=f"a multiple of {_FLOAT * len(columns)} bytes ({len(columns)} float32 per point)",
+            found=str(len(data)),
+            advice=f"check `columns` ({','.join(columns)})",
+        )
+    return dict(zip(columns, values.reshape(-1, len(columns)).T, strict=True))
+
+
+def _read_npy(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    with opening(path, "a NumPy file"):
+        array = np.load(path, allow_pickle=False)
+    return _named(array, path, columns)
+
+
+def _read_npz(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    with opening(path, "an .npz file"), np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    tables = {name: array for name, array in arrays.items() if array.ndim == 2 or array.dtype.names}
+    if len(tables) != 1:
+        if "x" in arrays:
+            return arrays
+        raise FormatError(path, expected="one table of points, or x, y and z", found=", ".join(arrays) or "nothing")
+    ((name, table),) = tables.items()
+    rest = {key: array for key, array in arrays.items() if key != name and len(array) == len(table)}
+    return _named(table, path, columns) | rest
+
+
+def _named(array: NDArray[Any], path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    """Return the columns of a structured array, or of a table (N, C)."""
+    if array.dtype.names:
+        return {name: array[name].reshape(-1) for name in array.dtype.names}
+    if array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise FormatError(path, expected="a table (N, 3) of numbers, or wider", found=f"{array.shape} {array.dtype}")
+    names = columns or _FIRST[: array.shape[1]]
+    if array.shape[1] != len(names):
+        raise FormatError(
+            path,
+            expected=f"{len(names)} columns ({','.join(names)})",
+            found=str(array.shape[1]),
+            advice="name all columns with `columns`",
+        )
+    return dict(zip(names, array.T, strict=True))
+
+
+def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    with opening(path, "a table of numbers"), path.open(encoding="utf-8-sig") as file:
+        first = file.readline()
+        separator = "," if "," in first else None
+        words = [word.strip() for word in first.lstrip("#/ ").split(separator)]
+        if named := any(not _is_number(word) for word in words):
+            columns = tuple(words)
+        elif first:
+            file.seek(0)
+        table = np.loadtxt(file, np.float64, delimiter=separator, ndmin=2)
+    if named and not table.size:
+        table = np.empty((0, len(words)))
+    return _named(table, path, columns)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_ply(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    rows = PlyVertices.open(path).read()
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def _read_pcd(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    return {name: values for name, values in read_pcd(path).items() if values.ndim == 1}
+
+
+def _read_las(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+    laspy = import_extra("laspy", "scans")
+    with opening(path, "a LAS file"):
+        cloud = laspy.read(path)
+        names = [name for name in cloud.point_format.dimension_names if name.lower() not in ("x", "y", "z")]
+        scaled = {axis: np.asarray(getattr(cloud, axis)) for axis in ("x", "y", "z")}
+        return scaled | {name: np.asarray(cloud[name]) for name in names}
+
+
+_READERS: dict[str, Callable[[Path, tuple[str, ...] | None], dict[str, NDArray[Any]]]] = {
+    ".bin": _read_bin,
+    ".npy": _read_npy,
+    ".npz": _read_npz,
+    ".csv": _read_csv,
+    ".txt": _read_csv,
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
+    ".las": _read_las,
+    ".laz": _read_las,
+}
+FORMATS = tuple(_READERS)
+"""The suffixes of the files that are read."""

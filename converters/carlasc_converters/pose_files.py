@@ -1,0 +1,163 @@
+"""Files of poses and of times: TUM, KITTI, EuRoC, CSV with a header, NumPy; times in any unit, as whole nanoseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import check_rigid
+from carlasc.errors import FormatError
+from carlasc_converters.files import opening, read_text
+from carlasc_converters.rigid import poses_of
+
+PoseOf = Literal["sensor", "vehicle"]
+_Row = TypeVar("_Row")
+_Value = TypeVar("_Value")
+
+_TUM, _KITTI = 8, 12  # numbers in a line
+_PLACES = (("x", "y", "z"), ("tx", "ty", "tz"), ("px", "py", "pz"), ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z"))
+_TURNS = (("qw", "qx", "qy", "qz"), ("q_rs_w", "q_rs_x", "q_rs_y", "q_rs_z"))
+_TIMES = ("timestamp", "time", "t", "stamp", "seconds", "sec", "nsec", "timestamp_ns", "time_ns")
+# A number above one of these counts milliseconds, microseconds or nanoseconds since 1970, or the time of a recording of years.
+_UNITS = ((Decimal(10) ** 17, 1), (Decimal(10) ** 14, 10**3), (Decimal(10) ** 11, 10**6))
+
+
+@dataclass(frozen=True)
+class PoseRows:
+    """The poses of a file.
+
+    Attributes:
+        world_T_body: (K, 4, 4) float64.
+        stamps: (K,) int64 nanoseconds, None if the file has no times.
+        of: what has these poses, as far as the format says it.
+        kind: the format, in a word.
+    """
+
+    world_T_body: NDArray[np.float64]
+    stamps: NDArray[np.int64] | None
+    of: PoseOf
+    kind: str
+
+
+def read_poses(path: Path) -> PoseRows:
+    """Read a file of poses. Its format is recognised: by its suffix (.npy), its header, or the numbers in its lines.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it has none of the formats, a pose is not rigid, a quaternion has not length 1, or times do not increase.
+    """
+    if path.suffix.lower() == ".npy":
+        with opening(path, "an array (N, 4, 4) of poses"):
+            poses = np.load(path, allow_pickle=False)
+            poses = np.asarray(poses, np.float64).reshape(-1, *poses.shape[-2:])
+        return PoseRows(_whole(poses, path), None, "sensor", "NumPy")
+    lines = [line.strip() for line in read_text(path, "poses as text").splitlines() if line.strip()]
+    comments = [line for line in lines if line.startswith("#")]
+    rows = [_split(line) for line in lines if not line.startswith("#")]
+    header = [word.lower().partition("[")[0].strip() for word in rows[0]] if rows else []
+    if any(map(str.isidentifier, header)):
+        return _read_named(header, rows[1:], path)
+    if comments and "q_RS_w" in comments[0]:
+        header = [word.lstrip("#").partition("[")[0].strip().lower() for word in comments[0].split(",")]
+        return _read_named(header, rows, path, of="vehicle", kind="EuRoC")
+    if rows and len(rows[0]) == _TUM:
+        table, stamps = _numbers(rows, _TUM, path), _stamps([row[0] for row in rows], path)
+        return PoseRows(poses_of(table[:, [7, 4, 5, 6]], table[:, 1:4], str(path)), stamps, "sensor", "TUM")
+    if rows and len(rows[0]) == _KITTI:
+        table = _numbers(rows, _KITTI, path)
+        return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor", "KITTI")
+    raise FormatError(
+        path,
+        expected="poses: lines of 8 numbers (TUM: t x y z qx qy qz qw) or of 12 (KITTI), a header with x, y, z, qw, qx, qy, qz, or .npy",
+        found=f"lines of {len(rows[0])} values" if rows else "no lines",
+    )
+
+
+def read_stamps(path: Path) -> NDArray[np.int64]:
+    """Return the (F,) nanoseconds of a file of times: one number a line, or the first of several; seconds, or a unit seen from its size.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: a line is no number.
+    """
+    lines = [line.strip() for line in read_text(path, "a time per line").splitlines()]
+    return _stamps([_split(line)[0] for line in lines if line and not line.startswith("#")], path, increasing=False)
+
+
+def nanoseconds(word: str) -> int:
+    """Return the nanoseconds of a number: seconds, or, if it is too large for these, milliseconds, microseconds or nanoseconds.
+
+    Raises:
+        ValueError: it is no finite number.
+    """
+    try:
+        value = Decimal(word)
+        scale = next((scale for least, scale in _UNITS if abs(value) >= least), 10**9)
+        return int(value * scale)
+    except (InvalidOperation, OverflowError):
+        raise ValueError(word) from None
+
+
+def _read_named(
+    header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor", kind: str = "CSV"
+) -> PoseRows:
+    def columns(choices: Sequence[tuple[str, ...]], what: str) -> list[int]:
+        for names in choices:
+            if all(name in header for name in names):
+                return [header.index(name) for name in names]
+        raise FormatError(path, expected=f"the columns {', '.join(choices[0])} of {what}", found=", ".join(header))
+
+    places, turns = columns(_PLACES, "the position"), columns(_TURNS, "the rotation")
+    times = next((header.index(name) for name in _TIMES if name in header), None)
+    table = _numbers(rows, len(header), path)
+    stamps = None if times is None else _stamps([row[times] for row in rows], path)
+    return PoseRows(poses_of(table[:, turns], table[:, places], str(path)), stamps, of, kind)
+
+
+def _split(line: str) -> list[str]:
+    return [word.strip() for word in line.split(",")] if "," in line else line.split()
+
+
+def _numbers(rows: Sequence[list[str]], columns: int, path: Path) -> NDArray[np.float64]:
+    return np.array(_each(rows, lambda row: _floats(row, columns), f"{columns} numbers", path)).reshape(-1, columns)
+
+
+def _floats(row: list[str], columns: int) -> list[float]:
+    if len(row) != columns:
+        raise ValueError(f"{len(row)} values")
+    return list(map(float, row))
+
+
+def _stamps(words: Sequence[str], path: Path, *, increasing: bool = True) -> NDArray[np.int64]:
+    stamps = np.array(_each(words, nanoseconds, "a time", path), np.int64)
+    if increasing and (np.diff(stamps) <= 0).any():
+        line = int(np.argmax(np.diff(stamps) <= 0)) + 2
+        raise FormatError(
+            path, expected="times that increase", found=f"{words[line - 1]} in row {line}, after {words[line - 2]}"
+        )
+    return stamps
+
+
+def _each(rows: Sequence[_Row], parse: Callable[[_Row], _Value], expected: str, path: Path) -> list[_Value]:
+    values = []
+    for number, row in enumerate(rows, 1):
+        try:
+            values.append(parse(row))
+        except ValueError as error:
+            raise FormatError(f"{path}: row {number}", expected=expected, found=str(error)) from None
+    return values
+
+
+def _whole(poses: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    """Return (K, 4, 4) poses from (K, 3, 4) or (K, 4, 4)."""
+    if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
+        raise FormatError(path, expected="an array (N, 4, 4) of poses", found=f"{poses.shape}")
+    whole = np.tile(np.eye(4), (len(poses), 1, 1))
+    whole[:, :3] = poses[:, :3]
+    return check_rigid(whole, str(path))
