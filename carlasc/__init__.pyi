@@ -48,6 +48,7 @@ from .storage import Sink as Sink
 from .storage import Source as Source
 from .storage import download as download
 from .storage import finish as finish
+from .storage import label as label
 from .storage import open as open
 from .storage import pack as pack
 from .storage import unpack as unpack

@@ -24,6 +24,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "simulate",
     "regrid",
     "convert",
+    "label",
     "export",
     "pack",
     "unpack",

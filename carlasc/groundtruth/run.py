@@ -205,6 +205,7 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
     how |= {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
     made_from = inputs.record()
     record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
+    record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
     settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
     params = parse_json(to_json(settings), plan.grid)  # as it is read again
     numbers = [frame.number for frame in inputs.frames]

@@ -203,6 +203,8 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
             yield from _check_numbers(sequence, name, arrays[name], where)
         elif kind == "class":
             yield from _check_classes(sequence, arrays[name], sequence.metadata.classes, where)
+        elif kind == "pairs":
+            yield from _check_classes(sequence, arrays[name][:, ::2], sequence.metadata.classes, where)
         elif kind == "boxes":
             yield from _check_boxes(sequence, arrays[name], where)
         elif kind == "picture" and arrays[name][:2].tobytes() != b"\xff\xd8":

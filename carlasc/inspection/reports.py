@@ -24,7 +24,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import write_output
 from carlasc.storage.folder import FolderSequence
-from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.protocol import ChosenSequences, Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
 
 _MOST_LEFT_OUT = 20  # scans that are left out of a long sequence for its held-out scores
@@ -202,7 +202,7 @@ class _ReportMaker:
             return None
         every = max(EVERY, len(self.inputs.feed.frames) // _MOST_LEFT_OUT)
         result = leave_out(
-            _SingleSequence(self.sequence),
+            ChosenSequences(self.sequence.location, {self.sequence.path: self.sequence}),
             spec,
             observe=self.inputs.options,
             voting=self.inputs.plan.voting,
@@ -210,16 +210,6 @@ class _ReportMaker:
             run=replace(run, progress=None),
         )
         return None if result.total is None else result.total.to_dict()
-
-
-class _SingleSequence(Source):
-    """One sequence of a source, as a source."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self.sequence, self.location = sequence, sequence.location
-
-    def sequences(self) -> Mapping[str, Sequence]:
-        return {self.sequence.path: self.sequence}
 
 
 def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:

@@ -35,12 +35,14 @@ WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2"
 # Level 6, zlib's own, takes 6 times as long, and saves 3 %: voxels are in order, so what repeats is always four bytes back.
 _VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
-CERTAIN = 65535  # the number in the column `votes` of `<grid>/classes` that means a probability of 1
+CERTAIN = (
+    65535  # the number that means a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
+)
 
 
 Per = Literal["point", "voxel", "vote", "box", "scan"]
 Kind = Literal[
-    "position", "vector", "class", "id", "value", "count", "probability", "flags", "votes", "boxes", "picture"
+    "position", "vector", "class", "pairs", "id", "value", "count", "probability", "flags", "votes", "boxes", "picture"
 ]
 
 
@@ -56,9 +58,9 @@ class Field:
         suffix: ending of the file name.
         per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
             "vote" (one row per vote), "box" (one row per box), or "scan" (the whole file belongs to the scan).
-        kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "id" (unsigned whole
-            numbers, such as actors), "value" (any number), "count", "probability" (0 to 1), "flags" (bits), "votes" and "boxes" (tables),
-            "picture" (the bytes of a file).
+        kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (of a class
+            and its probability), "id" (unsigned whole numbers, such as actors), "value" (any number), "count", "probability" (0 to 1),
+            "flags" (bits), "votes" and "boxes" (tables), "picture" (the bytes of a file).
         dtype: NumPy type on disk, little-endian; "" for tables, whose columns have types of their own.
         names: name of each value of a row.
         unit: unit of the values.
@@ -80,7 +82,7 @@ class Field:
     @property
     def columns(self) -> int | None:
         """Number of values per row; None for a flat array."""
-        return len(self.names) if self.kind in ("position", "vector") else None
+        return len(self.names) if self.kind in ("position", "vector", "pairs") else None
 
     def file(self, frame: int) -> str:
         """Return the path of a frame's file under `<coordinates>/`."""
@@ -172,6 +174,12 @@ SCAN_FIELDS: dict[str, Field] = {
             name="labels", folder="labels", suffix=".label", per="point", kind="class",
             dtype="<u4", names=("label",), unit="class",
             meaning="class of each point; 0 is unlabelled",
+        ),
+        Field(
+            name="probabilities", folder="probabilities", suffix=".bin", per="point", kind="pairs",
+            dtype="<u2", names=("class1", "share1", "class2", "share2", "class3", "share3"), unit="class, 1/65535",
+            meaning="the likeliest classes of each point, the first first: class and probability in 1/65535; 0 and 0 where there is none",
+            published=False,
         ),
         Field(
             name="flow", folder="predictions", suffix=".bin", per="point", kind="vector",

@@ -15,6 +15,8 @@ from carlasc.storage.files import parse_json, to_json
 FORMAT = 2
 """Version of carlasc.json. Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`."""
 
+PREDICTED = "predicted by "
+"""How the key `labels` of carlasc.json begins where a network made the labels; its name follows."""
 _AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # by the `frame` of version 1
 
 
@@ -44,6 +46,12 @@ class Metadata:
     def has_rays(self) -> bool:
         """Whether points were seen from the sensor. Clouds whose sensor nobody knows say otherwise: nothing tells their free space."""
         return self.extra.get("rays") is not False
+
+    @property
+    def predicted(self) -> str | None:
+        """What `labels` says of labels that were predicted: "predicted by ..."; None for others."""
+        labels = self.extra.get("labels")
+        return labels if isinstance(labels, str) and labels.startswith(PREDICTED) else None
 
     @classmethod
     def from_json(cls, data: bytes, where: str) -> Metadata:

@@ -318,6 +318,44 @@ class Sequence(ABC):
         return {name: value for name, value in self.__dict__.items() if name not in ("poses", "times", "_frame_lines")}
 
 
+class SequenceView(Sequence):
+    """A sequence that shows another one, as far as a subclass does not change what it shows.
+
+    Attributes:
+        whole: the other sequence.
+    """
+
+    def __init__(self, whole: Sequence) -> None:
+        self.whole = whole
+        self.path, self.location = whole.path, whole.location
+        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
+        self._given_poses = whole._given_poses
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields of the whole sequence."""
+        return self.whole.fields()
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field of the whole sequence."""
+        return self.whole.frames(field)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame of the whole sequence."""
+        return self.whole.read(field, frame)
+
+    def documents(self) -> tuple[str, ...]:
+        """Return the text files of the whole sequence."""
+        return self.whole.documents()
+
+    def read_document(self, name: str) -> bytes:
+        """Return the bytes of a text file of the whole sequence."""
+        return self.whole.read_document(name)
+
+    def line_of(self, frame: int, lines: int, document: str) -> int:
+        """Return the line of a text file that belongs to a frame: the one in the whole sequence."""
+        return self.whole.line_of(frame, lines, document)
+
+
 class Source(ABC):
     """A store that sequences are read from.
 
@@ -333,6 +371,17 @@ class Source(ABC):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
+
+
+class ChosenSequences(Source):
+    """Some of the sequences of a source, or others in their place."""
+
+    def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
+        self.location, self.chosen = location, sequences
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences."""
+        return self.chosen
 
 
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:

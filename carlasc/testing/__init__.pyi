@@ -7,3 +7,4 @@ from .drives import KINDS as KINDS
 from .drives import DriveScan as DriveScan
 from .drives import SimulatedDrive as SimulatedDrive
 from .drives import Thing as Thing
+from .mistakes import wrong_labels as wrong_labels

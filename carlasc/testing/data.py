@@ -139,6 +139,8 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
             fields["occupied"] = np.round(fields["occupied"])
         for part, array in fields.items():
             whole.write(f"evaluation_8x4x3/{part}", frame, array)
+    for frame, count in zip(FRAMES, (0, 1, 777, 1001), strict=True):
+        whole.write("probabilities", frame, rng.integers(0, 65536, (count, 6)).astype(np.uint16))
     return root
 
 

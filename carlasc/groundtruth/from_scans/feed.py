@@ -35,7 +35,7 @@ from carlasc.motion import (
 )
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
-from carlasc.storage.protocol import Sequence
+from carlasc.storage.protocol import Sequence, SequenceView
 
 _SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground
@@ -58,7 +58,7 @@ class ScanMotion:
     standing: Standing
 
 
-class WithoutScans(Sequence):
+class WithoutScans(SequenceView):
     """A sequence some of whose scans are hidden. The poses and times of these frames are still known.
 
     A hidden frame is not listed among the frames of a scan's fields, and reads as a scan without points.
@@ -69,14 +69,8 @@ class WithoutScans(Sequence):
     """
 
     def __init__(self, whole: Sequence, hidden: Collection[int]) -> None:
-        self.whole, self.hidden = whole, frozenset(hidden)
-        self.path, self.location = whole.path, whole.location
-        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
-        self._given_poses = whole._given_poses
-
-    def fields(self) -> frozenset[str]:
-        """Return the fields of the whole sequence."""
-        return self.whole.fields()
+        super().__init__(whole)
+        self.hidden = frozenset(hidden)
 
     def frames(self, field: str) -> NDArray[np.int64]:
         """Return the frames of a field; without the hidden ones if it is a field of the scans."""
@@ -89,18 +83,6 @@ class WithoutScans(Sequence):
             return self.whole.read(field, frame)
         entry = layout.SCAN_FIELDS[field]
         return np.empty(0 if entry.columns is None else (0, entry.columns), entry.dtype)
-
-    def documents(self) -> tuple[str, ...]:
-        """Return the text files of the whole sequence."""
-        return self.whole.documents()
-
-    def read_document(self, name: str) -> bytes:
-        """Return the bytes of a text file of the whole sequence."""
-        return self.whole.read_document(name)
-
-    def line_of(self, frame: int, lines: int, document: str) -> int:
-        """Return the line of a text file that belongs to a frame: the one in the whole sequence."""
-        return self.whole.line_of(frame, lines, document)
 
 
 class ScanFeed:

@@ -17,8 +17,8 @@ from carlasc.inspection.statistics import Histogram, Statistics, stats
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.packed.stores import PackedSource
+from carlasc.storage.protocol import ChosenSequences, Source
 from carlasc.storage.protocol import Sequence as StoredSequence
-from carlasc.storage.protocol import Source
 
 
 @dataclass(frozen=True)
@@ -209,16 +209,6 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
     )
 
 
-class _Chosen(Source):
-    """Some of the sequences of a source."""
-
-    def __init__(self, location: str, sequences: Mapping[str, StoredSequence]) -> None:
-        self.location, self.chosen = location, sequences
-
-    def sequences(self) -> Mapping[str, StoredSequence]:
-        return self.chosen
-
-
 def _count(location: str, sequences: Mapping[str, StoredSequence], every: int, run: Run) -> tuple[Statistics, ...]:
     """Count the classes, apart for each class table; sequences without labels are left out."""
     if every < 1:
@@ -230,7 +220,7 @@ def _count(location: str, sequences: Mapping[str, StoredSequence], every: int, r
     counted = []
     for chosen in tables.values():
         try:
-            counted.append(stats(_Chosen(location, chosen), remap=None, every=every, run=run))
+            counted.append(stats(ChosenSequences(location, chosen), remap=None, every=every, run=run))
         except MissingDataError:  # several grids, and none of them the published one
             continue
     return tuple(counted)

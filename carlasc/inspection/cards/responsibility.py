@@ -78,7 +78,11 @@ def preprocessing(facts: Facts) -> list[str]:
 
 def annotation(facts: Facts) -> list[str]:
     """Return where labels come from, one sentence each."""
-    sentences = [say("simulated_labels")] if facts.simulated else []
+    said = [one.metadata.predicted for one in facts.sequences.values()]
+    sentences = [say("predicted_labels", how=how) for how in sorted({how for how in said if how})]
+    if all(said):  # no other labels
+        return [*sentences, say("votes")] if facts.grids else sentences
+    sentences += [say("simulated_labels")] if facts.simulated else []
     if facts.sources:
         boxes = any(one.metadata.extra.get("labels") == "boxes" for one in facts.sequences.values())
         sentences.append(say("labels_of_boxes" if boxes else "labels_of_source"))

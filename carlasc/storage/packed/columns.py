@@ -171,6 +171,24 @@ class ValuesPacking(Packing):
         return values if self.entry.kind in ("class", "picture") else values.astype(self.entry.dtype, copy=False)
 
 
+class PairsPacking(Packing):
+    """(N, K) numbers as `values` (K, N): classes and probabilities, each column of which is much like itself."""
+
+    kind = "pairs"
+
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
+        rows = self.entry.columns
+        return (Column("values", self.entry.dtype, Encoding(shuffle=SHUFFLE), self.entry.unit, rows=rows),)
+
+    def split(self, array: NDArray[Any]) -> Columns:
+        """Return the columns as planes."""
+        return {"values": array.T}
+
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return (N, K) rows."""
+        return np.ascontiguousarray(columns["values"].T)
+
+
 class FlowPacking(Packing):
     """(N, 3) vectors as a `palette` (3, K) of the frame's distinct vectors, compared bit by bit, and the `index` of each point's."""
 
@@ -292,6 +310,7 @@ def packing_of(
 _BY_KIND: dict[layout.Kind, Callable[..., Packing]] = {
     "position": PointsPacking,
     "vector": FlowPacking,
+    "pairs": PairsPacking,
     "votes": VotesPacking,
     "boxes": BoxesPacking,
 }

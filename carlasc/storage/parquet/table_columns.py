@@ -95,7 +95,7 @@ def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: 
         return table
     if len(columns) == 1:
         return narrow(first) if entry.kind == "class" else first
-    rows, scale = np.empty((len(first), len(columns)), np.float32), attributes.get("scale_m")
+    rows, scale = np.empty((len(first), len(columns)), entry.dtype), attributes.get("scale_m")
     for k, (name, column) in enumerate(columns.items()):
         rows[:, k] = column * scale if scale and name in AXES else column
     return rows

@@ -1,0 +1,52 @@
+"""`carlasc label`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+import carlasc
+from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
+from carlasc.cli.flags import RunFlags
+
+
+def label(
+    run: RunFlags,
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")],
+    out: Annotated[str, place_option("-o", "--out", text="Folder of the labelled data set.")],
+    predictions: Annotated[
+        str,
+        typer.Option("--from", metavar="FILES", help="Folder of the predictions: a file for each frame, by sequence."),
+    ],
+    classes: Annotated[
+        str | None, typer.Option(metavar="TABLE", help="Class table of the predictions, by name or in a JSON file.")
+    ] = None,
+    logits: Annotated[
+        bool, typer.Option("--logits", help="Scores of classes are those from before the softmax.")
+    ] = False,
+    by: Annotated[str | None, typer.Option(help="What made the labels; the name of FILES if not given.")] = None,
+    frames: FramesOption = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a copy of SOURCE with the labels that a network predicted. SOURCE is not changed.
+
+    Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
+    """
+    with run.spread("Labelling", "files") as spread:
+        options: dict[str, Any] = {
+            "classes": classes,
+            "logits": logits,
+            "by": by,
+            "frames": frames,
+            "overwrite": overwrite,
+        }
+        result = carlasc.label(source, out, predictions, **options, run=spread)
+    if json:
+        print_json(result)
+        return
+    if result.left_out:
+        echo(f"note: without {', '.join(result.left_out)}, of other labels or classes")
+    files = f"{result.linked} files linked, {result.files} written"
+    echo(f"{result.out}: labels of {result.frames} frames predicted by {result.by} ({result.classes}); {files}")
