@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +18,7 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc_converters.bag_frames import BagFrame, CloudPlace, LidarTopic
 from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
 from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
+from carlasc_converters.files import sequence_name
 from carlasc_converters.point_fields import TimeUnit
 from carlasc_converters.transforms import FrameTrack, FrameTree, PlacedFrame
 
@@ -82,7 +82,7 @@ class BagRecording(Recording):
 
     def __init__(self, files: BagFiles, options: BagOptions) -> None:
         self._files, self._options, self.location = files, options, files.location
-        self.name = re.sub(r"[^\w-]+", "_", files.paths[0].name.split(".")[0].removesuffix("_0"))
+        self.name = sequence_name(files.paths[0].name.split(".")[0].removesuffix("_0"))
         self._pose_note, self._notes = "", list[str]()
         self._lidars = [LidarTopic(topic, options.time_unit) for topic in files.clouds(options.topics)]
 

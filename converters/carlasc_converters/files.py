@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +12,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage import layout
 from carlasc.storage.arrays import ArrayFormat, open_npz
 
 COPY = "the file may be cut short: copy it again"
+_OF_THE_LAYOUT = {*layout.scan_folders(), *layout.SPLITS, *layout.COORDINATES, layout.EVALUATION}
 _MISSING = "copy it, or unpack the archive of the data set that has it"
 
 
@@ -35,6 +38,12 @@ def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> 
             yield
         except FileNotFoundError:
             raise MissingDataError(path, expected=expected, found="nothing", advice=_MISSING) from None
+
+
+def sequence_name(name: str) -> str:
+    """Return a name that the layout can have for a sequence, from that of a file or a folder."""
+    name = re.sub(r"[^\w-]+", "_", name)
+    return f"{name}_recording" if name in _OF_THE_LAYOUT else name
 
 
 def read_bytes(path: str | os.PathLike[str], expected: str = "a file", advice: str = COPY) -> bytes:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from carlasc.converting import converter_names, load_converter, remaps_to_carla
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.core.tables import CARLA, TABLES, table_from_json
+from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, DependencyError
-from carlasc.storage.files import parse_json
-from carlasc_converters.files import read_bytes
+from carlasc.storage.predictions import read_table
 
 
 def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
@@ -17,8 +16,7 @@ def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
         name: the name of a table, or the path of a JSON file with a table as carlasc.json has it, or of a carlasc.json.
 
     Raises:
-        ArgumentError: no table has the name.
-        MissingDataError: the file does not exist.
+        ArgumentError: no table has the name, and no file.
         FormatError: the file holds no class table.
     """
     table = _table(name)
@@ -32,16 +30,15 @@ def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
 
 
 def _table(name: str) -> ClassTable:
-    if name.lower().endswith(".json"):
-        values = parse_json(read_bytes(name, "a class table"), name)
-        return table_from_json(values.get("classes", values), name)
-    known = dict(TABLES)
     for converter in converter_names():
         try:
             table = load_converter(converter).classes
         except (DependencyError, AttributeError):  # of another distribution, broken or without a table of its own
             continue
-        known.setdefault(table.name, table)
-    if name not in known:
-        raise ArgumentError("source_classes", expected=f"one of {', '.join(known)}, or a JSON file", found=repr(name))
-    return known[name]
+        if table.name == name:
+            return table
+    try:
+        return read_table(name)
+    except ArgumentError as error:
+        error.where = "source_classes"
+        raise

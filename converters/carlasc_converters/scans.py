@@ -18,6 +18,7 @@ from carlasc.core.geometry import Transform, invert
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc_converters.calibration_file import axes_named, in_axes, read_calibration
+from carlasc_converters.files import sequence_name
 from carlasc_converters.given_classes import classes_given
 from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
 from carlasc_converters.point_files import FORMATS, read_columns
@@ -135,7 +136,7 @@ class ScanFolder(Recording):
     def __init__(
         self, source: Path, files: dict[str, list[Path]], rig: dict[str, Transform], options: ScanOptions
     ) -> None:
-        self.location, self.name = str(source), re.sub(r"[^\w-]+", "_", source.resolve().name)
+        self.location, self.name = str(source), sequence_name(source.resolve().name)
         self._files, self._rig, self._options = files, rig, options
         self.has_labels = options.label_dir is not None or (options.has_classes and "label" in self._first)
         self.has_instances = self.has_labels and "instance" in self._first
