@@ -101,7 +101,7 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@touch $@
 
 # Without torch, which on Linux is gigabytes: its tests skip. `EXTRAS=all,dev` has it too.
-EXTRAS ?= zarr,hdf5,parquet,remote,kitti,scans,bags,render,simulate,view,plots,rerun,foxglove,hub,dev
+EXTRAS ?= zarr,hdf5,parquet,remote,kitti,scans,bags,ncore,render,simulate,view,plots,rerun,foxglove,hub,dev
 .venv-newest/ready: pyproject.toml
 	$(call virtual_environment,.venv-newest)
 	.venv-newest/bin/pip install --quiet --no-compile --editable '.[$(EXTRAS)]'

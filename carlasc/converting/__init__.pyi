@@ -8,8 +8,8 @@ from .exporting import export as export
 from .layout_options import FlowSource as FlowSource
 from .layout_options import LayoutOptions as LayoutOptions
 from .plans import SplitName as SplitName
-from .preview import RecordingPreview as RecordingPreview
-from .preview import preview as preview
+from .previewing import RecordingPreview as RecordingPreview
+from .previewing import preview as preview
 from .protocol import Cloud as Cloud
 from .protocol import Converter as Converter
 from .protocol import FrameHandle as FrameHandle

@@ -1,0 +1,156 @@
+"""Stores of NCore, version 4: zarr hierarchies of version 2, in a folder or in a tar archive with an index (.zarr.itar).
+
+The format: https://nvidia.github.io/ncore/data/formats.html. An archive ends with a block that says where its index is: names, places and
+sizes of its members, as CBOR compressed by LZMA. The metadata of a store are collected in one member, in the same form.
+"""
+
+from __future__ import annotations
+
+import itertools
+import lzma
+import struct
+from functools import cached_property, lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc_converters.files import COPY, opening, read_bytes
+
+SUFFIXES = (".zarr.itar", ".zarr")
+_METADATA = ".zmetadata.cbor.xz"
+_BLOCK = 512
+_HEADER = struct.Struct("<4sIQI")  # magic, kind of index, its place, its size
+_CBOR_LZMA = 1
+_MOST_BYTES = 1 << 31  # of an index or of metadata, unpacked
+
+
+class NcoreStore:
+    """One store. It opens its file for each read, and keeps the index."""
+
+    def __init__(self, path: str) -> None:
+        self.path = Path(path)
+
+    @cached_property
+    def _members(self) -> dict[str, tuple[int, int]]:
+        """Place and size of each member of an archive by its name."""
+        with opening(self.path, "an indexed tar archive of NCore"), self.path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(max(0, size - _BLOCK))
+            block = file.read(_BLOCK)
+            magic, kind, place, length = _HEADER.unpack(block[: _HEADER.size])
+            if magic != b"itar" or place + length > size:
+                raise FormatError(
+                    self.path,
+                    expected="an index at the end of the archive",
+                    found="none",
+                    advice=f"{COPY}, or write it again",
+                )
+            if kind != _CBOR_LZMA:
+                raise FormatError(
+                    self.path, expected="an index of kind 1", found=f"kind {kind}", advice="upgrade carlasc"
+                )
+            file.seek(place)
+            table = _unpacked(file.read(length))
+            return dict(zip(table["items"], zip(table["offset_datas"], table["sizes"], strict=True), strict=True))
+
+    def _read(self, name: str) -> bytes | None:
+        """Return the bytes of a member; None if it does not exist."""
+        if self.path.is_dir():
+            member = self.path / name
+            return read_bytes(member) if member.is_file() else None
+        if name not in self._members:
+            return None
+        place, size = self._members[name]
+        with opening(self.path, f"{size} bytes of {name}"), self.path.open("rb") as file:
+            file.seek(place)
+            data = file.read(size)
+        if len(data) < size:
+            raise FormatError(self.path, expected=f"{size} bytes of {name}", found=str(len(data)), advice=COPY)
+        return data
+
+    @cached_property
+    def _metadata(self) -> dict[str, Any]:
+        data = self._read(_METADATA)
+        if data is None:
+            raise MissingDataError(
+                self.path,
+                expected=f"metadata in {_METADATA}",
+                found="none",
+                advice="finish the store with NCore's writer",
+            )
+        with opening(self.path, "metadata of NCore"):
+            metadata: dict[str, Any] = _unpacked(data)["metadata"]
+        return metadata
+
+    def attributes(self, group: str = "") -> dict[str, Any]:
+        """Return the attributes of a group or an array; none if there are none."""
+        found: dict[str, Any] = self._metadata.get(f"{group}/.zattrs" if group else ".zattrs", {})
+        return found
+
+    def groups(self, parent: str) -> list[str]:
+        """Return the sorted names of the groups in a group."""
+        before, after = f"{parent}/", "/.zgroup"
+        within = (key for key in self._metadata if key.startswith(before) and key.endswith(after))
+        names = (key[len(before) : -len(after)] for key in within)
+        return sorted(name for name in names if name and "/" not in name)
+
+    def array(self, name: str) -> NDArray[Any]:
+        """Return a whole array.
+
+        Raises:
+            MissingDataError: there is none of this name.
+            FormatError: a chunk is damaged, or its codec is unknown.
+            DependencyError: numcodecs is not installed.
+        """
+        about = self._metadata.get(f"{name}/.zarray")
+        if about is None:
+            raise MissingDataError(f"{self.path}: {name}", expected="an array", found="none", advice=COPY)
+        where = f"{self.path}: {name}"
+        with opening(where, "an array of zarr version 2"):
+            shape, chunks = tuple(about["shape"]), tuple(about["chunks"])
+            values = np.full(shape, about["fill_value"] or 0, np.dtype(about["dtype"]))
+            if about["order"] != "C" or about["filters"]:
+                raise FormatError(
+                    where, expected="rows in order C without filters", found=f"{about['order']}, {about['filters']}"
+                )
+            codec = None if about["compressor"] is None else _codecs().get_codec(about["compressor"])
+            counts = [-(-size // step) for size, step in zip(shape, chunks, strict=True)]
+            for index in itertools.product(*map(range, counts)):
+                key = about.get("dimension_separator", ".").join(map(str, index)) or "0"
+                data = self._read(f"{name}/{key}")
+                if data is None:
+                    continue  # a chunk of nothing but the value that fills
+                raw = data if codec is None else codec.decode(data)
+                part = np.frombuffer(raw, values.dtype).reshape(chunks)
+                place = tuple(
+                    slice(i * step, min((i + 1) * step, size))
+                    for i, step, size in zip(index, chunks, shape, strict=True)
+                )
+                values[place] = part[tuple(slice(0, p.stop - p.start) for p in place)]
+        return values
+
+    def has(self, name: str) -> bool:
+        """Return whether an array exists."""
+        return f"{name}/.zarray" in self._metadata
+
+
+@lru_cache(maxsize=8)
+def open_store(path: str) -> NcoreStore:
+    """Return a store; one process reads its index and metadata once."""
+    return NcoreStore(path)
+
+
+def _unpacked(data: bytes) -> Any:
+    decoder = lzma.LZMADecompressor()
+    text = decoder.decompress(data, _MOST_BYTES)
+    if not decoder.eof:
+        raise ValueError("compressed data that end too early, or are too large")
+    return import_extra("cbor2", "ncore").loads(text)
+
+
+def _codecs() -> ModuleType:
+    return import_extra("numcodecs", "ncore")
