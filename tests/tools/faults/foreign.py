@@ -89,6 +89,32 @@ def _synthcity(root: Path) -> None:
     write_area(root / "area_3.parquet", SimulatedDrive(2, **_FEW), rows=30)
 
 
+def _scans(root: Path) -> None:
+    from helpers.converters.scan_writers import write_with_open3d
+
+    root.mkdir()
+    drive = SimulatedDrive(2, rolling=True, channels=6, columns=40)  # enough points to find the motion
+    for frame in range(drive.frames):
+        scan = drive.scan(frame)
+        fields = dict(zip(("x", "y", "z", "intensity"), scan.points.T, strict=True))
+        write_with_open3d(root / f"{frame}.pcd", {**fields, "time": scan.seconds}, compressed=True)
+
+
+def _bag(root: Path) -> None:
+    from helpers.converters.bags import Messages, drive_messages, write_bag
+
+    store = Messages("mcap")
+    drive = SimulatedDrive(2, rolling=True, channels=2, columns=6)
+    write_bag(root, "mcap", drive_messages(store, drive), store=store)
+
+
+def _ncore(root: Path) -> None:
+    from helpers.converters.ncore_files import write_store
+
+    root.mkdir()
+    write_store(root, SimulatedDrive(2, rolling=True, channels=2, columns=6))
+
+
 DATA_SETS: dict[str, Callable[[Path], None]] = {
     "kitti": _kitti,
     "poss": _poss,
@@ -100,8 +126,17 @@ DATA_SETS: dict[str, Callable[[Path], None]] = {
     "carlaocc": _carlaocc,
     "paris-carla-3d": _paris_carla,
     "synthcity": _synthcity,
+    "scans": _scans,
+    "bag": _bag,
+    "ncore": _ncore,
 }
 """Writers by the name of the converter that reads what they write."""
 
-PACKAGES = {"argoverse2": ("pyarrow",), "synthcity": ("pyarrow",)}
+PACKAGES = {
+    "argoverse2": ("pyarrow",),
+    "synthcity": ("pyarrow",),
+    "scans": ("open3d", "kiss_icp"),
+    "bag": ("rosbags",),
+    "ncore": ("cbor2", "numcodecs"),
+}
 """What a converter needs besides carlasc."""
