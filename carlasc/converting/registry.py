@@ -19,7 +19,8 @@ from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.tables import CARLA, remaps_between
-from carlasc.errors import ArgumentError, DependencyError, MissingDataError, check_choice
+from carlasc.errors import ArgumentError, CarlascError, DependencyError, MissingDataError, check_choice
+from carlasc.storage.opening import as_source
 
 GROUP = "carlasc.converters"
 EXPORTERS = "carlasc.exporters"
@@ -107,7 +108,16 @@ def find_recordings(converter: Converter) -> list[Recording]:
         others = [name for name in converter_names() if _finds(name, type(converter), converter.source)]
         if others:
             error.advice = f"this is what {' or '.join(f'`carlasc convert {name}`' for name in others)} reads"
+        elif _is_in_layout(converter.source):
+            error.advice = "this has the layout of CarlaSC already: `carlasc regrid` makes its grids"
         raise
+
+
+def _is_in_layout(source: Path) -> bool:
+    try:
+        return bool(as_source(source).sequences())
+    except CarlascError:
+        return False
 
 
 def _finds(name: str, other_than: type[Converter], source: Path) -> bool:

@@ -17,7 +17,7 @@ from carlasc.storage.arrays import ArrayFormat, open_npz
 
 COPY = "the file may be cut short: copy it again"
 _OF_THE_LAYOUT = {*layout.scan_folders(), *layout.SPLITS, *layout.COORDINATES, layout.EVALUATION}
-_MISSING = "copy it, or unpack the archive of the data set that has it"
+_MISSING = "check the path, or unpack the archive of the data set that has it"
 
 
 @contextmanager

@@ -329,3 +329,8 @@ def test_a_folder_that_another_converter_reads_names_it(tmp_path):
     write_scan(tmp_path / "in/a.npy", fields_of(DRIVE, 0))
     with pytest.raises(MissingDataError, match="this is what `carlasc convert scans` reads"):
         convert("argoverse2", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    options = {"pose_file": str(tmp_path / "p.npy")}
+    np.save(tmp_path / "p.npy", np.eye(4)[None])
+    convert("scans", tmp_path / "in", tmp_path / "own", grids=None, options=options, run=Run(workers=1))
+    with pytest.raises(MissingDataError, match="this has the layout of CarlaSC already"):
+        convert("argoverse2", tmp_path / "own", tmp_path / "out", run=Run(workers=1))
