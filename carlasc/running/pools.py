@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
@@ -52,11 +52,9 @@ class OwnProcesses(Executor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Start a task. Its result is asked for in the thread that submits."""
         task = _RetriedTask(self, _Cleanly(fn), args, kwargs)
-        try:
-            task.start(self._pool)
-        except BrokenProcessPool:
+        if not task.start(self._pool):
             self.recover()
-            task.start(self._pool)
+            task.start(self._pool)  # where a process dies again, the task is lost, and its result starts it again
         self._tasks[id(task)] = task
         return task
 
@@ -75,7 +73,7 @@ class OwnProcesses(Executor):
         Raises:
             CarlascError: new processes die before they do anything.
         """
-        self._pool.shutdown()
+        self._pool.end()
         self._pool = _ProcessGroup(1)
         for task in [task for task in self._tasks.values() if task.was_lost()]:
             for _ in range(DEATHS - 1):
@@ -83,7 +81,7 @@ class OwnProcesses(Executor):
                 task.start(self._pool)
                 if not task.was_lost():
                     break
-        self._pool.shutdown()
+        self._pool.end()
         self._pool = _ProcessGroup(self._workers)
         self._renew(self._workers)
 
@@ -96,10 +94,10 @@ class OwnProcesses(Executor):
         for _ in range(DEATHS):
             if self._is_alive():
                 return
-            self._pool.shutdown()
+            self._pool.end()
             self._pool = _ProcessGroup(workers)
         if not self._is_alive():
-            self._pool.shutdown()  # what its processes say on stderr comes before the error, not after it
+            self._pool.end()  # what its processes say on stderr comes before the error, not after it
             raise CarlascError(
                 "worker processes die as soon as they start",
                 problem='there is no memory for them, or they are started by a script without `if __name__ == "__main__":`',
@@ -122,9 +120,16 @@ class _RetriedTask(Future[Any]):
         super().__init__()
         self._owner, self._call, self._attempt = pool, (function, args, kwargs), Future[Any]()
 
-    def start(self, pool: ProcessPoolExecutor) -> None:
+    def start(self, pool: ProcessPoolExecutor) -> bool:
+        """Start the task; return whether the processes were alive. If not, the task is lost."""
         function, args, kwargs = self._call
-        self._attempt = pool.submit(function, *args, **kwargs)
+        try:
+            self._attempt = pool.submit(function, *args, **kwargs)
+        except BrokenProcessPool as error:
+            self._attempt = Future()
+            self._attempt.set_exception(error)
+            return False
+        return True
 
     def was_lost(self) -> bool:
         """Return whether the process died; waits for the end of the task."""
@@ -168,8 +173,25 @@ class _ProcessGroup(ProcessPoolExecutor):
         super().__init__(workers, mp_context=self._context, initializer=_prepare_worker)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        with inherited_by_workers():  # a pool starts its processes when tasks are submitted
-            return super().submit(fn, *args, **kwargs)
+        try:
+            with inherited_by_workers():  # a pool starts its processes when tasks are submitted
+                return super().submit(fn, *args, **kwargs)
+        except OSError as error:  # a process died while another was started, and the pool has closed the queue for it
+            raise BrokenProcessPool(f"a process cannot be started: {error}") from error
+
+    def end(self) -> None:
+        """End processes that have nothing to do, or of which one has died.
+
+        A pool that breaks tells its processes to end and waits for them, but does not tell one that was started at that moment, which
+        waits for a task for ever: it is killed here.
+        """
+        self.shutdown(wait=False)
+        for process in self._context.started:
+            with suppress(AssertionError):  # it was never started
+                process.join(_GRACE_S)
+            if process.is_alive():
+                process.kill()
+        self.shutdown()
 
     def stop(self) -> None:
         processes = [process for process in self._context.started if process.is_alive()]

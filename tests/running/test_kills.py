@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import psutil
@@ -83,3 +86,18 @@ def test_workers_of_a_cluster_are_killed(kills, tmp_path: Path):
 @pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_processes_of_our_own_are_killed(kills, tmp_path: Path):
     work_until_killed_often_enough(Killer(kills), tmp_path, None)
+
+
+def test_a_worker_that_dies_while_another_is_started_stops_nothing(monkeypatch: pytest.MonkeyPatch):
+    start, killed = SpawnProcess.start, list[int]()
+
+    def start_while_another_dies(process: SpawnProcess) -> None:
+        if not killed and (started := multiprocessing.active_children()):
+            killed.append(started[0].pid or 0)
+            os.kill(killed[0], signal.SIGKILL)
+            time.sleep(0.5)  # the pool sees it, and closes its queues
+        start(process)
+
+    monkeypatch.setattr(SpawnProcess, "start", start_while_another_dies)
+    assert list(run_all(jobs.square, range(20), run=Run(workers=3))) == [number**2 for number in range(20)]
+    assert killed
