@@ -88,15 +88,21 @@ def test_processes_of_our_own_are_killed(kills, tmp_path: Path):
     work_until_killed_often_enough(Killer(kills), tmp_path, None)
 
 
-def test_a_worker_that_dies_while_another_is_started_stops_nothing(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("is_first", [True, False], ids=["before it is started", "after it was started"])
+def test_a_worker_that_dies_while_another_is_started_stops_nothing(monkeypatch: pytest.MonkeyPatch, is_first: bool):
     start, killed = SpawnProcess.start, list[int]()
 
     def start_while_another_dies(process: SpawnProcess) -> None:
-        if not killed and (started := multiprocessing.active_children()):
-            killed.append(started[0].pid or 0)
-            os.kill(killed[0], signal.SIGKILL)
-            time.sleep(0.5)  # the pool sees it, and closes its queues
-        start(process)
+        if killed or not (others := multiprocessing.active_children()):
+            start(process)
+            return
+        killed.append(others[0].pid or 0)
+        for kills in (is_first, not is_first):
+            if kills:
+                os.kill(killed[0], signal.SIGKILL)
+            else:
+                start(process)
+            time.sleep(0.1)  # the pool sees it: it closes its queues, and ends the processes that it knows
 
     monkeypatch.setattr(SpawnProcess, "start", start_while_another_dies)
     assert list(run_all(jobs.square, range(20), run=Run(workers=3))) == [number**2 for number in range(20)]
