@@ -19,7 +19,7 @@ from carlasc.core.geometry import Transform, check_rigid, invert, multiply, quat
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.files import opening, sequence_name
 from carlasc_converters.kitti_boxes import BoxRows
-from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, class_of_name
+from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, OTHER_OBJECT, class_of_name
 from carlasc_converters.ncore_store import SUFFIXES, NcoreStore, open_store
 from carlasc_converters.transforms import FrameTree, PlacedFrame
 
@@ -27,6 +27,7 @@ _VERSION = "v4"
 _COMPONENT = "v1"
 _RIG, _WORLD = "rig", "world"
 _NS = 1000  # nanoseconds in a microsecond
+_ALONE_US = 50_000.0  # how far from a single frame what belongs to it may be
 
 
 class Ncore(Converter):
@@ -43,14 +44,14 @@ class Ncore(Converter):
             MissingDataError: there is none.
             FormatError: a store has another version.
         """
-        stores = defaultdict[str, list[NcoreStore]](list)
+        stores = defaultdict[tuple[Path, str], list[NcoreStore]](list)  # those of one sequence lie in one folder
         for path in self._paths():
             store = open_store(str(path))
             about = store.attributes()
             if about.get("version") != _VERSION:
                 raise FormatError(path, expected=f"NCore {_VERSION}", found=str(about.get("version", "no version")))
-            stores[str(about["sequence_id"])].append(store)
-        found = [NcoreRecording(name, parts) for name, parts in sorted(stores.items())]
+            stores[path.parent, str(about["sequence_id"])].append(store)
+        found = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
         if not found:
             raise MissingDataError(
                 self.source,
@@ -74,7 +75,7 @@ class NcoreRecording(Recording):
         self.name, self.location, self._stores = sequence_name(name), str(stores[0].path), stores
         if not self._lidars:
             raise MissingDataError(
-                self.location, expected="a component lidars", found="none", advice="give all stores of the sequence"
+                self.location, expected="a LiDAR with frames", found="none", advice="give all stores of the sequence"
             )
 
     def _components(self, kind: str) -> dict[str, tuple[NcoreStore, str]]:
@@ -89,40 +90,59 @@ class NcoreRecording(Recording):
                 found[name] = (store, group)
         return found
 
-    @cached_property
-    def _lidars(self) -> dict[str, tuple[NcoreStore, str]]:
-        return self._components("lidars")
+    def _component(self, kind: str) -> tuple[NcoreStore, str] | None:
+        """Return the component of a kind that is named default, as in NCore, or else the first; None if there is none."""
+        found = self._components(kind)
+        return found.get("default") or next(iter(found.values()), None)
 
     @cached_property
-    def _spans(self) -> list[NDArray[np.int64]]:
-        """(F, 2) microseconds of the start and the end of each frame of each LiDAR."""
-        spans = []
-        for store, group in self._lidars.values():
+    def _spans(self) -> dict[str, NDArray[np.int64]]:
+        """(F, 2) microseconds of the start and the end of each frame of each LiDAR that has frames."""
+        spans = {}
+        for name, (store, group) in self._components("lidars").items():
             with opening(f"{store.path}: {group}/frames", "the times of frames"):
-                spans.append(
-                    np.array(store.attributes(f"{group}/frames")["frames_timestamps_us"], np.int64).reshape(-1, 2)
-                )
+                own = np.array(store.attributes(f"{group}/frames")["frames_timestamps_us"], np.int64).reshape(-1, 2)
+            if len(own):
+                spans[name] = own
         return spans
 
     @cached_property
+    def _lidars(self) -> dict[str, tuple[NcoreStore, str]]:
+        """Store and group of each LiDAR that has frames, the first being the origin."""
+        components = self._components("lidars")
+        return {name: components[name] for name in self._spans}
+
+    @cached_property
+    def _first(self) -> NDArray[np.int64]:
+        """(F, 2) microseconds of the frames of the first LiDAR."""
+        return next(iter(self._spans.values()))
+
+    @cached_property
+    def _slack_us(self) -> float:
+        """Half of the time between frames: what is farther from a frame does not belong to it."""
+        ends = self._first[:, 1]
+        return float(np.median(np.diff(ends))) / 2 if len(ends) > 1 else _ALONE_US
+
+    @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
-        """The frames of the first LiDAR, each with the frame of every other one that ends nearest in time."""
-        first = self._spans[0][:, 1]
-        frames = []
-        for number, end in enumerate(first.tolist()):
-            parts = []
-            for index, (spans, (store, group)) in enumerate(zip(self._spans, self._lidars.values(), strict=True)):
-                if len(spans):
-                    own = int(spans[np.argmin(np.abs(spans[:, 1] - end)), 1])
-                    parts.append((index, str(store.path), f"{group}/frames/{own}"))
-            frames.append(NcoreFrame(number, end, tuple(parts)))
-        return frames
+        """The frames of the first LiDAR, each with the frames of the other ones that are nearest to it in time."""
+        ends = self._first[:, 1]
+        parts: list[list[tuple[int, str, str]]] = [[] for _ in ends]
+        for index, (name, (store, group)) in enumerate(self._lidars.items()):
+            own = self._spans[name][:, 1]
+            apart = np.abs(own[:, None] - ends[None])
+            for number in range(len(ends)):
+                row = int(np.argmin(apart[:, number]))
+                if apart[row, number] <= self._slack_us and int(np.argmin(apart[row])) == number:
+                    parts[number].append((index, str(store.path), f"{group}/frames/{own[row]}"))
+        return [NcoreFrame(number, end, tuple(parts[number])) for number, end in enumerate(ends.tolist())]
 
     @cached_property
     def _tree(self) -> FrameTree:
         """The frames of coordinates, as a tree below the world."""
         edges: dict[str, list[tuple[str, NDArray[np.int64], NDArray[np.float64]]]] = defaultdict(list)
-        for store, group in self._components("poses").values():
+        if (component := self._component("poses")) is not None:
+            store, group = component
             with opening(f"{store.path}: {group}", "poses between frames"):
                 given = {**store.attributes(f"{group}/static_poses"), **store.attributes(f"{group}/dynamic_poses")}
                 for key, entry in given.items():
@@ -158,7 +178,7 @@ class NcoreRecording(Recording):
         Raises:
             MissingDataError: there are several, and no poses between them.
         """
-        at, sensors = self._spans[0][:1, 1] * _NS, []
+        at, sensors = self._first[:1, 1] * _NS, []
         for name in self._lidars:
             if not self._tree.connected(name, self._vehicle):
                 raise MissingDataError(
@@ -169,10 +189,10 @@ class NcoreRecording(Recording):
 
     def times(self) -> NDArray[np.float64]:
         """Return seconds after the first frame."""
-        return self._seconds(self._spans[0][:, 1])
+        return self._seconds(self._first[:, 1])
 
     def _seconds(self, stamps_us: NDArray[np.int64]) -> NDArray[np.float64]:
-        return (stamps_us - self._spans[0][0, 1]) / 1e6
+        return (stamps_us - self._first[0, 1]) / 1e6
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
         """Return the poses of the rig in the world; None if there are none."""
@@ -184,38 +204,61 @@ class NcoreRecording(Recording):
         stamps = max(tracks, key=len)
         return Trajectory(self._tree.lookup(_WORLD, self._vehicle, stamps), self._seconds(stamps // _NS), self.location)
 
+    @cached_property
+    def _observations(self) -> list[tuple[int, dict[str, Any]]]:
+        """The observations of tracks, each with the number of its frame; -1 where no frame is near."""
+        if (component := self._component("cuboids")) is None:
+            return []
+        store, group = component
+        with opening(f"{store.path}: {group}", "observations of tracks"):
+            given = store.attributes(f"{group}/cuboids").get("cuboid_track_observations", [])
+            return [(self._frame_at(int(entry["timestamp_us"])), entry) for entry in given]
+
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the cuboids of each frame in the frame of the rig at the time of the frame; None if there are none."""
-        observations = [
-            entry
-            for store, group in self._components("cuboids").values()
-            for entry in store.attributes(f"{group}/cuboids").get("cuboid_track_observations", ())
-        ]
-        if not observations:
+        """Return the cuboids of each frame in which any was observed, in the frame of the rig at its time; None if there are none."""
+        if not self._observations:
             return None
-        ends = self._spans[0][:, 1]
+        annotated = sorted({frame for frame, _ in self._observations} - {-1})
         numbers: dict[str, int] = {}
-        rows, seen = BoxRows(f"{self.location}: cuboids", list(range(len(ends)))), set[tuple[int, int]]()
-        with opening(f"{self.location}: cuboids", "observations of tracks"):
-            for entry in observations:
-                frame, track = (
-                    self._frame_at(int(entry["timestamp_us"])),
-                    numbers.setdefault(entry["track_id"], len(numbers) + 1),
-                )
-                if (frame, track) in seen:
-                    continue  # seen by several sensors
+        where = f"{self.location}: cuboids"
+        rows, seen = BoxRows(where, annotated), set[tuple[int, int]]()
+        with opening(where, "observations of tracks"):
+            for frame, entry in self._observations:
+                track = numbers.setdefault(entry["track_id"], len(numbers) + 1)
+                if frame < 0 or (frame, track) in seen:  # or it was seen by several sensors
+                    continue
                 seen.add((frame, track))
-                stamps = np.array([ends[frame], entry["reference_frame_timestamp_us"]], np.int64) * _NS
+                stamps = np.array([self._first[frame, 1], entry["reference_frame_timestamp_us"]], np.int64) * _NS
                 vehicle_T_reference = self._between(entry["reference_frame_id"], stamps)
-                box = entry["bbox3"]
+                box, label = entry["bbox3"], class_of_name(entry["class_id"])
                 pose = multiply(vehicle_T_reference, _pose_of(box["centroid"], box["rot"]))
-                rows.add(frame, track, class_of_name(entry["class_id"]), pose, np.array(box["dim"], np.float64))
+                size = np.array(box["dim"], np.float64)
+                rows.add(frame, track, OTHER_OBJECT if label is None else label, pose, size)
         return rows.boxes()
 
+    def notes(self) -> list[str]:
+        """Return what of the recording was left out, and which classes of objects are not known."""
+        notes = list[str]()
+        for kind in ("poses", "cuboids"):
+            chosen, found = self._component(kind), self._components(kind)
+            if others := [name for name, component in found.items() if component != chosen]:
+                notes.append(f"of several {kind}, others than the one that was read: {', '.join(others)}")
+        if idle := sorted(self._components("lidars").keys() - self._lidars.keys()):
+            notes.append(f"LiDARs without frames were left out: {', '.join(idle)}")
+        if far := sum(frame < 0 for frame, _ in self._observations):
+            notes.append(f"{far} observations of boxes are at no frame, and were left out")
+        unknown = {
+            str(entry["class_id"]) for _, entry in self._observations if class_of_name(entry["class_id"]) is None
+        }
+        if unknown:
+            notes.append(f"objects of classes that are not known became Other object: {', '.join(sorted(unknown))}")
+        return notes
+
     def _frame_at(self, stamp_us: int) -> int:
-        """Return the frame within which a time is, or which is nearest to it."""
-        spans = self._spans[0]
-        return int(np.argmin(np.maximum(spans[:, 0] - stamp_us, 0) + np.maximum(stamp_us - spans[:, 1], 0)))
+        """Return the frame within which a time is, or which is nearest to it; -1 if none is near."""
+        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(stamp_us - self._first[:, 1], 0)
+        frame = int(np.argmin(away))
+        return frame if away[frame] <= self._slack_us else -1
 
     def _between(self, reference: str, stamps: NDArray[np.int64]) -> Transform:
         """Return (4, 4) from a frame at the second time to the rig at the first time."""

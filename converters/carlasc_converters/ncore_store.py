@@ -138,9 +138,16 @@ class NcoreStore:
         return f"{name}/.zarray" in self._metadata
 
 
-@lru_cache(maxsize=8)
 def open_store(path: str) -> NcoreStore:
-    """Return a store; one process reads its index and metadata once."""
+    """Return a store; one process reads its index and metadata once, and again if it was written again."""
+    file = Path(path)
+    with opening(path, "a store of NCore"):
+        status = (file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file).stat()
+    return _open(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=8)
+def _open(path: str, modified_ns: int, size: int) -> NcoreStore:
     return NcoreStore(path)
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from carlasc_converters.ncore import Ncore
-from carlasc_converters.ncore_classes import class_of_name
-from helpers.converters.ncore_files import contents, for_library, write_store
+from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, OTHER_OBJECT, class_of_name
+from helpers.converters.ncore_files import NAMES, START_US, contents, for_library, write_store
 
 from carlasc.converting import Sensor
 from carlasc.core.geometry import rotation_z, translation
@@ -26,7 +26,7 @@ SENSORS = (
 DRIVE = SimulatedDrive(4, sensors=SENSORS, rolling=True, channels=10, columns=80)
 
 
-IDS = {"car": 5, "van": 5, "pedestrian": 4, "cyclist": 3}
+IDS = {kind: class_of_name(name) for kind, name in NAMES.items()}
 
 
 class TestNcore(ConverterContract):
@@ -112,14 +112,53 @@ def test_damage_is_one_line(tmp_path):
         Ncore(tmp_path / "none").sequences()
 
 
-def test_names_of_classes_belong_to_classes():
-    assert [class_of_name(name) for name in ("automobile", "heavy_truck", "person", "motorcyclist", "cone")] == [
-        5,
-        5,
-        4,
-        3,
-        6,
-    ]
+def test_names_of_classes_belong_to_classes_and_unknown_ones_are_said(tmp_path):
+    named = {"automobile": "Vehicle", "BICYCLIST": "Rider", "MOBILE_PEDESTRIAN_CROSSING_SIGN": "Sign", "dog": "Animal"}
+    assert {name: NCORE.names[class_of_name(name)] for name in named} == named
+    assert class_of_name("scarecrow") is None
+    assert NCORE_TO_CARLA.target.names[NCORE_TO_CARLA.mapping[class_of_name("cyclist")]] == "Pedestrian"
+
+    def rename(content):
+        for entry in content["observations"]:
+            entry["class_id"] = "scarecrow" if entry["class_id"] == "van" else entry["class_id"]
+
+    (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=rename)).sequences()
+    assert recording.notes() == ["objects of classes that are not known became Other object: scarecrow"]
+    assert any((boxes.labels == OTHER_OBJECT).any() for boxes in recording.boxes().values())
+
+
+def test_frames_that_nobody_annotated_have_no_entry_and_far_observations_are_left_out(tmp_path):
+    def thin(content):
+        first, last = START_US + 50_000, START_US + 350_000
+        kept = [entry for entry in content["observations"] if entry["timestamp_us"] in (first, last)]
+        far = {**kept[0], "timestamp_us": last + 14_000_000}
+        content["observations"] = [*kept, far]
+
+    (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=thin)).sequences()
+    assert sorted(recording.boxes()) == [0, 3]
+    assert recording.notes() == ["1 observations of boxes are at no frame, and were left out"]
+
+
+def test_a_lidar_that_starts_late_gives_each_frame_once(tmp_path):
+    def start_late(content):
+        for number in range(2):
+            del content["frames"]["lidar_rear", number]
+
+    (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=start_late)).sequences()
+    assert [[cloud.sensor for cloud in frame.read()] for frame in recording.frames] == [[0], [0], [0, 1], [0, 1]]
+
+
+def test_lidars_without_frames_are_left_out(tmp_path):
+    def empty(content, names):
+        content["frames"] = {key: frame for key, frame in content["frames"].items() if key[0] not in names}
+
+    (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=lambda content: empty(content, ["lidar_front"]))).sequences()
+    assert [sensor.name for sensor in recording.sensors] == ["lidar_rear"]
+    assert recording.notes() == ["LiDARs without frames were left out: lidar_front"]
+    both = ["lidar_front", "lidar_rear"]
+    path = write_store(tmp_path, DRIVE, edit=lambda content: empty(content, both))  # the same file, written again
+    with pytest.raises(MissingDataError, match="expected a LiDAR with frames, found none"):
+        Ncore(path).sequences()
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import json
 import lzma
 import struct
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -90,9 +91,12 @@ def for_library(folder: Path, content: dict) -> None:
     (folder / "given.json").write_text(json.dumps(content["observations"]))
 
 
-def write_store(folder: Path, drive: SimulatedDrive, *, version: str = "v4") -> Path:
-    """Write a store, and return its file."""
+def write_store(
+    folder: Path, drive: SimulatedDrive, *, version: str = "v4", edit: Callable[[dict], object] = bool
+) -> Path:
+    """Write a store, and return its file; `edit` may change what it holds, as `contents` returns it."""
     content = contents(drive)
+    edit(content)
     members: dict[str, bytes] = {}
     metadata: dict[str, dict] = {}
 
