@@ -67,13 +67,8 @@ def _print_list(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _print_preview(
-    found: tuple[carlasc.converting.RecordingPreview, ...], out: str, poses: str, grids: str, *, json: bool
-) -> None:
+def _print_preview(found: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str) -> None:
     """Print what a conversion would read and write."""
-    if json:
-        print_json([recording.to_dict() for recording in found])
-        return
     for one in found:
         rate = "no times" if one.rate_hz is None else f"{one.rate_hz:g} Hz"
         echo(f"{one.location}: {one.frames} scans, {rate}, of {', '.join(one.sensors)}")
@@ -84,8 +79,9 @@ def _print_preview(
         ground = "no ground is seen in it" if one.up is None else f"the sensor is {one.height_m:g} m above the ground"
         wrong = one.up not in (None, "+z")
         echo(f"  {ground}" + (f", but up is {one.up}: other axes than x forward, y left, z up" if wrong else ""))
-        given = one.poses == "file" and poses != "kiss-icp"
-        echo(f"  poses: {'those of the recording' if given else 'estimated from the scans with KISS-ICP'}")
+        echo(
+            f"  poses: {'those of the recording' if one.poses == 'file' else 'estimated from the scans with KISS-ICP'}"
+        )
         for note in one.notes:
             echo(f"  {note}")
         echo(
@@ -136,8 +132,13 @@ def convert(
     """
     chosen = None if sequences is None else sequences.split(",")
     if dry_run:
-        found = carlasc.converting.preview(name, source, sequences=chosen, split=split, options=options.values)
-        _print_preview(found, out, poses.options().source, grids, json=json)
+        found = carlasc.converting.preview(
+            name, source, sequences=chosen, split=split, poses=poses.options(), options=options.values
+        )
+        if json:
+            print_json(found)
+        else:
+            _print_preview(found, out, grids)
         return
     if making.is_given and grids != "scans":
         raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids)

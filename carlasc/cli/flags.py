@@ -130,7 +130,7 @@ def _declared(option: OptionDeclaration) -> inspect.Parameter:
     """Return the parameter of a declared option. Without a value it is None, and the library takes the default."""
     dashed = option.name.replace("_", "-")
     is_switch = option.type is bool
-    shown = option.default is not None and option.default is not False and option.default != ""
+    shown = option.default is not None and option.default is not False
     info = typer.Option(
         f"--{dashed}/--no-{dashed}" if is_switch else f"--{dashed}",
         help=f"{option.help}{f'  [default: {_shown(option.default)}]' if shown else ''}".strip(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -35,14 +35,17 @@ def label(
     Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
     """
     with run.spread("Labelling", "files") as spread:
-        options: dict[str, Any] = {
-            "classes": classes,
-            "logits": logits,
-            "by": by,
-            "frames": frames,
-            "overwrite": overwrite,
-        }
-        result = carlasc.label(source, out, predictions, **options, run=spread)
+        result = carlasc.label(
+            source,
+            out,
+            predictions,
+            classes=classes,
+            logits=logits,
+            by=by,
+            frames=frames,
+            overwrite=overwrite,
+            run=spread,
+        )
     if json:
         print_json(result)
         return

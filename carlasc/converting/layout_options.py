@@ -50,14 +50,15 @@ class LayoutOptions:
             ArgumentError: `classes` is neither "carla" nor the name of the converter's class table.
         """
         check_choice("classes", self.classes, ("carla", converter.classes.name))
-        if self.classes == "carla" and converter.to_carla is None:
+        if self.classes == converter.classes.name:
+            return AxesAndClasses(converter.classes, None, self.axes == "left", self.allow_unknown)
+        if converter.to_carla is None:
             raise ArgumentError(
                 "classes",
                 expected=f"{converter.classes.name}, because nothing maps this table to CarlaSC's",
                 found="carla",
             )
-        remap = converter.to_carla if self.classes == "carla" else None
-        return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
+        return AxesAndClasses(converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,10 @@ from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.plans import SplitName, choose_recordings
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
+from carlasc.converting.trajectory import FILE, KISS_ICP, frame_times, read_trajectory
 from carlasc.groundtruth.heights import find_ground
+from carlasc.motion.options import PoseOptions
 
-_REACH_M = 25.0
 _LEAST_M = 0.3  # a ground that is nearer to the sensor is none
 _UP = {"+z": (0, 1, 2), "-z": (0, 1, 2), "+y": (2, 0, 1), "-y": (2, 0, 1), "+x": (1, 2, 0), "-x": (1, 2, 0)}
 
@@ -58,10 +59,6 @@ class RecordingPreview:
     poses: str
     notes: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values as JSON has them."""
-        return asdict(self)
-
 
 def preview(
     name: str | type[Converter],
@@ -69,6 +66,7 @@ def preview(
     *,
     sequences: Collection[str] | None = None,
     split: SplitName = "all",
+    poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
 ) -> tuple[RecordingPreview, ...]:
     """Return what `convert` with the same arguments would read.
@@ -78,20 +76,22 @@ def preview(
         source: folder of the data set, or of one of its sequences.
         sequences: names of sequences or the last parts of them; None for all.
         split: only sequences of this split.
+        poses: where poses would come from.
         options: what the converter takes beside the source, by name.
 
     Raises:
         ArgumentError: an argument has a wrong value, or no converter has that name.
-        MissingDataError: the source or a sequence does not exist.
+        MissingDataError: the source, a sequence or the poses do not exist.
         FormatError: a file does not hold what it must.
     """
     converter = open_converter(name, Path(source), options)
     recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)
-    return tuple(_preview(recording) for recording in recordings)
+    return tuple(_preview(recording, poses) for recording in recordings)
 
 
-def _preview(recording: Recording) -> RecordingPreview:
-    times, has_poses = recording.times(), recording.poses() is not None
+def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
+    times = recording.times()
+    trajectory = read_trajectory(recording, frame_times(recording, times), poses)
     scan = read_scan(recording.frames[0], Rig(tuple(recording.sensors), recording.vehicle_T_scan), None)
     steps = np.zeros(0) if times is None else np.diff(times[[handle.number for handle in recording.frames]])
     given = {"labels": scan.labels, "instances": scan.instances}
@@ -111,7 +111,7 @@ def _preview(recording: Recording) -> RecordingPreview:
         upper,  # type: ignore[arg-type]
         up,
         height_m,
-        "file" if has_poses else "kiss-icp",
+        KISS_ICP if trajectory is None else FILE,
         tuple(recording.notes()),
     )
 
@@ -120,7 +120,7 @@ def _ground(points: NDArray[np.float32]) -> tuple[str | None, float | None]:
     """Return the direction away from the ground, and the height of the sensor above it, of (N, 3) points."""
     for up, order in _UP.items():
         turned = points[:, order] * np.array([1, 1, -1 if up.startswith("-") else 1], np.float32)
-        ground = find_ground([turned], _REACH_M)
+        ground = find_ground([turned])
         if ground is not None and ground.below_m > _LEAST_M:
             return up, round(ground.below_m, 2)
     return None, None

@@ -264,7 +264,7 @@ class Converter(ABC):
         source: folder of the data set, or of one of its sequences.
         title: what it reads, in a few words.
         classes: the data set's class table.
-        to_carla: maps its ids to CarlaSC's; None if nothing does, so that sequences keep their ids.
+        to_carla: maps its ids to CarlaSC's; None if nothing does, or if they are CarlaSC's: sequences keep their ids.
         sensor: the sensor that took the scans.
         min_range_m: nearer points are left out of grids: they belong to the vehicle that carries the sensor.
         max_range_m: farther points are left out of grids: they are too sparse to tell free space from occupied space.

@@ -30,7 +30,6 @@ from carlasc.running.spreading import Run
 from carlasc.storage.metadata import Metadata
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
-_GROUND_REACH_M = 25.0
 _NEAR_M = 250.0  # boxes farther away from the sensor hold no points
 
 
@@ -230,7 +229,7 @@ class Conversion:
             for number in sorted(chosen - self._failed)
             if plan.writer.has("points", number) and (points := plan.writer.read("points", number)) is not None
         ]
-        self.ground = find_ground(scans, _GROUND_REACH_M)
+        self.ground = find_ground(scans)
         if self.ground is not None:
             write_heights(plan, self.ground.below_m)
 

@@ -14,6 +14,7 @@ from carlasc.motion import ground_height, ground_points
 _BELOW = 0.05  # share of ground points that may be below a grid
 _LOW = 0.05  # quantile of the heights of ground points that a grid must reach down to
 _OF_EACH = 1000  # heights that stand for those of one drive
+_REACH_M = 25.0  # horizontal distance within which the ground is looked for
 _SLACK_M = 0.6  # a grid that begins so far below the ground wastes voxels
 
 
@@ -44,7 +45,7 @@ def ground_of(
     return points[found]
 
 
-def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float) -> Ground | None:
+def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float = _REACH_M) -> Ground | None:
     """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the sensor; None if there is none."""
     heights: list[NDArray[np.float32]] = []
     near: list[float] = []

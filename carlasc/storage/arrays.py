@@ -46,11 +46,18 @@ class ArrayFormat:
         dtypes: NumPy's names of the types that it may have, with the byte order.
         shape: length of each axis; None allows any length. A shape of None allows every shape.
         most: largest number of elements, where the format or another file says it.
+        records: whether elements may also be records, whose fields have these types.
     """
 
     dtypes: tuple[str, ...]
     shape: tuple[int | None, ...] | None
     most: int | None = None
+    records: bool = False
+
+    def holds(self, dtype: np.dtype[Any]) -> bool:
+        """Return whether elements may have a type."""
+        kinds = [dtype[name] for name in dtype.names] if self.records and dtype.names else [dtype]
+        return all(kind in tuple(map(np.dtype, self.dtypes)) for kind in kinds)
 
 
 @dataclass(frozen=True)
@@ -166,6 +173,12 @@ class NpzFile:
         self._members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
         self.names = tuple(self._members)
 
+    def dtype(self, name: str) -> np.dtype[Any]:
+        """Return the type of an array, from its header alone."""
+        where = f"{self._where}: {name}"
+        with reading(where, "a .npy array in a whole zip"), self._archive.open(self._members[name]) as stream:
+            return _npy_header(stream)[2]
+
     def read(self, name: str, expected: ArrayFormat) -> NDArray[Any]:
         """Return an array, in C order.
 
@@ -266,21 +279,27 @@ def _opened(path: str | Path) -> Iterator[IO[bytes]]:
         yield file
 
 
+def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return the shape, whether the order is Fortran's, and the type that the header of a .npy file says."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _READERS:
+        raise ValueError(f"version {version} of the .npy format")
+    header: tuple[tuple[int, ...], bool, np.dtype[Any]] = _READERS[version](stream)
+    return header
+
+
 def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Header:
     """Read the header of a .npy file, and compare it with what the file must hold.
 
     Only its text is interpreted, by NumPy, as a literal of Python of at most 10,000 characters: no code is run.
     """
     with reading(where, "a .npy array"):
-        version = np.lib.format.read_magic(stream)
-        if version not in _READERS:
-            raise ValueError(f"version {version} of the .npy format")
-        shape, fortran_order, dtype = _READERS[version](stream)
+        shape, fortran_order, dtype = _npy_header(stream)
         start = stream.tell()
     # An empty array of shape (0,) is taken for one of (0, K): the authors of CarlaSC write an empty list of actors so.
     if len(shape) == 1 and shape[0] == 0 and expected.shape is not None and len(expected.shape) == 2:
         shape = (0, expected.shape[1] or 0)
-    if dtype not in tuple(map(np.dtype, expected.dtypes)):
+    if not expected.holds(dtype):
         names = list(dict.fromkeys(np.dtype(name).name for name in expected.dtypes))
         wanted = " or ".join(names) if len(names) < 4 else "numeric"
         raise FormatError(where, expected=f"{wanted} values", found=dtype.name)

@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting import Converter, LayoutOptions, convert, load_converter, read_options
+from carlasc.converting import Converter, LayoutOptions, convert, load_converter
+from carlasc.converting.registry import open_converter
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, relative_to, transform_points
 from carlasc.motion import PoseOptions
@@ -173,7 +174,7 @@ class ConverterContract:
         assert not speed[truth == 0][instances[truth == 0] == 0].any()
 
     def test_frames_are_read_in_other_processes(self, source: Path) -> None:
-        (recording,) = self._class()(source, **read_options(self._class(), self.options)).sequences()
+        (recording,) = open_converter(self.converter, source, self.options).sequences()
         handle = recording.frames[1]
         again = pickle.loads(pickle.dumps(handle))
         for one, other in zip(handle.read(), again.read(), strict=True):

@@ -58,9 +58,8 @@ def wrong_labels(
         cubes, clump, counts = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
         rngs = [np.random.default_rng([seed, *cube]) for cube in (cubes & 0xFFFFFFFF).tolist()]
         order = np.argsort([rng.random() for rng in rngs])
-        above = np.cumsum(counts[order]) - counts[order] / 2 < share * len(
-            places
-        )  # of which more than half is within the share
+        wanted = share * len(places)
+        above = np.cumsum(counts[order]) - counts[order] / 2 < wanted  # of which more than half is within the share
         chosen = np.zeros(len(cubes), np.bool_)
         chosen[order[above]] = True
         classes_of = np.array([rng.integers(0, len(others)) for rng in rngs])

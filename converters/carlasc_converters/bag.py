@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Trajectory
-from carlasc.core.classes import Remap
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc_converters.bag_frames import BagFrame, CloudPlace, LidarTopic
@@ -31,18 +30,18 @@ class Bag(Converter):
 
     title: ClassVar[str] = "a bag of ROS 1, ROS 2 or Foxglove"
     classes = CARLA
-    to_carla = Remap("carla", CARLA, CARLA, {label: label for label in CARLA.names})
+    to_carla = None
 
     def __init__(
         self,
         source: Path,
         *,
         topics: Annotated[
-            str, "Topics of points, one a LiDAR, by commas; the messages of the first are the frames."
-        ] = "",
-        pose_topic: Annotated[str, "Topic of the poses, or /tf; otherwise the only one of its kind."] = "",
-        pose_frame: Annotated[str, "Frame whose poses these are, where the messages do not say it."] = "",
-        world_frame: Annotated[str, "Frame in which poses from /tf are: odom, map, world, or the root."] = "",
+            str | None, "Topics of points, one a LiDAR, by commas; the messages of the first are the frames."
+        ] = None,
+        pose_topic: Annotated[str | None, "Topic of the poses, or /tf; otherwise the only one of its kind."] = None,
+        pose_frame: Annotated[str | None, "Frame whose poses these are, where the messages do not say it."] = None,
+        world_frame: Annotated[str | None, "Frame in which poses from /tf are: odom, map, world, or the root."] = None,
         time_unit: Annotated[TimeUnit, "Unit of the times of points; auto: from how long a scan takes."] = "auto",
         deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
     ) -> None:
@@ -64,10 +63,10 @@ class Bag(Converter):
 class BagOptions:
     """The options of `Bag`, which says what they mean."""
 
-    topics: str = ""
-    pose_topic: str = ""
-    pose_frame: str = ""
-    world_frame: str = ""
+    topics: str | None = None
+    pose_topic: str | None = None
+    pose_frame: str | None = None
+    world_frame: str | None = None
     time_unit: TimeUnit = "auto"
     deskewed: bool = False
 

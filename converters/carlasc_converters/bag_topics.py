@@ -127,11 +127,11 @@ class BagFiles:
         found = sorted(self.topics.items())
         return [topic for _, topic in found if topic.channel.type in types and is_readable(topic.channel)]
 
-    def clouds(self, names: str) -> list[Topic]:
+    def clouds(self, names: str | None) -> list[Topic]:
         """Return the topics of points: those that are named, or the only one that there is.
 
         Args:
-            names: separated by commas; empty for the only one.
+            names: separated by commas; None for the only one.
 
         Raises:
             MissingDataError: there is none.
@@ -157,7 +157,7 @@ class BagFiles:
             )
         return found
 
-    def poses(self, name: str) -> Topic | None:
+    def poses(self, name: str | None) -> Topic | None:
         """Return the topic of poses: the one that is named, or the only one that there is; None if there is none.
 
         Raises:

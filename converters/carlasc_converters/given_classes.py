@@ -10,7 +10,7 @@ from carlasc.storage.predictions import read_table
 
 
 def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
-    """Return a class table, and how its ids become CarlaSC's; None if nothing says so.
+    """Return a class table, and how its ids become CarlaSC's; None if nothing says so, or if they are CarlaSC's.
 
     Args:
         name: the name of a table, or the path of a JSON file with a table as carlasc.json has it, or of a carlasc.json.
@@ -21,7 +21,7 @@ def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
     """
     table = _table(name)
     remaps = remaps_to_carla(table)
-    if remaps is None:
+    if not remaps:
         return table, None
     mapping = {label: label for label in table.names}
     for remap in remaps:

@@ -78,28 +78,32 @@ class NcoreRecording(Recording):
                 self.location, expected="a LiDAR with frames", found="none", advice="give all stores of the sequence"
             )
 
-    def _components(self, kind: str) -> dict[str, tuple[NcoreStore, str]]:
-        """Return the store and the group of each component of a kind, by its name."""
-        found = {}
+    @cached_property
+    def _components(self) -> dict[str, dict[str, tuple[NcoreStore, str]]]:
+        """Store and group of each component that is read, by its kind and its name."""
+        found: dict[str, dict[str, tuple[NcoreStore, str]]] = {kind: {} for kind in ("lidars", "poses", "cuboids")}
         for store in self._stores:
-            for name in store.groups(kind):
-                group = f"{kind}/{name}"
-                version = store.attributes(group).get("component_version")
-                if version != _COMPONENT:
-                    raise FormatError(f"{store.path}: {group}", expected=f"version {_COMPONENT}", found=str(version))
-                found[name] = (store, group)
+            for kind, components in found.items():
+                for name in store.groups(kind):
+                    group = f"{kind}/{name}"
+                    version = store.attributes(group).get("component_version")
+                    if version != _COMPONENT:
+                        raise FormatError(
+                            f"{store.path}: {group}", expected=f"version {_COMPONENT}", found=str(version)
+                        )
+                    components[name] = (store, group)
         return found
 
     def _component(self, kind: str) -> tuple[NcoreStore, str] | None:
         """Return the component of a kind that is named default, as in NCore, or else the first; None if there is none."""
-        found = self._components(kind)
+        found = self._components[kind]
         return found.get("default") or next(iter(found.values()), None)
 
     @cached_property
     def _spans(self) -> dict[str, NDArray[np.int64]]:
         """(F, 2) microseconds of the start and the end of each frame of each LiDAR that has frames."""
         spans = {}
-        for name, (store, group) in self._components("lidars").items():
+        for name, (store, group) in self._components["lidars"].items():
             with opening(f"{store.path}: {group}/frames", "the times of frames"):
                 own = np.array(store.attributes(f"{group}/frames")["frames_timestamps_us"], np.int64).reshape(-1, 2)
             if len(own):
@@ -109,8 +113,7 @@ class NcoreRecording(Recording):
     @cached_property
     def _lidars(self) -> dict[str, tuple[NcoreStore, str]]:
         """Store and group of each LiDAR that has frames, the first being the origin."""
-        components = self._components("lidars")
-        return {name: components[name] for name in self._spans}
+        return {name: self._components["lidars"][name] for name in self._spans}
 
     @cached_property
     def _first(self) -> NDArray[np.int64]:
@@ -240,10 +243,10 @@ class NcoreRecording(Recording):
         """Return what of the recording was left out, and which classes of objects are not known."""
         notes = list[str]()
         for kind in ("poses", "cuboids"):
-            chosen, found = self._component(kind), self._components(kind)
+            chosen, found = self._component(kind), self._components[kind]
             if others := [name for name, component in found.items() if component != chosen]:
                 notes.append(f"of several {kind}, others than the one that was read: {', '.join(others)}")
-        if idle := sorted(self._components("lidars").keys() - self._lidars.keys()):
+        if idle := sorted(self._components["lidars"].keys() - self._lidars.keys()):
             notes.append(f"LiDARs without frames were left out: {', '.join(idle)}")
         if far := sum(frame < 0 for frame, _ in self._observations):
             notes.append(f"{far} observations of boxes are at no frame, and were left out")

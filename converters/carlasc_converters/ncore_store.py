@@ -11,13 +11,13 @@ import lzma
 import struct
 from functools import cached_property, lru_cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.storage.arrays import check_size
 from carlasc_converters.files import COPY, opening, read_bytes
 
 SUFFIXES = (".zarr.itar", ".zarr")
@@ -112,12 +112,17 @@ class NcoreStore:
         where = f"{self.path}: {name}"
         with opening(where, "an array of zarr version 2"):
             shape, chunks = tuple(about["shape"]), tuple(about["chunks"])
+            check_size(shape, np.dtype(about["dtype"]), where)
             values = np.full(shape, about["fill_value"] or 0, np.dtype(about["dtype"]))
             if about["order"] != "C" or about["filters"]:
                 raise FormatError(
                     where, expected="rows in order C without filters", found=f"{about['order']}, {about['filters']}"
                 )
-            codec = None if about["compressor"] is None else _codecs().get_codec(about["compressor"])
+            codec = (
+                None
+                if about["compressor"] is None
+                else import_extra("numcodecs", "ncore").get_codec(about["compressor"])
+            )
             counts = [-(-size // step) for size, step in zip(shape, chunks, strict=True)]
             for index in itertools.product(*map(range, counts)):
                 key = about.get("dimension_separator", ".").join(map(str, index)) or "0"
@@ -132,10 +137,6 @@ class NcoreStore:
                 )
                 values[place] = part[tuple(slice(0, p.stop - p.start) for p in place)]
         return values
-
-    def has(self, name: str) -> bool:
-        """Return whether an array exists."""
-        return f"{name}/.zarray" in self._metadata
 
 
 def open_store(path: str) -> NcoreStore:
@@ -157,7 +158,3 @@ def _unpacked(data: bytes) -> Any:
     if not decoder.eof:
         raise ValueError("compressed data that end too early, or are too large")
     return import_extra("cbor2", "ncore").loads(text)
-
-
-def _codecs() -> ModuleType:
-    return import_extra("numcodecs", "ncore")

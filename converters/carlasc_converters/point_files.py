@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, open_npz, read_npy
 from carlasc_converters.files import COPY, opening, read_bytes
 from carlasc_converters.pcd import read_pcd
 from carlasc_converters.ply import PlyVertices
@@ -17,6 +18,7 @@ from carlasc_converters.ply import PlyVertices
 _FIRST = ("x", "y", "z", "intensity")  # the columns of an array without names
 _MOST_COLUMNS = 12
 _FLOAT = 4
+_ARRAY = ArrayFormat(NUMBERS, None, records=True)
 
 
 def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
@@ -64,14 +66,12 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
 
 
 def _read_npy(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
-    with opening(path, "a NumPy file"):
-        array = np.load(path, allow_pickle=False)
-    return _named(array, path, columns)
+    return _named(read_npy(path, _ARRAY), path, columns)
 
 
 def _read_npz(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
-    with opening(path, "an .npz file"), np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
+    with open_npz(path) as archive:
+        arrays = {name: archive.read(name, _ARRAY) for name in archive.names if _ARRAY.holds(archive.dtype(name))}
     tables = {name: array for name, array in arrays.items() if array.ndim == 2 or array.dtype.names}
     if len(tables) != 1:
         if "x" in arrays:

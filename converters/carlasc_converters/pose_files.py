@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import FormatError
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
 from carlasc_converters.files import opening, read_text
 from carlasc_converters.rigid import poses_of
 
@@ -36,13 +37,11 @@ class PoseRows:
         world_T_body: (K, 4, 4) float64.
         stamps: (K,) int64 nanoseconds, None if the file has no times.
         of: what has these poses, as far as the format says it.
-        kind: the format, in a word.
     """
 
     world_T_body: NDArray[np.float64]
     stamps: NDArray[np.int64] | None
     of: PoseOf
-    kind: str
 
 
 def read_poses(path: Path) -> PoseRows:
@@ -53,10 +52,10 @@ def read_poses(path: Path) -> PoseRows:
         FormatError: it has none of the formats, a pose is not rigid, a quaternion has not length 1, or times do not increase.
     """
     if path.suffix.lower() == ".npy":
+        poses = read_npy(path, ArrayFormat(NUMBERS, None)).astype(np.float64)
         with opening(path, "an array (N, 4, 4) of poses"):
-            poses = np.load(path, allow_pickle=False)
-            poses = np.asarray(poses, np.float64).reshape(-1, *poses.shape[-2:])
-        return PoseRows(_whole(poses, path), None, "sensor", "NumPy")
+            poses = poses.reshape(-1, *poses.shape[-2:])
+        return PoseRows(_whole(poses, path), None, "sensor")
     lines = [line.strip() for line in read_text(path, "poses as text").splitlines() if line.strip()]
     comments = [line for line in lines if line.startswith("#")]
     rows = [_split(line) for line in lines if not line.startswith("#")]
@@ -65,13 +64,13 @@ def read_poses(path: Path) -> PoseRows:
         return _read_named(header, rows[1:], path)
     if comments and "q_RS_w" in comments[0]:
         header = [word.lstrip("#").partition("[")[0].strip().lower() for word in comments[0].split(",")]
-        return _read_named(header, rows, path, of="vehicle", kind="EuRoC")
+        return _read_named(header, rows, path, of="vehicle")
     if rows and len(rows[0]) == _TUM:
         table, stamps = _numbers(rows, _TUM, path), _stamps([row[0] for row in rows], path)
-        return PoseRows(poses_of(table[:, [7, 4, 5, 6]], table[:, 1:4], str(path)), stamps, "sensor", "TUM")
+        return PoseRows(poses_of(table[:, [7, 4, 5, 6]], table[:, 1:4], str(path)), stamps, "sensor")
     if rows and len(rows[0]) == _KITTI:
         table = _numbers(rows, _KITTI, path)
-        return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor", "KITTI")
+        return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor")
     raise FormatError(
         path,
         expected="poses: lines of 8 numbers (TUM: t x y z qx qy qz qw) or of 12 (KITTI), a header with x, y, z, qw, qx, qy, qz, or .npy",
@@ -104,9 +103,7 @@ def nanoseconds(word: str) -> int:
         raise ValueError(word) from None
 
 
-def _read_named(
-    header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor", kind: str = "CSV"
-) -> PoseRows:
+def _read_named(header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor") -> PoseRows:
     def columns(choices: Sequence[tuple[str, ...]], what: str) -> list[int]:
         for names in choices:
             if all(name in header for name in names):
@@ -117,7 +114,7 @@ def _read_named(
     times = next((header.index(name) for name in _TIMES if name in header), None)
     table = _numbers(rows, len(header), path)
     stamps = None if times is None else _stamps([row[times] for row in rows], path)
-    return PoseRows(poses_of(table[:, turns], table[:, places], str(path)), stamps, of, kind)
+    return PoseRows(poses_of(table[:, turns], table[:, places], str(path)), stamps, of)
 
 
 def _split(line: str) -> list[str]:

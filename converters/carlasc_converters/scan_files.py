@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from carlasc.converting import Cloud, FrameHandle
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
-from carlasc_converters.files import opening, read_bytes
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
+from carlasc.storage.predictions import load
+from carlasc_converters.files import opening
 from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds, whole_numbers
 from carlasc_converters.point_files import read_columns
 
@@ -103,12 +105,13 @@ def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
         FormatError: it has not `count` of them, or others than whole numbers.
     """
     if path.suffix == ".label":
-        with opening(path, "uint32 values"):
-            labels = np.frombuffer(read_bytes(path), "<u4") & np.uint32(0xFFFF)
+        values, _ = load(path)
+    elif path.suffix == ".npy":
+        values = read_npy(path, ArrayFormat(NUMBERS, None))
     else:
         with opening(path, "a class id for each point"):
-            values = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=1)
-        labels = whole_numbers(values.reshape(-1), str(path))
+            values = np.loadtxt(path, ndmin=1)
+    labels = whole_numbers(np.asarray(values).reshape(-1), str(path))
     if len(labels) != count:
         raise FormatError(path, expected=f"a label for each of {count} points", found=str(len(labels)))
-    return labels.astype(np.uint32)
+    return labels

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
-from carlasc.core.classes import Remap
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
@@ -36,28 +35,28 @@ class Scans(Converter):
 
     title: ClassVar[str] = f"a folder of scans of any LiDAR, one file each: {', '.join(FORMATS)}"
     classes = CARLA
-    to_carla: Remap | None = Remap("carla", CARLA, CARLA, {label: label for label in CARLA.names})
+    to_carla = None
 
     def __init__(
         self,
         source: Path,
         *,
-        columns: Annotated[str, "Columns of files that do not name them, by commas: x,y,z,intensity."] = "",
-        pose_file: Annotated[str, "File of poses: TUM, KITTI, EuRoC, CSV with a header, .npy (N, 4, 4)."] = "",
+        columns: Annotated[str | None, "Columns of files that do not name them, by commas: x,y,z,intensity."] = None,
+        pose_file: Annotated[str | None, "File of poses: TUM, KITTI, EuRoC, CSV with a header, .npy (N, 4, 4)."] = None,
         pose_of: Annotated[
             Literal["auto", "sensor", "vehicle"], "What has these poses; auto: the sensor, with EuRoC the vehicle."
         ] = "auto",
-        calibration: Annotated[str, "YAML or JSON file with the poses of the LiDARs on the vehicle."] = "",
-        time_file: Annotated[str, "File with the time of each scan, one per line."] = "",
+        calibration: Annotated[str | None, "YAML or JSON file with the poses of the LiDARs on the vehicle."] = None,
+        time_file: Annotated[str | None, "File with the time of each scan, one per line."] = None,
         time_unit: Annotated[TimeUnit, "Unit of the times of points; auto: from how long a scan takes."] = "auto",
         deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
-        label_dir: Annotated[str, "Folder with a .label, .npy or .txt file of classes for each scan."] = "",
-        source_classes: Annotated[str, "Class table of the labels: a name such as semantickitti, or a JSON file."] = "",
+        label_dir: Annotated[str | None, "Folder with a .label, .npy or .txt file of classes for each scan."] = None,
+        source_classes: Annotated[
+            str | None, "Class table of the labels: a name such as semantickitti, or a JSON file."
+        ] = None,
         source_axes: Annotated[str, "Directions of x, y and z: flu, fru (left-handed), rfu, frd, rdf, ..."] = "flu",
     ) -> None:
         super().__init__(source)
-        given = [Path(name) if name else None for name in (pose_file, calibration, time_file, label_dir)]
-        names = tuple(name.strip() for name in columns.split(",")) if columns else None
         if source_classes:
             self.classes, self.to_carla = classes_given(source_classes)
         elif label_dir:
@@ -65,9 +64,17 @@ class Scans(Converter):
                 "source_classes", expected="the class table of the labels: a name, or a JSON file", found="none"
             )
         self.options = ScanOptions(
-            names, given[0], pose_of, given[1], given[2], time_unit, given[3], bool(source_classes),
-            axes_named(source_axes), deskewed,
-        )  # fmt: skip
+            columns=tuple(name.strip() for name in columns.split(",")) if columns else None,
+            pose_file=_path(pose_file),
+            pose_of=pose_of,
+            calibration=_path(calibration),
+            time_file=_path(time_file),
+            time_unit=time_unit,
+            label_dir=_path(label_dir),
+            has_classes=bool(source_classes),
+            axes=axes_named(source_axes),
+            deskewed=deskewed,
+        )
 
     def sequences(self) -> list[Recording]:
         """Return the recording, which is one.
@@ -299,6 +306,10 @@ class ScanFolder(Recording):
         if "label" in self._first and not options.has_classes:
             notes.append("points have a field of classes, which was not read: `source_classes` says what they mean")
         return notes
+
+
+def _path(name: str | None) -> Path | None:
+    return Path(name) if name else None
 
 
 def _natural(path: Path) -> list[Any]:

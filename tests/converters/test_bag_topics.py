@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from carlasc_converters.bag import Bag
 from carlasc_converters.bag_topics import find_bags
-from helpers.converters.bags import KINDS, START_NS, Messages, file_of, velodyne, write_bag
+from helpers.converters.bags import KINDS, START_NS, Messages, file_of, velodyne, write_bag, write_one_message
 
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 
@@ -63,13 +63,8 @@ def test_a_topic_that_does_not_exist_or_has_another_type_is_named(tmp_path):
 
 
 def test_points_in_an_encoding_that_is_not_read_are_named(tmp_path):
-    writer_of = pytest.importorskip("mcap.writer")
-    with (tmp_path / "drive.mcap").open("wb") as file:
-        writer = writer_of.Writer(file)
-        writer.start()
-        schema = writer.register_schema("foxglove.PointCloud", "flatbuffer", b"")
-        writer.add_message(writer.register_channel("/points", "flatbuffer", schema), 1, b"", 1)
-        writer.finish()
+    pytest.importorskip("mcap.writer")
+    write_one_message(tmp_path / "drive.mcap", "flatbuffer", b"")
     for options in ({}, {"topics": "/points"}):
         message = refused(CarlascError, lambda options=options: Bag(tmp_path / "drive.mcap", **options).sequences())
         assert "found /points (foxglove.PointCloud as flatbuffer, 1 messages)" in message

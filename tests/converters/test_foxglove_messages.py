@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from carlasc_converters.bag import Bag
 from carlasc_converters.foxglove_messages import read_message
+from helpers.converters.bags import write_one_message
 from helpers.scenes.road_blocks import write_blocks
 
 from carlasc.core.geometry import quaternions_of, rotation_z, translation
@@ -109,13 +110,8 @@ def test_protobuf_that_is_cut_short_is_no_message():
 
 
 def test_a_message_that_is_none_is_named(tmp_path):
-    writer_of = pytest.importorskip("mcap.writer")
-    with (tmp_path / "drive.mcap").open("wb") as file:
-        writer = writer_of.Writer(file)
-        writer.start()
-        schema = writer.register_schema("foxglove.PointCloud", "protobuf", b"")
-        writer.add_message(writer.register_channel("/points", "protobuf", schema), 1, b"\x0a\xff", 1)
-        writer.finish()
+    pytest.importorskip("mcap.writer")
+    write_one_message(tmp_path / "drive.mcap", "protobuf", b"\x0a\xff")
     with pytest.raises(
         FormatError, match="/points: expected a message of type foxglove.PointCloud, found something else"
     ):

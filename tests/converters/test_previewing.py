@@ -3,11 +3,14 @@
 import json
 
 import numpy as np
+import pytest
 from helpers.converters.scan_writers import write_scan
 from typer.testing import CliRunner
 
 from carlasc.cli import app
 from carlasc.converting import preview
+from carlasc.errors import FormatError
+from carlasc.motion import PoseOptions
 from carlasc.testing import SimulatedDrive
 
 DRIVE = SimulatedDrive(3, channels=16, columns=120)
@@ -36,6 +39,17 @@ def test_frames_bounds_height_and_poses_are_found(tmp_path):
 def test_axes_with_y_up_are_noticed(tmp_path):
     write(tmp_path / "in", "yzx")
     assert preview("scans", tmp_path / "in")[0].up == "+y"
+
+
+def test_poses_are_those_that_a_conversion_would_take(tmp_path):
+    write(tmp_path / "in")
+    np.save(tmp_path / "poses.npy", np.tile(np.eye(4), (2, 1, 1)))
+    options = {"pose_file": str(tmp_path / "poses.npy")}
+    with pytest.raises(FormatError, match="expected a pose for each of 3 scans, found 2 poses"):
+        preview("scans", tmp_path / "in", options=options)
+    assert preview("scans", tmp_path / "in", poses=PoseOptions("kiss-icp"), options=options)[0].poses == "kiss-icp"
+    np.save(tmp_path / "poses.npy", np.tile(np.eye(4), (3, 1, 1)))
+    assert preview("scans", tmp_path / "in", options=options)[0].poses == "file"
 
 
 def test_the_command_writes_nothing(tmp_path):

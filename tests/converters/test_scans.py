@@ -269,13 +269,21 @@ def test_scans_that_do_not_fit_are_refused_in_one_line(folder):
     refused(folder, FormatError, r"scans: expected scans of one format, found 6 .npy, 1 .npz")
     (folder / "scans/scan9.npz").unlink()
     first.write_bytes(good[:60])
-    refused(folder, FormatError, r"scan8.npy: expected a NumPy file")
+    refused(folder, FormatError, r"scan8.npy: expected a .npy array, found something else \(EOF")
     for path in (folder / "scans").iterdir():
         path.unlink()
     refused(folder, MissingDataError, r"scans: expected scans: files with the suffix .bin")
     np.zeros((10, 6), np.float32).tofile(folder / "scans/a.bin")
     refused(folder, ArgumentError, r"columns: expected the names .* are points of 3 or 4 or 5 or 6 or 10 or 12 float32")
     refused(folder, FormatError, r"a.bin: expected a multiple of 28 bytes .*found 240", columns="x,y,z,i,t,ring,label")
+
+
+def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path):
+    (tmp_path / "scans").mkdir()
+    np.savez_compressed(tmp_path / "scans/a.npz", points=np.zeros((5_000_000, 4), np.float32))
+    refused(tmp_path, FormatError, r"a.npz: points: expected at most 100 times .* made to fill the memory")
+    np.savez(tmp_path / "scans/a.npz", points=np.ones((5, 3), np.float32), note=np.array("by hand"))
+    assert len(Scans(tmp_path / "scans").sequences()[0].frames[0].read()[0].points) == 5
 
 
 def test_poses_and_times_that_do_not_fit_are_refused_in_one_line(folder):

@@ -136,6 +136,18 @@ def write_bag(folder: Path, kind: str, messages: Iterable[tuple], *, store: Mess
     return path
 
 
+def write_one_message(path: Path, encoding: str, data: bytes) -> None:
+    """Write an MCAP file of one message of the type foxglove.PointCloud in some encoding."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.PointCloud", encoding, b"")
+        writer.add_message(writer.register_channel("/points", encoding, schema), 1, data, 1)
+        writer.finish()
+
+
 def file_of(bag: Path) -> Path:
     """Return the file of a bag that holds the messages."""
     return bag if bag.is_file() else next(path for path in bag.iterdir() if path.suffix != ".yaml")
