@@ -17,7 +17,8 @@ DATA = Path(__file__).parent / "data"
 
 os.environ.setdefault("CARLASC_REMOTE_BACKOFF_S", "0.01")  # servers of tests that fail need no time to recover
 
-hypothesis.settings.register_profile("carlasc", deadline=None)  # how long an example takes is the machine's affair
+# How long an example takes is the machine's affair. Equal code gets equal examples; `--hypothesis-profile default` looks for others.
+hypothesis.settings.register_profile("carlasc", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("carlasc")
 
 
