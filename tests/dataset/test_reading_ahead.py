@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 from helpers.datasets.drives import write_drive
+from helpers.servers.object_store import BUCKET, options_for, s3_server
 from helpers.servers.range_server import serve_folder
 
 import carlasc
@@ -310,26 +311,18 @@ class TestStatefulDataLoader:
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_bucket_is_read_through_the_cache_and_a_new_version_of_it_is_seen(drives, truth, tmp_path, workers):
-    moto = pytest.importorskip("moto.server")
-    pytest.importorskip("s3fs")
     import fsspec
 
-    server = moto.ThreadedMotoServer(port=0, verbose=False)
-    server.start()
-    try:
-        host, port = server.get_host_and_port()
-        options = {"key": "test", "secret": "test", "endpoint_url": f"http://{host}:{port}"}
+    with s3_server() as endpoint:
+        options = options_for(endpoint)
         bucket = fsspec.filesystem("s3", **options)
-        bucket.mkdir(f"carlasc{workers}")  # moto keeps buckets from one server to the next
-        bucket.put(str(drives / "served" / "x.zarr"), f"carlasc{workers}/x.zarr", recursive=True)
+        bucket.put(str(drives / "served" / "x.zarr"), f"{BUCKET}/x.zarr", recursive=True)
         for _ in range(2):  # the second time from the cache
-            dataset = Dataset(carlasc.open(f"s3://carlasc{workers}/x.zarr", cache=tmp_path, **options), history=HISTORY)
+            dataset = Dataset(carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY)
             sampler = ShardSampler(dataset, **SHAPE)
             loader = DataLoader(dataset, BATCH, sampler=sampler, num_workers=workers)
             assert frames_of(loader, truth) == order_of(sampler, 0)
         (_, path), *_ = dataset.cached_files([0])
-        bucket.pipe(f"carlasc{workers}/x.zarr/{path}", b"something else")
+        bucket.pipe(f"{BUCKET}/x.zarr/{path}", b"something else")
         with pytest.raises(carlasc.errors.CarlascError, match=r"x\.zarr"):
-            Dataset(carlasc.open(f"s3://carlasc{workers}/x.zarr", cache=tmp_path, **options), history=HISTORY)[0]
-    finally:
-        server.stop()
+            Dataset(carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY)[0]

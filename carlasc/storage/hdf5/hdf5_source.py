@@ -21,6 +21,7 @@ from carlasc.storage.files import parse_json_value
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.transport.remote_tree import RemoteTree
+from carlasc.storage.transport.requests import holding_a_lock
 from carlasc.storage.transport.trees import Tree
 
 _BLOSC = 32001  # the filter's registered number
@@ -110,7 +111,7 @@ class HDF5Store(ArrayStore):
         h5py = import_extra("h5py", "hdf5")
         with reading(self.location, "an HDF5 file", "is it truncated or corrupted?"):
             if isinstance(self.tree, RemoteTree):
-                with self.tree.open(self.path) as remote, h5py.File(remote, "r") as file:
+                with self.tree.open(self.path) as remote, holding_a_lock(), h5py.File(remote, "r") as file:
                     yield file
             else:
                 with h5py.File(self.location, "r", locking=False) as file:

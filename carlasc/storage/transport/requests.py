@@ -9,6 +9,7 @@ between servers, `carlasc.storage.transport.failures` says which failures are te
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import random
 import threading
@@ -295,6 +296,50 @@ class HttpAnswer:
         while piece:
             yield piece
             piece = self.more()
+
+
+class _Collecting:
+    """Whether garbage is collected: off while anybody needs it off."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._was_on = False
+
+    def stop(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._was_on = gc.isenabled()
+                gc.disable()
+            self._users += 1
+
+    def resume(self) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0 and self._was_on:
+                gc.enable()
+
+
+_COLLECTING = _Collecting()
+
+
+@contextmanager
+def holding_a_lock() -> Iterator[None]:
+    """Let a library that holds a lock of its own wait for requests, as h5py does when it reads a file object.
+
+    A collection of garbage on fsspec's thread could free an object of that library, which needs the same lock: each would wait for the
+    other for ever. So nothing is collected meanwhile, nor does that thread begin in the middle of a collection.
+    """
+    import asyncio
+
+    from fsspec.asyn import get_loop, sync
+
+    _COLLECTING.stop()
+    try:
+        sync(get_loop(), asyncio.sleep, 0)  # when this has run, no collection is under way on that thread
+        yield
+    finally:
+        _COLLECTING.resume()
 
 
 async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings, scheme: str) -> list[Any]:

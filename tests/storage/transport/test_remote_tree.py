@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import re
 import sys
 import threading
@@ -13,13 +14,15 @@ import fsspec
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.servers.object_store import faulty_server
+from helpers.servers.object_store import BUCKET, faulty_server, options_for, s3_server
 from storage.transport.test_zipped import write_zip
 
 import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
 from carlasc.storage import Source, layout
 from carlasc.storage.packing import pack
+from carlasc.storage.transport import requests
+from carlasc.storage.transport.servers import get
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 
@@ -76,16 +79,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str, 
 @pytest.fixture(scope="module")
 def bucket() -> Iterator[tuple[str, dict[str, Any]]]:
     """An S3 bucket on this machine, and the options that reach it."""
-    moto = pytest.importorskip("moto.server")
-    pytest.importorskip("s3fs")
-    server = moto.ThreadedMotoServer(port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    options = {"key": "test", "secret": "test", "endpoint_url": f"http://{host}:{port}"}
-    fs = fsspec.filesystem("s3", **options)
-    fs.mkdir("carlasc")
-    yield "s3://carlasc", options
-    server.stop()
+    with s3_server() as endpoint:
+        yield f"s3://{BUCKET}", options_for(endpoint)
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +158,33 @@ def test_every_kind_is_read_over_http(published: Path, site: tuple[Path, str, ty
         for found, wanted in zip(sequence.read_many(name, frames), here.read_many(name, frames), strict=True):
             assert np.array_equal(found, wanted)
     assert sequence.read_document("carlasc.json") == here.read_document("carlasc.json")
+
+
+class _Cell:
+    """Something that only a collection frees."""
+
+    def __init__(self, held: object) -> None:
+        self.held, self.itself = held, self
+
+
+@pytest.mark.timeout(60)
+def test_garbage_that_h5py_must_free_does_not_stop_the_thread_that_h5py_waits_for(
+    published: Path, site: tuple[Path, str, type[RangeHandler]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    h5py = pytest.importorskip("h5py")
+    folder, url, _ = site
+    pack(published, folder / "garbage.h5")
+    ready, made = [h5py.h5t.NATIVE_DOUBLE.copy() for _ in range(200)], []
+
+    async def get_and_leave_garbage(*arguments: Any, **options: Any) -> Any:
+        _Cell(ready.pop())
+        made[:] = [[] for _ in range(10_000)]  # so many new objects start a collection, if any may
+        return await get(*arguments, **options)
+
+    monkeypatch.setattr(requests, "get", get_and_leave_garbage)
+    source = carlasc.open(f"{url}/garbage.h5")
+    assert source.sequences()[WHOLE].fields() == carlasc.open(published).sequences()[WHOLE].fields()
+    assert made and gc.isenabled()
 
 
 def test_a_member_of_a_zip_over_http_costs_its_own_bytes(
