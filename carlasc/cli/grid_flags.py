@@ -131,6 +131,12 @@ class PoseFlags(Flags):
             help="file: those of the data. kiss-icp: estimated from the scans. auto: the file if it exists, else estimated."
         ),
     ] = "auto"
+    refine: Annotated[
+        carlasc.motion.RefineMode,
+        typer.Option(
+            help="Change poses so that neighbouring scans agree. auto: where scans come clearly nearer to each other; always; never."
+        ),
+    ] = "auto"
     force: Annotated[
         bool,
         typer.Option(
@@ -141,7 +147,7 @@ class PoseFlags(Flags):
 
     def options(self) -> carlasc.motion.PoseOptions:
         """Return where poses come from."""
-        return carlasc.motion.PoseOptions(self.poses, self.force)
+        return carlasc.motion.PoseOptions(self.poses, self.refine, self.force)
 
 
 @dataclass(frozen=True)

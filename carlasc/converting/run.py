@@ -165,7 +165,7 @@ def _make_grids(
     if grids.follow_ground:
         spec, notes = _fit(spec, [one.ground for one in conversions if one.ground is not None], sink.location)
     observe = replace(
-        grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=PoseOptions("file", poses.force)
+        grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=replace(poses, source="file")
     )
     voting = grids.voting or Voting()
     result = regrid(_ConvertedScans(sink, conversions), spec, out, observe=observe, voting=voting, run=run)

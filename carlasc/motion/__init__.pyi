@@ -14,6 +14,7 @@ from .options import MotionOptions as MotionOptions
 from .options import MotionSource as MotionSource
 from .options import PoseOptions as PoseOptions
 from .options import PoseSource as PoseSource
+from .options import RefineMode as RefineMode
 from .segments import Chain as Chain
 from .segments import Linker as Linker
 from .segments import Segment as Segment

@@ -8,6 +8,7 @@ from typing import Literal
 from carlasc.errors import ArgumentError, check_choice
 
 PoseSource = Literal["auto", "file", "kiss-icp"]
+RefineMode = Literal["auto", "always", "never"]
 MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
 
 
@@ -18,17 +19,21 @@ class PoseOptions:
     Attributes:
         source: "file": those of the data; "kiss-icp": estimated from the scans (needs the extra `kitti`); "auto": those of the data
             where they exist, otherwise estimated. Estimated poses are written only where the sequence has none.
+        refine: whether poses are changed so that neighbouring scans agree. "auto": where scans come clearly nearer to each other by it,
+            which is measured in places that take no part; "always": also where they do not; "never". The given poses are not overwritten.
         force: accept poses that are farther apart than a vehicle can move or turn, or under which scans do not overlap.
 
     Raises:
-        ArgumentError: an unknown source.
+        ArgumentError: an unknown value.
     """
 
     source: PoseSource = "auto"
+    refine: RefineMode = "auto"
     force: bool = False
 
     def __post_init__(self) -> None:
         check_choice("poses", self.source, PoseSource)
+        check_choice("refine", self.refine, RefineMode)
 
 
 @dataclass(frozen=True)

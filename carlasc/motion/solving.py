@@ -59,6 +59,35 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
     return fit
 
 
+@cached
+def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N,) the solution of a positive definite system, by Cholesky's method.
+
+    Args:
+        matrix: (N, N), of which the lower half is read. Is changed.
+        right: (N,).
+    """
+    count = len(right)
+    solution, column = right.copy(), np.empty(count)
+    for k in range(count):
+        root = np.sqrt(matrix[k, k])
+        solution[k] /= root
+        for i in range(k, count):
+            matrix[i, k] /= root
+            column[i] = matrix[i, k]
+        for i in range(k + 1, count):
+            lower = column[i]
+            if lower != 0.0:
+                solution[i] -= lower * solution[k]
+                for j in range(k + 1, i + 1):
+                    matrix[i, j] -= lower * column[j]
+    for k in range(count - 1, -1, -1):
+        solution[k] /= matrix[k, k]
+        for i in range(k):
+            solution[i] -= matrix[k, i] * solution[k]
+    return solution
+
+
 @cached(error_model="python")
 def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the eigenvalues of symmetric matrices, increasing, and their eigenvectors, by Jacobi's method.

@@ -120,3 +120,13 @@ else:
 
     def _sync(descriptor: int) -> None:
         os.fsync(descriptor)
+
+
+def unfinished(path: Path) -> Path:
+    """Return where a store or a folder is written until it is whole: `<name>.part` beside it."""
+    return path.with_name(f"{path.name}.part")
+
+
+def replaced(path: Path) -> Path:
+    """Return where an older store waits until the new one is whole: `<name>.replaced`, which users hardly call a copy of their own."""
+    return path.with_name(f"{path.name}.replaced")

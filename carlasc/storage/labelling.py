@@ -21,12 +21,12 @@ from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDat
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import refuse_overlap
-from carlasc.storage.durability import make_folder, sync_all
+from carlasc.storage.durability import make_folder, replaced, sync_all, unfinished
 from carlasc.storage.files import to_json, write_atomic
 from carlasc.storage.folder import FolderSequence, FolderSource
 from carlasc.storage.metadata import PREDICTED
 from carlasc.storage.opening import as_source
-from carlasc.storage.packed.output import remove, replaced, unfinished
+from carlasc.storage.packed.output import remove
 from carlasc.storage.predictions import (
     PredictedFiles,
     PredictionReader,

@@ -28,6 +28,7 @@ TIMES = "times.txt"
 METADATA = "carlasc.json"
 PARAMS = "params.json"
 REPORT = "carlasc-report.json"
+DERIVED = ".carlasc"  # the folder of what is derived of a sequence: no field, never packed, safe to delete
 
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
@@ -295,6 +296,11 @@ def scan_folders() -> frozenset[str]:
 def params_file(grid: str) -> str:
     """Return the path of a grid's params.json under `<coordinates>/`."""
     return f"{grid}/{PARAMS}"
+
+
+def derived(name: str, digest: str) -> str:
+    """Return the path of a file that is derived of a sequence, such as its tracks, by the digest of what it is made from."""
+    return f"{DERIVED}/{name}-{digest[:16]}.npz"
 
 
 def report_file(grid: str) -> str:

@@ -156,7 +156,9 @@ class PublishedSequence(Sequence):
         texts = {layout.POSES, layout.TIMES, layout.METADATA}
         entries = self.tree.entries(self.path)
         unknown = [
-            f"{name}/" if is_folder else name for name, is_folder in entries.items() if name not in known | texts
+            f"{name}/" if is_folder else name
+            for name, is_folder in entries.items()
+            if name not in known | texts | {layout.DERIVED}
         ]
         for folder in sorted(known):
             suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}

@@ -8,23 +8,29 @@ if both are equal to its own. A grid without a record is published data and is n
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from hashlib import sha256
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import ArgumentError, ConflictError, FormatError
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import Sequence
 from carlasc.storage.sinks import SequenceWriter
+
+Kept = TypeVar("Kept")
 
 RECORD = "carlasc"
 RECORD_FORMAT = 1
 """Version of the record's own layout: of the keys that it has, and of what they mean."""
 _RENAMED = {"source": "observe", "vote": "voting"}  # keys of the records without a format
 _TOLERANCE = 1e-6  # metres, entries of a rotation, seconds: the last digits of poses.txt depend on the machine
+_LOOKED_AT = 16  # scans that are read to know a sequence again
 _OTHER_SETTINGS = "choose another `name`, or replace the grid with `overwrite=True`"
 _PUBLISHED = "this is published data, which is never written to: choose another `name` or `out`"
 
@@ -201,3 +207,43 @@ def _other_data(where: str, frame: int) -> ConflictError:
         found=f"other data at frame {frame}",
         advice="choose another `out`, or move the existing files away",
     )
+
+
+def derived_key(sequence: Sequence, frames: NDArray[np.int64], **settings: Any) -> str:
+    """Return a digest of settings and of a sequence, by which what is derived of it is kept: its actors, or its refined poses.
+
+    Poses, times, and the contents of 16 scans count, so that long drives need not be read: if others are replaced, that is not noticed.
+    """
+    about = {
+        **settings,
+        "frames": frames.tolist(),
+        "poses": sha256(sequence.poses.tobytes()).hexdigest(),
+        "times": sequence.times.tolist() if layout.TIMES in sequence.documents() else None,
+    }
+    digest = sha256(to_json(about))
+    for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
+        for name in sorted(sequence.fields() & layout.SCAN_FIELDS.keys()):
+            if frames[row] in sequence.frames(name):
+                with suppress(CarlascError):  # one that cannot be read is reported when its grid is made
+                    digest.update(np.ascontiguousarray(sequence.read(name, int(frames[row]))).tobytes())
+    return digest.hexdigest()
+
+
+def read_derived(
+    writer: SequenceWriter, name: str, key: str, read: Callable[[bytes, str], tuple[Kept, str]]
+) -> Kept | None:
+    """Return what an earlier run derived of a sequence, and kept beside its grids; None if there is nothing of the same key.
+
+    Args:
+        writer: where the sequence is written.
+        name: what it is, such as "tracks".
+        key: as `derived_key` returns it.
+        read: returns what a file holds, and the key in it.
+    """
+    file = layout.derived(name, key)
+    data = writer.read_document(file)
+    try:
+        found, made_from = (None, None) if data is None else read(data, file)
+    except CarlascError:  # of another version, or damaged: it is only a copy of what the scans say
+        return None
+    return found if made_from == key else None

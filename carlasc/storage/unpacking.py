@@ -10,9 +10,10 @@ from pathlib import Path
 from carlasc.errors import ConflictError
 from carlasc.running.spreading import Run
 from carlasc.storage.copying import blocks_of, copy_blocks, copy_documents, counter, refuse_overlap
+from carlasc.storage.durability import unfinished
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
-from carlasc.storage.packed.output import put_in_place, unfinished
+from carlasc.storage.packed.output import put_in_place
 from carlasc.storage.protocol import Source
 from carlasc.storage.transport.trees import is_url
 

@@ -8,3 +8,4 @@ from .drives import DriveScan as DriveScan
 from .drives import SimulatedDrive as SimulatedDrive
 from .drives import Thing as Thing
 from .mistakes import wrong_labels as wrong_labels
+from .mistakes import wrong_poses as wrong_poses

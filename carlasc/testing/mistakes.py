@@ -1,4 +1,4 @@
-"""Labels as a network gets them wrong: at random, or in clumps."""
+"""Labels as a network gets them wrong, and poses as an odometry or a satellite receiver gets them wrong."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.geometry import invert, multiply, rotations_of
 from carlasc.errors import ArgumentError
 
 
@@ -68,3 +69,56 @@ def wrong_labels(
     same = others[drawn] == labels[wrong]
     result[wrong] = others[(drawn + same) % len(others)]
     return result
+
+
+def wrong_poses(
+    poses: NDArray[np.float64],
+    *,
+    jitter_m: float = 0.0,
+    jitter_rad: float = 0.0,
+    drift_m: float = 0.0,
+    drift_rad: float = 0.0,
+    height_drift_m: float = 0.0,
+    seed: int = 0,
+) -> NDArray[np.float64]:
+    """Return poses with errors: the same for equal arguments.
+
+    Args:
+        poses: (F, 4, 4) world_T_sensor in order of time.
+        jitter_m: standard deviation of an error of each position, along each axis of the world, that is independent of the others.
+        jitter_rad: the same of each rotation, about each axis of the sensor.
+        drift_m: standard deviation of an error of each motion from one pose to the next, along each axis of the sensor; these add up.
+        drift_rad: the same of each rotation.
+        height_drift_m: standard deviation of the steps of a random walk of the height alone.
+        seed: of the random numbers.
+
+    Returns:
+        (F, 4, 4) world_T_sensor. Drift leaves the first pose as it is.
+
+    Raises:
+        ArgumentError: a standard deviation is negative or no number.
+    """
+    given = {"jitter_m": jitter_m, "jitter_rad": jitter_rad, "drift_m": drift_m, "drift_rad": drift_rad}
+    for name, value in (given | {"height_drift_m": height_drift_m}).items():
+        if not 0 <= value < np.inf:
+            raise ArgumentError(name, expected="a standard deviation, 0 or more", found=str(value))
+    rng = np.random.default_rng(seed)
+    wrong = np.array(poses, np.float64)
+    motions = multiply(invert(wrong[:-1]), wrong[1:])
+    motions = multiply(motions, _turns(rng, len(motions), drift_rad))
+    motions[:, :3, 3] += rng.normal(0.0, drift_m, (len(motions), 3))
+    if drift_m or drift_rad:
+        for row, motion in enumerate(motions):
+            wrong[row + 1] = multiply(wrong[row], motion)
+    wrong = multiply(wrong, _turns(rng, len(wrong), jitter_rad))
+    wrong[:, :3, 3] += rng.normal(0.0, jitter_m, (len(wrong), 3))
+    wrong[1:, 2, 3] += np.cumsum(rng.normal(0.0, height_drift_m, max(len(wrong) - 1, 0)))
+    return wrong
+
+
+def _turns(rng: np.random.Generator, count: int, deviation_rad: float) -> NDArray[np.float64]:
+    """Return (count, 4, 4) small rotations."""
+    turns = np.tile(np.eye(4), (count, 1, 1))
+    half = rng.normal(0.0, deviation_rad, (count, 3)) / 2
+    turns[:, :3, :3] = rotations_of(np.column_stack([np.ones(count), half]))
+    return turns

@@ -34,8 +34,7 @@ def test_parts_make_the_files_of_one_conversion(kitti, tmp_path, order):
         path.replace("whole", "parts") for path in whole.sequences
     )
     trees = [read_tree(tmp_path / name) for name in ("parts", "whole")]
-    for tree in trees:  # what is kept of the motion names the times of the scans' folders
-        assert [tree.pop(name) for name in list(tree) if name.endswith("tracks.npz")]
+    assert any("/.carlasc/tracks-" in name for name in trees[0])
     assert trees[0] == trees[1]
 
 

@@ -28,7 +28,7 @@ def run(tmp_path, *, poses="auto", force=False, grids=None, sequences=None, spli
         sequences=sequences,
         split=split,
         layout=LayoutOptions(flow=flow, **layout),
-        poses=PoseOptions(poses, force),
+        poses=PoseOptions(poses, force=force),
         grids=grids,
         run=Run(workers=1),
     )

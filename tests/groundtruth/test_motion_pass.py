@@ -8,11 +8,9 @@ from helpers.scenes import passing_car
 import carlasc
 from carlasc import FromScans, Run
 from carlasc.errors import FormatError
-from carlasc.groundtruth.from_scans import sequences
-from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
-from carlasc.groundtruth.from_scans.sequences import TRACKS
-from carlasc.motion import Extent, MotionOptions, Track
+from carlasc.groundtruth.from_scans import motion_pass
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.motion import Extent, MotionOptions, PoseOptions, Track
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
 
@@ -115,8 +113,14 @@ def passes(monkeypatch):
         made.append(1)
         return find_actors(*args, **options)
 
-    monkeypatch.setattr(sequences, "find_actors", find)
+    monkeypatch.setattr(motion_pass, "find_actors", find)
     return made
+
+
+def kept_in(street):
+    """Return the one file of actors that is kept beside the grids."""
+    (file,) = (street / "cartesian" / layout.DERIVED).glob("tracks-*.npz")
+    return file
 
 
 def run(street, name="mine", frames=None, workers=1, **options):
@@ -131,15 +135,15 @@ class TestPass:
     def test_it_is_made_once_for_several_grids_and_runs(self, street, passes):
         run(street, frames=(0, 2))
         assert len(passes) == 1
-        kept = (street / "cartesian" / TRACKS).read_bytes()
+        kept = kept_in(street).read_bytes()
         run(street, frames=(0, 4))
         run(street, "other", frames=(0, 2), window=(-2, 2))
         assert len(passes) == 1
-        assert (street / "cartesian" / TRACKS).read_bytes() == kept
+        assert kept_in(street).read_bytes() == kept
 
     def test_kept_actors_give_the_same_grids_as_new_ones(self, street, passes):
         first, again = run(street, "first", (4, 6)), run(street, "again", (4, 6))
-        (street / "cartesian" / TRACKS).unlink()
+        kept_in(street).unlink()
         assert first == again == run(street, "new", (4, 6))
         assert len(passes) == 2
 
@@ -155,10 +159,11 @@ class TestPass:
 
     @pytest.mark.parametrize("data", [b"", b"not an archive", MovingActors().to_bytes("of another drive")])
     def test_it_is_made_again_if_what_is_kept_is_damaged_or_of_something_else(self, street, passes, data):
-        (street / "cartesian" / TRACKS).write_bytes(data)
+        run(street, "first", frames=(4, 5))
+        kept_in(street).write_bytes(data)
         run(street, frames=(4, 5))
-        assert len(passes) == 1
-        assert MovingActors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), TRACKS)[0].tracks
+        assert len(passes) == 2
+        assert MovingActors.from_bytes(kept_in(street).read_bytes(), "tracks")[0].tracks
 
     def test_other_options_of_motion_need_another_one(self, street, passes):
         run(street, "fields", (4, 5))
@@ -170,12 +175,12 @@ class TestPass:
 
     def test_two_workers_find_the_same_as_one(self, street):
         one = run(street, "one", (3, 6))
-        kept = (street / "cartesian" / TRACKS).read_bytes()
-        (street / "cartesian" / TRACKS).unlink()
+        kept = kept_in(street).read_bytes()
+        kept_in(street).unlink()
         assert one == run(street, "two", (3, 6), workers=2)
         assert_equal(
             MovingActors.from_bytes(kept, "")[0],
-            MovingActors.from_bytes((street / "cartesian" / TRACKS).read_bytes(), "")[0],
+            MovingActors.from_bytes(kept_in(street).read_bytes(), "")[0],
         )
 
     def test_a_grid_does_not_depend_on_the_frames_of_the_run(self, street):
@@ -184,9 +189,10 @@ class TestPass:
     @pytest.mark.parametrize(
         ("options", "scans"),
         [
-            ({}, 2 * FRAMES),  # fields, and then free space
-            ({"motion": MotionOptions("instances")}, FRAMES),
-            ({"dynamic": "tube"}, 0),
+            ({}, 3 * FRAMES),  # poses, then fields, and then free space
+            ({"motion": MotionOptions("instances")}, 2 * FRAMES),
+            ({"motion": MotionOptions("instances"), "poses": PoseOptions(refine="never")}, FRAMES),
+            ({"dynamic": "tube"}, FRAMES),
         ],
     )
     def test_progress_counts_every_scan_that_is_read_and_every_frame(self, street, options, scans):
@@ -205,22 +211,23 @@ class TestPass:
             assert list(done) == sorted(set(done)) and (done[0], done[-1]) == (0, scans + 2)
 
 
-def test_the_key_depends_on_what_the_actors_are_made_from(street):
-    (sequence,) = carlasc.open(street).sequences().values()
-    keys = {
-        key_of(ScanFeed(sequence, FromScans(**options)))
-        for options in (
-            {},
-            {"motion": MotionOptions("instances")},
-            {"motion": MotionOptions(min_speed_m_s=0.5)},
-            {"max_range_m": 20.0},
-            {"min_range_m": 2.0},
-        )
-    }
-    assert len(keys) == 5
-    assert key_of(ScanFeed(sequence, FromScans())) == key_of(
-        ScanFeed(sequence, FromScans(window=(-2, 2), complete="seen"))
+def test_the_file_depends_on_what_the_actors_are_made_from(street):
+    folder = street / "cartesian" / layout.DERIVED
+    settings = (
+        {},
+        {"motion": MotionOptions("instances")},
+        {"motion": MotionOptions(min_speed_m_s=0.5)},
+        {"max_range_m": 20.0},
+        {"min_range_m": 2.0},
     )
-    moved = sequence.poses.copy()
-    moved[3, 0, 3] += 0.01
-    assert key_of(ScanFeed(sequence.with_poses(moved), FromScans())) not in keys
+    for number, options in enumerate(settings):
+        run(street, f"grid{number}", (4, 5), **options)
+    assert len(list(folder.glob("tracks-*.npz"))) == len(settings)
+    run(street, "same", (4, 5), window=(-2, 2), complete="seen")
+    assert len(list(folder.glob("tracks-*.npz"))) == len(settings)
+    poses = (street / "cartesian" / layout.POSES).read_text().splitlines()
+    numbers = poses[3].split()
+    poses[3] = " ".join([*numbers[:3], str(float(numbers[3]) + 0.01), *numbers[4:]])
+    (street / "cartesian" / layout.POSES).write_text("\n".join(poses))
+    run(street, "moved", (4, 5))
+    assert len(list(folder.glob("tracks-*.npz"))) == len(settings) + 1

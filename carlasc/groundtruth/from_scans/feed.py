@@ -274,6 +274,18 @@ class ScanFeed:
             self._scans.move_to_end(frame)
             return self._scans[frame]
 
+    def static_points(self, frame: int) -> NDArray[np.float32]:
+        """Return the (N, 3) points of a scan whose class cannot move, all of them without labels, metres, sensor frame."""
+        scan = self.sequence.scan(frame, ("labels", "origins"))
+        origins = scan.others.get("origins")
+        seen = scan.points if origins is None else scan.points - origins
+        with np.errstate(invalid="ignore", over="ignore"):
+            distance = np.sqrt(np.square(seen).sum(axis=1))
+            static = (distance >= self.min_range_m) & (distance <= self.max_range_m)
+        if scan.labels is not None:
+            static &= ~np.isin(scan.labels, sorted(self.classes.movable))
+        return np.ascontiguousarray(scan.points[static], np.float32)
+
     def sighting(self, frame: int, boxes: Sequence_[Track]) -> Sighting:
         """Return a scan as evidence of motion needs it; points of actors that the sequence's own fields show are marked.
 

@@ -1,4 +1,4 @@
-"""The pass over the scans of a sequence that finds its actors, before the first grid is made.
+"""The passes over the scans of a sequence, before the first grid is made: poses are refined, then actors are found.
 
 Scans are read in batches, by several workers; segments are linked as they come, and the track of an actor is estimated when it was seen for
 the last time. So memory does not grow with the length of a drive, except for the result.
@@ -6,20 +6,18 @@ the last time. So memory does not grow with the length of a drive, except for th
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import invert, transform_points
+from carlasc.core.geometry import invert, multiply, transform_points
+from carlasc.errors import CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.motion import (
     HORIZON_S,
@@ -35,15 +33,21 @@ from carlasc.motion import (
     seen_from,
     tracks_from_boxes,
 )
+from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.folder import FolderSequence
+from carlasc.storage.protocol import Sequence as StoredScans
+from carlasc.storage.resuming import derived_key, read_derived
+from carlasc.storage.sinks import SequenceWriter
 
-VERSION = 1
-"""Version of the estimate of motion. It changes only when the same input gives other tracks."""
+TRACKS, POSES = "tracks", "poses"
+"""What the files that keep actors and refined poses are called, in the folder of what is derived."""
+POOR_M = 0.04
+"""Scans that disagree by more than this, in metres, have poses that cost quality."""
 
+_VERSIONS = {TRACKS: 1, POSES: 1}  # of the methods: they change only when the same input gives another result
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece
 _BLOCK = 100  # frames whose evidence is found in one piece
@@ -225,26 +229,88 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
     return tracks_from_boxes(boxes, {frame: feed.pose(frame) for frame in boxes}, feed.times)
 
 
-def key_of(feed: ScanFeed) -> str:
-    """Return a digest of what the actors of a sequence depend on: its scans, poses and times, and the options.
+def read_or_find_actors(feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> MovingActors:
+    """Return the actors that an earlier run kept; if there are none of the same scans and options, find and keep them."""
+    about = {"motion": feed.motion, "min_speed_m_s": feed.options.motion.min_speed_m_s}
+    key = _key_of(TRACKS, feed, **about)
+    actors = read_derived(writer, TRACKS, key, MovingActors.from_bytes)
+    if actors is not None:
+        steps(feed.reads)
+        return actors
+    actors = find_actors(feed, run, steps)
+    writer.write_document(layout.derived(TRACKS, key), actors.to_bytes(key))
+    return actors
 
-    The contents of scans are not read: a scan that is replaced is noticed by the time of the folder that holds it.
+
+def refine_sequence(
+    feed: ScanFeed,
+    writer: SequenceWriter | None = None,
+    run: Run = Run(),  # noqa: B008 (frozen)
+    steps: Callable[[int], None] | None = None,
+) -> RefinedPoses:
+    """Refine the poses of the frames of a sequence, or return what an earlier run kept.
+
+    Args:
+        feed: the scans, under the given poses.
+        writer: where the result is kept; None to keep it nowhere.
+        run: how the work is spread. Scans are read by all workers, and aligned by this process.
+        steps: called with the number of scans that were read since the last call.
     """
-    options, sequence = feed.options, feed.sequence
-    about: dict[str, Any] = {
-        "version": VERSION,
-        "motion": feed.motion,
-        "min_speed_m_s": options.motion.min_speed_m_s,
-        "range_m": [feed.min_range_m, str(feed.max_range_m)],
-        "frames": feed.frames.tolist(),
-        "poses": hashlib.sha256(sequence.poses.tobytes()).hexdigest(),
-        "times": sequence.times.tolist() if layout.TIMES in sequence.documents() else None,
-        "folders": _changed(sequence.folder) if isinstance(sequence, FolderSequence) else None,
-    }
-    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+    frames, mode = feed.frames.tolist(), feed.options.poses.refine
+    key = "" if writer is None else _key_of(POSES, feed, refine=mode, movable=sorted(feed.classes.movable))
+    kept = None if writer is None else read_derived(writer, POSES, key, RefinedPoses.from_bytes)
+    if kept is not None:
+        if steps is not None:
+            steps(len(frames))
+        return kept
+    given = np.stack([feed.pose(frame) for frame in frames])
+    with closing(run_all(_ThinScan(feed), frames, run)) as scans:
+        refined = refine_poses(scans, given, always=mode == "always", steps=steps)
+    if writer is not None:
+        writer.write_document(layout.derived(POSES, key), refined.to_bytes(key))
+    return refined
 
 
-def _changed(folder: Path) -> dict[str, int]:
-    """Return when files were last added to or replaced in the folders of a sequence's scans, in nanoseconds."""
-    names = {field.folder for field in layout.SCAN_FIELDS.values()}
-    return {name: (folder / name).stat().st_mtime_ns for name in sorted(names) if (folder / name).is_dir()}
+@dataclass(frozen=True)
+class _ThinScan:
+    """Reads a scan for the refinement, in a worker."""
+
+    feed: ScanFeed
+
+    def __call__(self, frame: int) -> ThinnedScan:
+        try:
+            points = self.feed.static_points(frame)
+        except CarlascError:  # making the frame raises the same error, and that one is reported
+            points = np.empty((0, 3), np.float32)
+        return ThinnedScan.of(points, self.feed.pose(frame))
+
+
+def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
+    ranges = [feed.min_range_m, str(feed.max_range_m)]
+    return derived_key(feed.sequence, feed.frames, version=_VERSIONS[name], range_m=ranges, **settings)
+
+
+def with_refined_poses(sequence: StoredScans, frames: NDArray[np.int64], refined: RefinedPoses) -> StoredScans:
+    """Return a sequence with refined poses. Lines of frames without a scan get the correction of the scan before them."""
+    given = sequence.poses
+    lines = np.array([sequence.line_of(frame, len(given), layout.POSES) for frame in frames.tolist()])
+    row = np.clip(np.searchsorted(lines, np.arange(len(given)), side="right") - 1, 0, None)
+    correction = multiply(refined.poses, invert(refined.given))
+    poses = multiply(correction[row], given)
+    poses[lines] = refined.poses
+    return sequence.with_poses(poses)
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else 0.0
+
+
+def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str]:
+    """Yield what the refinement did, in a line: nothing if the given poses are good, and were left alone."""
+    before, after = (_mean(values) for values in (refined.before_m, refined.after_m))
+    left = [(int(frames[first]), int(frames[last])) for first, last, changed in refined.stretches() if not changed]
+    if refined.refined.any():
+        but = f"; those of frames {', '.join(f'{a} to {b}' for a, b in left[:3])} were left alone" if left else ""
+        yield f"poses were refined: neighbouring scans disagreed by {100 * before:.1f} cm, now by {100 * after:.1f} cm{but}"
+    elif before > POOR_M:
+        yield f"poses could not be refined, although neighbouring scans disagree by {100 * before:.1f} cm"

@@ -17,7 +17,12 @@ from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
-from carlasc.groundtruth.from_scans.motion_pass import find_actors, key_of
+from carlasc.groundtruth.from_scans.motion_pass import (
+    pose_notes,
+    read_or_find_actors,
+    refine_sequence,
+    with_refined_poses,
+)
 from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
@@ -32,6 +37,7 @@ from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.facts import Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
+from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
@@ -39,8 +45,6 @@ from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD
 from carlasc.storage.sinks import SequenceWriter
 
-TRACKS = "tracks.npz"
-"""The document that keeps the actors of a sequence beside its grids. It may be deleted: the next run makes it again."""
 _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
 _RANGE_M = 100.0  # of a sensor whose range carlasc.json does not give
 _TENTH = 10
@@ -115,6 +119,7 @@ class ScanSequence(StoredSequence):
         super().__init__(sequence, plan)
         self.options = options
         self.actors = MovingActors()
+        self.refined: RefinedPoses | None = None
 
     @cached_property
     def estimates_poses(self) -> bool:
@@ -126,8 +131,8 @@ class ScanSequence(StoredSequence):
         return isinstance(record, dict) and record.get("poses") == "kiss-icp"
 
     @cached_property
-    def feed(self) -> ScanFeed:
-        """The scans of the sequence, after its poses and times were checked.
+    def posed(self) -> Sequence:
+        """The sequence with the poses that it has or that were estimated, not refined, after poses and times were checked.
 
         Raises:
             MissingDataError: there are no poses.
@@ -135,7 +140,12 @@ class ScanSequence(StoredSequence):
         """
         sequence = with_estimated_poses(self.sequence) if self.estimates_poses else self.sequence
         check_trajectory(sequence, self.options)
-        return ScanFeed(sequence, self.options)
+        return sequence
+
+    @cached_property
+    def feed(self) -> ScanFeed:
+        """The scans of the sequence: under refined poses, after `refine`. It raises what `posed` does."""
+        return ScanFeed(self.posed, self.options)
 
     def _find_frames(self) -> tuple[FrameInput, ...]:
         chosen = choose_frames(self.plan.frames, self.sequence.frames("points"), self.location)
@@ -147,21 +157,28 @@ class ScanSequence(StoredSequence):
 
     @property
     def steps_before(self) -> int:
-        """Number of scans that the pass that finds the actors reads."""
-        return self.feed.reads
+        """Number of scans that the passes that refine poses and find actors read."""
+        return self.feed.reads + (len(self.feed.frames) if self.refines else 0)
 
     def prepare(self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> None:
-        """Find the actors of the sequence, or read those that an earlier run found."""
-        if not self.feed.needs_actors:
+        """Refine the poses of the sequence, and find its actors, or read what an earlier run found."""
+        self.refine(writer, run, steps)
+        if self.feed.needs_actors:
+            self.actors = read_or_find_actors(self.feed, writer, run, steps)
+
+    @property
+    def refines(self) -> bool:
+        """Whether poses may be refined."""
+        return self.options.poses.refine != "never" and len(self.feed.frames) >= MIN_SCANS
+
+    def refine(self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]) -> None:
+        """Refine the poses, or read what an earlier run kept with `writer`; the feed then has the refined poses."""
+        if not self.refines:
             return
-        key = key_of(self.feed)
-        kept = _read_actors(writer, key)
-        if kept is None:
-            self.actors = find_actors(self.feed, run, steps)
-            writer.write_document(TRACKS, self.actors.to_bytes(key))
-            return
-        self.actors = kept
-        steps(self.steps_before)
+        feed = ScanFeed(self.posed, self.options)
+        self.refined = refine_sequence(feed, writer, run, steps)
+        if self.refined.refined.any():
+            self.feed = ScanFeed(with_refined_poses(self.posed, feed.frames, self.refined), self.options)
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return what was found of each actor, by number; None if no actor is tracked."""
@@ -177,6 +194,7 @@ class ScanSequence(StoredSequence):
         if not options.own_path:
             record |= {"own_path": False}
         record |= {"poses": "kiss-icp"} if self.estimates_poses else {}
+        record |= {"refine": options.poses.refine} if self.refines else {}
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}
         record |= {} if options.window_m is None else {"window_m": options.window_m}
         limits = {"min_range_m": self.feed.min_range_m, "max_range_m": self.feed.max_range_m}
@@ -185,13 +203,16 @@ class ScanSequence(StoredSequence):
     def poses(self) -> NDArray[np.float64] | None:
         """Return the poses to write beside the grids; None if they were estimated and the sequence has its own."""
         has_own = layout.POSES in self.sequence.documents()
-        return None if has_own and self.estimates_poses else self.feed.sequence.poses
+        return None if has_own and self.estimates_poses else self.posed.poses
 
     def notes(self) -> list[str]:
         """Return what the scans lack, and what was found in spite of it."""
         where, dynamic, notes = self.location, self.options.dynamic, []
         if self.estimates_poses and self.options.poses.source == "auto":
             notes.append(f"{where}: there are no poses: they were estimated from the scans (kiss-icp)")
+        notes += (
+            [] if self.refined is None else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
+        )
         if not self.feed.has_labels:
             notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
         elif not self.feed.motion and dynamic != "tube":
@@ -232,18 +253,6 @@ class ScanSequence(StoredSequence):
             heights.append(points[ground & (np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])), 2])
         below = np.concatenate(heights) < spec.lower[2]
         return float(below.mean()) if len(below) else 0.0
-
-
-def _read_actors(writer: SequenceWriter, key: str) -> MovingActors | None:
-    """Return the actors that an earlier run kept; None if there are none, or they were made from something else."""
-    data = writer.read_document(TRACKS)
-    if data is None:
-        return None
-    try:
-        actors, made_from = MovingActors.from_bytes(data, TRACKS)
-    except CarlascError:  # of another version, or damaged: it is only a copy of what the scans say
-        return None
-    return actors if made_from == key else None
 
 
 def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, options: FromScans) -> list[SequenceInput]:

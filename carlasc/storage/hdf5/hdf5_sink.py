@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.durability import sync_tree
+from carlasc.storage.durability import sync_tree, unfinished
 from carlasc.storage.hdf5.hdf5_source import CRC
 from carlasc.storage.packed.array_layout import (
     DOCUMENT,
@@ -28,7 +28,7 @@ from carlasc.storage.packed.array_layout import (
 )
 from carlasc.storage.packed.chunks import crc32c, in_threads
 from carlasc.storage.packed.columns import Column
-from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing, unfinished
+from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing
 from carlasc.storage.packed.stores import (
     STORE,
     VERSION,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
-from carlasc.storage.durability import make_folder, remove_file, rename, sync_all
+from carlasc.storage.durability import make_folder, remove_file, rename, replaced, sync_all
 from carlasc.storage.files import storage_error
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
@@ -47,16 +47,6 @@ def _is_store(path: Path) -> bool:
         return any((path / mark).is_file() for mark in ("zarr.json", TABLES_MARK))
     with path.open("rb") as file:
         return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
-
-
-def unfinished(path: Path) -> Path:
-    """Return where a store or a folder is written until it is whole: `<name>.part` beside it."""
-    return path.with_name(f"{path.name}.part")
-
-
-def replaced(path: Path) -> Path:
-    """Return where an older store waits until the new one is whole: `<name>.replaced`, which users hardly call a copy of their own."""
-    return path.with_name(f"{path.name}.replaced")
 
 
 def unfinished_error(where: str | os.PathLike[str]) -> FormatError:

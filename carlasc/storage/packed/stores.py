@@ -161,7 +161,7 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
 
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""
-        return self._documents
+        return tuple(name for name in self._documents if not name.startswith(f"{layout.DERIVED}/"))
 
     def _check_document(self, name: str) -> None:
         if name not in self._documents:

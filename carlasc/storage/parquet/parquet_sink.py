@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.durability import remove_file, sync_tree
+from carlasc.storage.durability import remove_file, sync_tree, unfinished
 from carlasc.storage.files import parse_json, remove_stale, to_json, write_atomic
 from carlasc.storage.packed.output import (
     TABLES_MARK,
@@ -21,7 +21,6 @@ from carlasc.storage.packed.output import (
     put_in_place,
     refuse_existing,
     remove,
-    unfinished,
 )
 from carlasc.storage.packed.stores import (
     STORE,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
-from carlasc.storage.durability import rename
+from carlasc.storage.durability import rename, replaced
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.packed.output import remove, replaced
+from carlasc.storage.packed.output import remove
 from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.shards import METADATA, group_metadata

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import json
 from pathlib import Path
 
 import numpy as np
@@ -24,26 +22,13 @@ def content_of(folder: Path) -> Content:
     for path in sorted(folder.rglob("*")):
         if path.name != MESSAGES and not _is_trial(path):
             is_file = path.is_file() and not path.is_symlink()
-            found[path.relative_to(folder).as_posix()] = (
-                _without_times(path.name, path.read_bytes()) if is_file else None
-            )
+            found[path.relative_to(folder).as_posix()] = path.read_bytes() if is_file else None
     return found
 
 
 def _is_trial(path: Path) -> bool:
     """Whether `tempfile` made a file to see whether it can; a process that is killed at that moment leaves these four bytes."""
     return path.parent.name == TEMPORARY and path.is_file() and b"blat".startswith(path.read_bytes())
-
-
-def _without_times(name: str, data: bytes) -> bytes:
-    """Return bytes that depend on no time: the tracks that a run keeps for the next one hold a key of the times of folders."""
-    if name != "tracks.npz" or not data:
-        return data
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        arrays = {member: file[member] for member in file.files}
-    about = json.loads(arrays.pop("about").tobytes())
-    digests = {member: hashlib.sha256(array.tobytes()).hexdigest() for member, array in arrays.items()}
-    return json.dumps([about["summary"], digests]).encode()
 
 
 def differences(expected: Content, found: Content) -> list[str]:

@@ -1,0 +1,397 @@
+"""Joint alignment: the poses of many scans at once, so that what each scan saw of a surface lies on one plane.
+
+The points of each scan are grouped into the cells of a grid in the world. A group is a cluster: the sums of its points are all that is needed
+of them. The clusters that several scans have in one cell give a plane, if they are flat together. The poses then move so that the clusters
+come nearer to these planes, all poses in one linear system from which the places of the planes are eliminated. This is repeated, first with
+large cells and then with small ones. (Liu et al., "Efficient and Consistent Bundle Adjustment on Lidar Point Clouds", T-RO 2023, do it with
+the second derivative; with fixed normals the first one is enough, and the errors here are small.)
+
+A plane is made of the scans of one block, 60 after each other, and blocks overlap by half. So scans that are farther apart in time, and
+may have drifted, are not drawn to each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.compiling import cached, jit
+from carlasc.motion.solving import principal_axes, solve_positive
+
+HALF_BLOCK = 30
+"""Half of the number of scans that planes are made of: all scans that are no farther apart are compared."""
+
+_MIN_SCANS, _MIN_POINTS = 3, 8  # a plane has so many
+_WIDE_M2 = 0.02  # variance of a plane along its second axis: narrower things are lines
+_POINT_M = 0.03  # error of a point
+_EQUAL = 4  # points of a cluster beyond this number tell nothing new
+_INDEPENDENT = 0.1  # share of the clusters whose errors are independent
+_OUTLIER = 9.0  # squared distance to a plane, in standard deviations, from which a cluster counts less
+_STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
+_PER_DIRECTION = 300  # planes of each direction that are used: more of one add little
+_SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
+_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
+MIX = np.int64(-7046029254386353131)
+"""Spreads the keys of cells over a hash table."""
+_BITS = 21  # of the number of a cell along an axis: cells that are so many apart have one key
+
+
+class Pull(NamedTuple):
+    """How firmly poses are held to others: standard deviations of three metres and three radians.
+
+    Attributes:
+        to_given: of a pose about the given one.
+        to_neighbour: of the change of a pose about the change of the one before it.
+    """
+
+    to_given: tuple[float, float] = (0.5, math.radians(2.0))
+    to_neighbour: tuple[float, float] = (0.1, math.radians(0.5))
+
+
+class Pass(NamedTuple):
+    """One pass over the cells.
+
+    Attributes:
+        cell_m: size of a cell.
+        repeats: number of steps.
+        thick_m: greatest standard deviation of a plane across.
+        flat: greatest variance of a plane across, as a share of the one along its second axis.
+    """
+
+    cell_m: float
+    repeats: int
+    thick_m: float
+    flat: float
+
+
+PASSES = (Pass(2.0, 3, 0.35, 0.1), Pass(1.0, 4, 0.12, 0.03))
+_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # for comparing scans: planes of scans that do not fit are thick
+
+
+class Clusters(NamedTuple):
+    """What the scans of a block saw in each cell, sorted by cell.
+
+    Attributes:
+        start: (G + 1,) the first cluster of each cell.
+        scan: (C,) the scan of each cluster, as its row in the poses.
+        sums: (C, 10) of its points, seen from its sensor, on the axes of the world.
+    """
+
+    start: NDArray[np.int64]
+    scan: NDArray[np.int64]
+    sums: NDArray[np.float64]
+
+
+def align(
+    points: Sequence[NDArray[np.float32]],
+    start: NDArray[np.float64],
+    given: NDArray[np.float64],
+    fixed: int = 0,
+    pull: Pull = Pull(),  # noqa: B008 (a tuple)
+) -> NDArray[np.float64]:
+    """Return the poses under which scans agree.
+
+    Args:
+        points: (N, 3) of each scan, metres, frame of the sensor.
+        start: (F, 4, 4) world_T_sensor of the scans, in order of time, from which the poses are found: right within decimetres.
+        given: (F, 4, 4) what holds the poses where the scans do not determine them.
+        fixed: number of scans at the beginning whose poses stay.
+        pull: how firmly the given poses hold.
+
+    Returns:
+        (F, 4, 4) world_T_sensor.
+    """
+    poses, free = start.copy(), len(points) - fixed
+    if free < 1:
+        return poses
+    for one in PASSES:
+        for repeat in range(one.repeats):
+            matrix, right = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
+            for found in _blocks(points, poses, one.cell_m, shift=0.5 * (repeat % 2)):
+                normals, thickness = planes(found, poses, one)
+                chosen = _choose(normals, thickness)
+                add_planes(found, poses, normals, thickness, chosen, fixed, matrix, right)
+            add_given(poses, given, np.array([*pull.to_given, *pull.to_neighbour]) ** -2.0, fixed, matrix, right)
+            move(poses, solve_positive(matrix, right).reshape(-1, 6), fixed)
+    return poses
+
+
+def disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (F,) how far each scan is from the planes of the others, metres, root mean square; NaN where nothing tells.
+
+    Args:
+        points: (N, 3) of each scan, metres, frame of the sensor.
+        poses: (F, 4, 4) world_T_sensor.
+    """
+    sums = np.zeros((len(points), 2))
+    for found in _blocks(points, poses, _MEASURE.cell_m, shift=0.0):
+        normals, thickness = planes(found, poses, _MEASURE)
+        add_distances(found, poses, normals, thickness, sums)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(sums[:, 0] / sums[:, 1]))
+
+
+def _blocks(
+    points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64], cell_m: float, shift: float
+) -> list[Clusters]:
+    """Return the clusters of each block of scans, in cells that are shifted by a share of their size."""
+    per_scan = [clusters(own, pose, cell_m, shift) for own, pose in zip(points, poses, strict=True)]
+    found = []
+    for first in range(0, max(len(points) - HALF_BLOCK, 1), HALF_BLOCK):
+        block = per_scan[first : first + 2 * HALF_BLOCK]
+        keys = np.concatenate([keys for keys, _ in block])
+        order = np.argsort(keys, kind="stable")
+        begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        scan = np.repeat(np.arange(first, first + len(block)), [len(keys) for keys, _ in block])
+        sums = np.concatenate([sums for _, sums in block])
+        found.append(Clusters(np.append(begins, len(keys)), scan[order], sums[order]))
+    return found
+
+
+def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the planes that are used: of each of six directions about the same number, spread over the place."""
+    found = np.flatnonzero(thickness >= 0)
+    x, y, upright = normals[found, 0], normals[found, 1], np.abs(normals[found, 2])
+    wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
+    direction = np.where(upright > _STEEP, 0, np.where(upright > _SLANTED, 1, wall))
+    chosen = [found[:0]]
+    for number in range(6):
+        own = found[direction == number]
+        chosen.append(own[:: max(1, -(-len(own) // _PER_DIRECTION))])
+    return np.concatenate(chosen)
+
+
+@jit
+def cell_key(x: float, y: float, z: float) -> int:
+    """Return a number for the cell that has a place, in sizes of a cell."""
+    low = (1 << _BITS) - 1
+    return (math.floor(x) & low) << 2 * _BITS | (math.floor(y) & low) << _BITS | math.floor(z) & low
+
+
+@cached
+def clusters(
+    points: NDArray[np.float32], pose: NDArray[np.float64], cell_m: float, shift: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return (C,) the keys of the cells in which a scan has points, and (C, 10) the sums of these points."""
+    size = 16
+    while size < 2 * len(points):
+        size *= 2
+    table = np.full(size, -1, np.int64)
+    keys, sums, count = np.empty(len(points), np.int64), np.zeros((len(points), _SUMS)), 0
+    seen, at = np.empty(3), np.empty(3)
+    for i in range(len(points)):
+        for a in range(3):
+            seen[a] = pose[a, 0] * points[i, 0] + pose[a, 1] * points[i, 1] + pose[a, 2] * points[i, 2]
+            at[a] = (seen[a] + pose[a, 3]) / cell_m + shift
+        key = cell_key(at[0], at[1], at[2])
+        place = ((key * MIX) >> 20) & (size - 1)
+        while table[place] >= 0 and keys[table[place]] != key:
+            place = (place + 1) & (size - 1)
+        if table[place] < 0:
+            table[place], keys[count] = count, key
+            count += 1
+        row, x, y, z = table[place], seen[0], seen[1], seen[2]
+        for k, value in enumerate((1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)):
+            sums[row, k] += value
+    return keys[:count].copy(), sums[:count].copy()
+
+
+def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (G, 3) the normals of the planes in cells, and (G,) their variances across, metres squared, -1 where there is no plane."""
+    enough, covariances = spread_of(found, poses)
+    values, vectors = principal_axes(covariances)
+    flat = enough & (values[:, 0] < how.thick_m**2) & (values[:, 0] < how.flat * values[:, 1])
+    flat &= values[:, 1] > _WIDE_M2
+    return vectors[:, :, 0], np.where(flat, np.maximum(values[:, 0], 0.0), -1.0)
+
+
+@cached
+def spread_of(found: Clusters, poses: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return (G,) whether a cell has points of enough scans, and (G, 3, 3) the covariance of its points; a scan counts for some points only."""
+    start, scan, sums = found
+    cells = len(start) - 1
+    enough, covariances = np.zeros(cells, np.bool_), np.zeros((cells, 3, 3))
+    total, to, center = np.empty(_SUMS), np.empty(3), np.empty(3)
+    for g in range(cells):
+        first = start[g]
+        if start[g + 1] - first < _MIN_SCANS:
+            continue
+        for a in range(3):  # sums from nearby, so that rounding is small
+            center[a] = poses[scan[first], a, 3] + sums[first, 1 + a] / sums[first, 0]
+        total[:] = 0.0
+        for r in range(first, start[g + 1]):
+            weight = min(sums[r, 0], _EQUAL) / sums[r, 0]
+            for a in range(3):
+                to[a] = poses[scan[r], a, 3] - center[a]
+            total[0] += weight * sums[r, 0]
+            for a in range(3):
+                total[1 + a] += weight * (sums[r, 1 + a] + sums[r, 0] * to[a])
+                for b in range(a, 3):
+                    k = _SQUARES[a, b]
+                    moved = sums[r, k] + to[a] * sums[r, 1 + b] + to[b] * sums[r, 1 + a] + sums[r, 0] * to[a] * to[b]
+                    total[k] += weight * moved
+        enough[g] = total[0] >= _MIN_POINTS
+        for a in range(3):
+            for b in range(3):
+                mean = total[1 + a] * total[1 + b] / (total[0] * total[0])
+                covariances[g, a, b] = total[_SQUARES[a, b]] / total[0] - mean
+    return enough, covariances
+
+
+@jit
+def _to_plane(
+    scan: NDArray[np.int64],
+    sums: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    variance: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (C,) the distances of clusters from their plane, along its normal, and (C,) their weights, less for outliers."""
+    off, weight = np.empty(len(scan)), np.empty(len(scan))
+    for i in range(len(scan)):
+        off[i] = 0.0
+        for a in range(3):
+            off[i] += normal[a] * (sums[i, 1 + a] / sums[i, 0] + poses[scan[i], a, 3])
+        weight[i] = min(sums[i, 0], _EQUAL) / variance
+    for repeat in range(4):
+        total = level = 0.0
+        for i in range(len(scan)):
+            robust = 1.0 if repeat == 0 else 1.0 / (1.0 + off[i] * off[i] / (_OUTLIER * variance))
+            weight[i] = robust * robust * min(sums[i, 0], _EQUAL) / variance
+            total += weight[i]
+            level += weight[i] * off[i]
+        off -= level / total
+    return off, weight
+
+
+@cached
+def add_planes(
+    found: Clusters,
+    poses: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    thickness: NDArray[np.float64],
+    chosen: NDArray[np.int64],
+    fixed: int,
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Add what the chosen planes say about the poses of the scans from `fixed` on to the normal equations, their lower half."""
+    for g in chosen:
+        first, last, normal = found.start[g], found.start[g + 1], normals[g]
+        scan, sums = found.scan[first:last], found.sums[first:last]
+        off, weight = _to_plane(scan, sums, poses, normal, _POINT_M * _POINT_M + thickness[g])
+        slope = np.empty((len(scan), 6))
+        for i in range(len(scan)):
+            x, y, z = sums[i, 1] / sums[i, 0], sums[i, 2] / sums[i, 0], sums[i, 3] / sums[i, 0]
+            slope[i, :3] = normal
+            slope[i, 3] = y * normal[2] - z * normal[1]
+            slope[i, 4] = z * normal[0] - x * normal[2]
+            slope[i, 5] = x * normal[1] - y * normal[0]
+        total = weight.sum()
+        for i in range(len(scan)):
+            own, share = 6 * (scan[i] - fixed), _INDEPENDENT * weight[i]
+            if own < 0:
+                continue
+            for k in range(6):
+                right[own + k] -= share * off[i] * slope[i, k]
+                for m in range(6):
+                    matrix[own + k, own + m] += share * slope[i, k] * slope[i, m]
+            for j in range(len(scan)):
+                other = 6 * (scan[j] - fixed)
+                if 0 <= other <= own:
+                    both = share * weight[j] / total
+                    for k in range(6):
+                        for m in range(6):
+                            matrix[own + k, other + m] -= both * slope[i, k] * slope[j, m]
+
+
+@cached
+def add_distances(
+    found: Clusters,
+    poses: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    thickness: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> None:
+    """Add (F, 2) the squared distances of the clusters of each scan to the planes of the others, and their number."""
+    for g in range(len(thickness)):
+        if thickness[g] < 0:
+            continue
+        first, last = found.start[g], found.start[g + 1]
+        scan, sums = found.scan[first:last], found.sums[first:last]
+        off, weight = _to_plane(scan, sums, poses, normals[g], _POINT_M * _POINT_M + thickness[g])
+        total = weight.sum()
+        for i in range(len(scan)):
+            if total > weight[i]:
+                alone = off[i] * total / (total - weight[i])  # from the plane without this scan
+                result[scan[i], 0] += alone * alone
+                result[scan[i], 1] += 1.0
+
+
+@jit
+def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: int) -> float:
+    """Return a number of the small rotation vector from the rotation of one pose to that of another, on the axes of the world."""
+    low, high = (axis + 1) % 3, (axis + 2) % 3
+    value = 0.0
+    for k in range(3):
+        value += other[high, k] * one[low, k] - other[low, k] * one[high, k]
+    return value / 2.0
+
+
+@cached
+def add_given(
+    poses: NDArray[np.float64],
+    given: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    fixed: int,
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Add what the given poses say: each holds its own, and the change of one that of the next."""
+    count = len(poses)
+    change = np.empty((count, 6))
+    for i in range(count):
+        for a in range(3):
+            change[i, a] = poses[i, a, 3] - given[i, a, 3]
+            change[i, 3 + a] = _turn_between(given[i], poses[i], a)
+    for i in range(fixed, count):
+        own = 6 * (i - fixed)
+        for k in range(6):
+            held, near = weights[k // 3], weights[2 + k // 3]
+            matrix[own + k, own + k] += held
+            right[own + k] -= held * change[i, k]
+            if i == 0:
+                continue
+            matrix[own + k, own + k] += near
+            right[own + k] -= near * (change[i, k] - change[i - 1, k])
+            if i > fixed:
+                matrix[own + k - 6, own + k - 6] += near
+                matrix[own + k, own + k - 6] -= near
+                right[own + k - 6] += near * (change[i, k] - change[i - 1, k])
+
+
+@cached
+def move(poses: NDArray[np.float64], steps: NDArray[np.float64], fixed: int) -> None:
+    """Change the poses from `fixed` on by (F - fixed, 6) small translations and rotation vectors on the axes of the world."""
+    for i in range(len(steps)):
+        pose, (x, y, z) = poses[fixed + i], steps[i, 3:]
+        for a in range(3):
+            pose[a, 3] += steps[i, a]
+        half = math.sqrt(x * x + y * y + z * z) / 2.0
+        scale = 0.5 if half < 1e-9 else math.sin(half) / (2.0 * half)
+        w, x, y, z = math.cos(half), scale * x, scale * y, scale * z
+        turn = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        for b in range(3):
+            p, q, r = pose[0, b], pose[1, b], pose[2, b]
+            for a in range(3):
+                pose[a, b] = turn[a, 0] * p + turn[a, 1] * q + turn[a, 2] * r

@@ -1,0 +1,202 @@
+"""Refined poses: the given poses of a drive, changed so that scans within some seconds of each other agree.
+
+Scans come in order and only some hundred are kept. A stretch of them is aligned together (`joint_alignment`), with the end of the stretch
+before it, whose poses are final, and the beginning of the one after it. A quarter of the places that the scans saw takes no part in this:
+there it is measured how far neighbouring scans are from each other's surfaces, before and after. A stretch in which that does not become
+clearly less keeps the motion that was given. Over longer times than a stretch the given poses hold, weakly.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice, pairwise
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.compiling import cached
+from carlasc.core.geometry import invert, multiply, transform_points
+from carlasc.errors import reading
+from carlasc.motion.joint_alignment import HALF_BLOCK, MIX, align, cell_key, disagreement
+from carlasc.storage.arrays import ArrayFormat, open_npz
+
+MIN_SCANS = 3
+"""Fewer scans are not refined."""
+
+_FORMATS = {
+    "given": ArrayFormat(("<f8",), (None, 4, 4)),
+    "poses": ArrayFormat(("<f8",), (None, 4, 4)),
+    "before_m": ArrayFormat(("<f8",), (None,)),
+    "after_m": ArrayFormat(("<f8",), (None,)),
+    "refined": ArrayFormat(("|b1",), (None,)),
+}
+_STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
+_THIN_M = 0.3  # one point is used of each cell of this size
+_PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
+_BETTER, _NEARER_M = 0.9, 0.003  # scans must come nearer to each other by this factor, and by this distance
+_FAR_M = 1e5  # points that are farther away are no returns
+_FARTHEST_M, _FARTHEST_RAD = 0.5, np.deg2rad(3.0)  # a change between two scans that is greater is no refinement
+
+
+@dataclass(frozen=True)
+class ThinnedScan:
+    """The points of one scan that poses are refined with.
+
+    Attributes:
+        used: (N, 3) float32, metres, frame of the sensor: those that are aligned.
+        measured: (M, 3) float32: those in places that take no part.
+    """
+
+    used: NDArray[np.float32]
+    measured: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, points: NDArray[np.float32], world_T_sensor: NDArray[np.float64]) -> Self:
+        """Choose from the (N, 3) points of a scan, metres, those that are static as far as anybody knows."""
+        chosen = points[_first_of_cells(np.ascontiguousarray(points, np.float32), _THIN_M)]
+        x, y, z = np.floor(transform_points(world_T_sensor, chosen) / _PLACE_M).astype(np.int64).T
+        measured = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) % _PLACES == 0
+        return cls(chosen[~measured], chosen[measured])
+
+
+@dataclass(frozen=True)
+class RefinedPoses:
+    """The poses of a drive after refinement.
+
+    Attributes:
+        given: (F, 4, 4) float64 world_T_sensor of each scan before.
+        poses: (F, 4, 4) float64 world_T_sensor of each scan.
+        before_m: (F,) how far each scan is from the surfaces that its neighbours saw, under the given poses, in metres; NaN where nothing tells.
+        after_m: (F,) the same under the refined poses.
+        refined: (F,) bool, the scans whose motion is not the given one.
+    """
+
+    given: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    before_m: NDArray[np.float64]
+    after_m: NDArray[np.float64]
+    refined: NDArray[np.bool_]
+
+    def changes(self) -> NDArray[np.float64]:
+        """Return (F - 1, 6) by how much the motion from each scan to the next one differs from the given one: metres, then radians, frame of the sensor."""
+        return _changes(self.given, self.poses)
+
+    def stretches(self) -> Iterator[tuple[int, int, bool]]:
+        """Yield (first, last, whether refined) of runs of scans, as rows."""
+        bounds = [0, *(np.flatnonzero(np.diff(self.refined)) + 1).tolist(), len(self.refined)]
+        for first, end in pairwise(bounds):
+            yield first, end - 1, bool(self.refined[first])
+
+    def to_bytes(self, key: str) -> bytes:
+        """Return all of it as an `.npz` file; `key` says what it was made from."""
+        file = io.BytesIO()
+        np.savez(file, key=np.frombuffer(key.encode(), np.uint8), **vars(self))
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes, where: str) -> tuple[Self, str]:
+        """Return what a file holds, and the key of what it was made from.
+
+        Raises:
+            FormatError: it is no such file; the message starts with `where`.
+        """
+        with open_npz(data, where) as file:
+            key = file.read("key", ArrayFormat(("u1",), (None,))).tobytes()
+            arrays = {name: file.read(name, expected) for name, expected in _FORMATS.items()}
+        with reading(where, "poses refined by carlasc", "remove it"):
+            if len({len(array) for array in arrays.values()}) != 1:
+                raise ValueError("arrays of different lengths")
+            return cls(**arrays), key.decode()
+
+
+def refine_poses(
+    scans: Iterable[ThinnedScan],
+    given: NDArray[np.float64],
+    *,
+    always: bool = False,
+    steps: Callable[[int], None] | None = None,
+) -> RefinedPoses:
+    """Refine the poses of a drive.
+
+    Where scans do not determine a direction, as along a tunnel, the given poses hold in this direction. Movers among the points do little
+    harm: what passes through a cell is no plane.
+
+    Args:
+        scans: the scans, in order of time; they are taken as they are needed.
+        given: (F, 4, 4) float64 world_T_sensor of each of them.
+        always: whether stretches are refined in which scans do not come nearer to each other, too.
+        steps: called with the number of scans that were taken since the last call.
+    """
+    count, poses = len(given), given.copy()
+    before, after, refined = np.full(count, np.nan), np.full(count, np.nan), np.zeros(count, np.bool_)
+    scans, kept, first = iter(scans), list[ThinnedScan](), 0
+    begin = 0
+    while begin < count and count >= MIN_SCANS:
+        end = count if count - begin < _STRETCH + HALF_BLOCK else begin + _STRETCH
+        start, last = max(0, begin - HALF_BLOCK), min(end + HALF_BLOCK, count)
+        del kept[: start - first]
+        for scan in islice(scans, last - start - len(kept)):
+            kept.append(scan)
+            if steps is not None:
+                steps(1)
+        first = start
+        near, rows = slice(start, last), slice(begin - start, end - start)
+        if begin:  # the correction of the scan before goes on
+            poses[begin:last] = multiply(poses[begin - 1], invert(given[begin - 1]), given[begin:last])
+        held = poses[near].copy()
+        found = align([scan.used for scan in kept], held, given[near], begin - start)
+        measured = [scan.measured for scan in kept]
+        before[begin:end] = disagreement(measured, given[near])[rows]
+        now = disagreement(measured, found)[rows]
+        chosen = _is_near(held, found) and (always or _is_better(before[begin:end], now))
+        if chosen:
+            poses[begin:end], refined[begin:end] = found[rows], True
+        after[begin:end] = now if chosen else before[begin:end]
+        begin = end
+    return RefinedPoses(given, poses, before, after, refined)
+
+
+def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return False
+    was, now = float(before[both].mean()), float(after[both].mean())
+    return now < min(_BETTER * was, was - _NEARER_M)
+
+
+def _changes(given: NDArray[np.float64], found: NDArray[np.float64]) -> NDArray[np.float64]:
+    before, after = (multiply(invert(poses[:-1]), poses[1:]) for poses in (given, found))
+    off = multiply(invert(before), after)
+    turns = [off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]]
+    return np.concatenate([off[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
+
+
+def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
+    """Return whether no motion between two scans changed by more than poses of a drive can be wrong."""
+    changes = _changes(held, found)
+    moved, turned = (np.sqrt(np.square(part).sum(axis=1)) for part in (changes[:, :3], changes[:, 3:]))
+    return bool((moved < _FARTHEST_M).all() and (turned < _FARTHEST_RAD).all())
+
+
+@cached
+def _first_of_cells(points: NDArray[np.float32], cell_m: float) -> NDArray[np.int64]:
+    """Return the indices of the first point of each cell that has one, increasing; points that are not finite are in no cell."""
+    size = 16
+    while size < 2 * len(points):
+        size *= 2
+    table, keys = np.full(size, -1, np.int64), np.empty(len(points), np.int64)
+    chosen, count = np.empty(len(points), np.int64), 0
+    for i in range(len(points)):
+        if not (abs(points[i, 0]) < _FAR_M and abs(points[i, 1]) < _FAR_M and abs(points[i, 2]) < _FAR_M):
+            continue
+        key = cell_key(points[i, 0] / cell_m, points[i, 1] / cell_m, points[i, 2] / cell_m)
+        place = ((key * MIX) >> 20) & (size - 1)
+        while table[place] >= 0 and keys[table[place]] != key:
+            place = (place + 1) & (size - 1)
+        if table[place] < 0:
+            table[place], keys[count], chosen[count] = count, key, i
+            count += 1
+    return chosen[:count].copy()
