@@ -27,10 +27,11 @@ HALF_BLOCK = 30
 
 _MIN_SCANS, _MIN_POINTS = 3, 8  # a plane has so many
 _WIDE_M2 = 0.02  # variance of a plane along its second axis: narrower things are lines
-_POINT_M = 0.03  # error of a point
+POINT_M = 0.03  # error of a point
 _EQUAL = 4  # points of a cluster beyond this number tell nothing new
 _INDEPENDENT = 0.1  # share of the clusters whose errors are independent
 _OUTLIER = 9.0  # squared distance to a plane, in standard deviations, from which a cluster counts less
+_DETERMINED = 0.003  # share of the planes, by weight, that must lie across a direction
 _STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
 _PER_DIRECTION = 300  # planes of each direction that are used: more of one add little
 _SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
@@ -48,7 +49,7 @@ class Pull(NamedTuple):
         to_neighbour: of the change of a pose about the change of the one before it.
     """
 
-    to_given: tuple[float, float] = (0.5, math.radians(2.0))
+    to_given: tuple[float, float] = (2.0, math.radians(4.0))
     to_neighbour: tuple[float, float] = (0.1, math.radians(0.5))
 
 
@@ -68,8 +69,7 @@ class Pass(NamedTuple):
     flat: float
 
 
-PASSES = (Pass(2.0, 3, 0.35, 0.1), Pass(1.0, 4, 0.12, 0.03))
-_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # for comparing scans: planes of scans that do not fit are thick
+PASSES = (Pass(2.0, 5, 0.35, 0.1), Pass(1.0, 6, 0.12, 0.03))
 
 
 class Clusters(NamedTuple):
@@ -111,31 +111,17 @@ def align(
     for one in PASSES:
         for repeat in range(one.repeats):
             matrix, right = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
-            for found in _blocks(points, poses, one.cell_m, shift=0.5 * (repeat % 2)):
+            for found in blocks(points, poses, one.cell_m, shift=0.5 * (repeat % 2)):
                 normals, thickness = planes(found, poses, one)
                 chosen = _choose(normals, thickness)
-                add_planes(found, poses, normals, thickness, chosen, fixed, matrix, right)
+                slopes = _determined(normals, thickness, chosen)
+                add_planes(found, poses, normals, slopes, thickness, chosen, fixed, matrix, right)
             add_given(poses, given, np.array([*pull.to_given, *pull.to_neighbour]) ** -2.0, fixed, matrix, right)
             move(poses, solve_positive(matrix, right).reshape(-1, 6), fixed)
     return poses
 
 
-def disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) how far each scan is from the planes of the others, metres, root mean square; NaN where nothing tells.
-
-    Args:
-        points: (N, 3) of each scan, metres, frame of the sensor.
-        poses: (F, 4, 4) world_T_sensor.
-    """
-    sums = np.zeros((len(points), 2))
-    for found in _blocks(points, poses, _MEASURE.cell_m, shift=0.0):
-        normals, thickness = planes(found, poses, _MEASURE)
-        add_distances(found, poses, normals, thickness, sums)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.sqrt(sums[:, 0] / sums[:, 1]))
-
-
-def _blocks(
+def blocks(
     points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64], cell_m: float, shift: float
 ) -> list[Clusters]:
     """Return the clusters of each block of scans, in cells that are shifted by a share of their size."""
@@ -163,6 +149,21 @@ def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDA
         own = found[direction == number]
         chosen.append(own[:: max(1, -(-len(own) // _PER_DIRECTION))])
     return np.concatenate(chosen)
+
+
+def _determined(
+    normals: NDArray[np.float64], thickness: NDArray[np.float64], chosen: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the normals without their parts along directions that the chosen planes do not determine, as along a tunnel."""
+    own = normals[chosen]
+    weights = 1.0 / (POINT_M**2 + thickness[chosen])
+    spread = (weights[:, None, None] * own[:, :, None] * own[:, None, :]).sum(axis=0)
+    values, vectors = principal_axes(spread[None])
+    slopes = normals.copy()
+    for value, vector in zip(values[0], vectors[0].T, strict=True):
+        if value < _DETERMINED * values.sum():
+            slopes -= (normals * vector).sum(axis=1)[:, None] * vector
+    return slopes
 
 
 @jit
@@ -243,7 +244,7 @@ def spread_of(found: Clusters, poses: NDArray[np.float64]) -> tuple[NDArray[np.b
 
 
 @jit
-def _to_plane(
+def to_plane(
     scan: NDArray[np.int64],
     sums: NDArray[np.float64],
     poses: NDArray[np.float64],
@@ -273,17 +274,21 @@ def add_planes(
     found: Clusters,
     poses: NDArray[np.float64],
     normals: NDArray[np.float64],
+    slopes: NDArray[np.float64],
     thickness: NDArray[np.float64],
     chosen: NDArray[np.int64],
     fixed: int,
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Add what the chosen planes say about the poses of the scans from `fixed` on to the normal equations, their lower half."""
+    """Add what the chosen planes say about the poses of the scans from `fixed` on to the normal equations, their lower half.
+
+    `slopes` are the normals as far as motions along them are determined.
+    """
     for g in chosen:
-        first, last, normal = found.start[g], found.start[g + 1], normals[g]
+        first, last, normal = found.start[g], found.start[g + 1], slopes[g]
         scan, sums = found.scan[first:last], found.sums[first:last]
-        off, weight = _to_plane(scan, sums, poses, normal, _POINT_M * _POINT_M + thickness[g])
+        off, weight = to_plane(scan, sums, poses, normals[g], POINT_M * POINT_M + thickness[g])
         slope = np.empty((len(scan), 6))
         for i in range(len(scan)):
             x, y, z = sums[i, 1] / sums[i, 0], sums[i, 2] / sums[i, 0], sums[i, 3] / sums[i, 0]
@@ -307,29 +312,6 @@ def add_planes(
                     for k in range(6):
                         for m in range(6):
                             matrix[own + k, other + m] -= both * slope[i, k] * slope[j, m]
-
-
-@cached
-def add_distances(
-    found: Clusters,
-    poses: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    result: NDArray[np.float64],
-) -> None:
-    """Add (F, 2) the squared distances of the clusters of each scan to the planes of the others, and their number."""
-    for g in range(len(thickness)):
-        if thickness[g] < 0:
-            continue
-        first, last = found.start[g], found.start[g + 1]
-        scan, sums = found.scan[first:last], found.sums[first:last]
-        off, weight = _to_plane(scan, sums, poses, normals[g], _POINT_M * _POINT_M + thickness[g])
-        total = weight.sum()
-        for i in range(len(scan)):
-            if total > weight[i]:
-                alone = off[i] * total / (total - weight[i])  # from the plane without this scan
-                result[scan[i], 0] += alone * alone
-                result[scan[i], 1] += 1.0
 
 
 @jit

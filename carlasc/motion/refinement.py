@@ -9,7 +9,7 @@ clearly less keeps the motion that was given. Over longer times than a stretch t
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from typing import Self
@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, transform_points
 from carlasc.errors import reading
-from carlasc.motion.joint_alignment import HALF_BLOCK, MIX, align, cell_key, disagreement
+from carlasc.motion.joint_alignment import (
+    HALF_BLOCK,
+    MIX,
+    POINT_M,
+    Clusters,
+    Pass,
+    align,
+    blocks,
+    cell_key,
+    planes,
+    to_plane,
+)
 from carlasc.storage.arrays import ArrayFormat, open_npz
 
 MIN_SCANS = 3
@@ -33,6 +44,7 @@ _FORMATS = {
     "after_m": ArrayFormat(("<f8",), (None,)),
     "refined": ArrayFormat(("|b1",), (None,)),
 }
+_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that do not fit are thick
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point is used of each cell of this size
 _PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
@@ -149,8 +161,8 @@ def refine_poses(
         held = poses[near].copy()
         found = align([scan.used for scan in kept], held, given[near], begin - start)
         measured = [scan.measured for scan in kept]
-        before[begin:end] = disagreement(measured, given[near])[rows]
-        now = disagreement(measured, found)[rows]
+        before[begin:end] = _disagreement(measured, given[near])[rows]
+        now = _disagreement(measured, found)[rows]
         chosen = _is_near(held, found) and (always or _is_better(before[begin:end], now))
         if chosen:
             poses[begin:end], refined[begin:end] = found[rows], True
@@ -179,6 +191,44 @@ def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
     changes = _changes(held, found)
     moved, turned = (np.sqrt(np.square(part).sum(axis=1)) for part in (changes[:, :3], changes[:, 3:]))
     return bool((moved < _FARTHEST_M).all() and (turned < _FARTHEST_RAD).all())
+
+
+def _disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (F,) how far each scan is from the planes of the others, metres, root mean square; NaN where nothing tells.
+
+    Args:
+        points: (N, 3) of each scan, metres, frame of the sensor.
+        poses: (F, 4, 4) world_T_sensor.
+    """
+    sums = np.zeros((len(points), 2))
+    for found in blocks(points, poses, _MEASURE.cell_m, shift=0.0):
+        normals, thickness = planes(found, poses, _MEASURE)
+        _add_distances(found, poses, normals, thickness, sums)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(sums[:, 0] / sums[:, 1]))
+
+
+@cached
+def _add_distances(
+    found: Clusters,
+    poses: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    thickness: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> None:
+    """Add (F, 2) the squared distances of the clusters of each scan to the planes of the others, and their number."""
+    for g in range(len(thickness)):
+        if thickness[g] < 0:
+            continue
+        first, last = found.start[g], found.start[g + 1]
+        scan, sums = found.scan[first:last], found.sums[first:last]
+        off, weight = to_plane(scan, sums, poses, normals[g], POINT_M * POINT_M + thickness[g])
+        total = weight.sum()
+        for i in range(len(scan)):
+            if total > weight[i]:
+                alone = off[i] * total / (total - weight[i])  # from the plane without this scan
+                result[scan[i], 0] += alone * alone
+                result[scan[i], 1] += 1.0
 
 
 @cached
