@@ -50,7 +50,15 @@ _THIN_M = 0.3  # one point is used of each cell of this size
 _PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
 _BETTER, _NEARER_M = 0.9, 0.003  # scans must come nearer to each other by this factor, and by this distance
 _FAR_M = 1e5  # points that are farther away are no returns
-_FARTHEST_M, _FARTHEST_RAD = 0.5, np.deg2rad(3.0)  # a change between two scans that is greater is no refinement
+_FARTHEST_M, _FARTHEST_RAD = (
+    0.5,
+    np.deg2rad(3.0),
+)  # a change of the motion from one scan to the next that is greater is no refinement,
+_SPAN, _OFF_M, _OFF_RAD = (
+    10,
+    1.0,
+    np.deg2rad(5.0),
+)  # nor is a greater one over so many scans: such poses are of another drive
 
 
 @dataclass(frozen=True)
@@ -179,18 +187,21 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     return now < min(_BETTER * was, was - _NEARER_M)
 
 
-def _changes(given: NDArray[np.float64], found: NDArray[np.float64]) -> NDArray[np.float64]:
-    before, after = (multiply(invert(poses[:-1]), poses[1:]) for poses in (given, found))
+def _changes(given: NDArray[np.float64], found: NDArray[np.float64], span: int = 1) -> NDArray[np.float64]:
+    before, after = (multiply(invert(poses[:-span]), poses[span:]) for poses in (given, found))
     off = multiply(invert(before), after)
     turns = [off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]]
     return np.concatenate([off[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
 
 
 def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
-    """Return whether no motion between two scans changed by more than poses of a drive can be wrong."""
-    changes = _changes(held, found)
-    moved, turned = (np.sqrt(np.square(part).sum(axis=1)) for part in (changes[:, :3], changes[:, 3:]))
-    return bool((moved < _FARTHEST_M).all() and (turned < _FARTHEST_RAD).all())
+    """Return whether no motion changed by more than the poses of a drive can be wrong."""
+    for span, most_m, most_rad in ((1, _FARTHEST_M, _FARTHEST_RAD), (_SPAN, _OFF_M, _OFF_RAD)):
+        changes = _changes(held, found, span)
+        moved, turned = (np.sqrt(np.square(part).sum(axis=1)) for part in (changes[:, :3], changes[:, 3:]))
+        if (moved > most_m).any() or (turned > most_rad).any():
+            return False
+    return True
 
 
 def _disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -49,7 +49,7 @@ def test_a_report_that_is_made_from_files_is_that_of_the_run(made, copied):
     steps = []
     again = report(made, remake=True, run=Run(workers=1, progress=lambda *step: steps.append(step)))
     assert again == report(made)
-    assert steps == [(i, 2 * FRAMES) for i in range(2 * FRAMES + 1)]  # the pass that finds the actors, and the frames
+    assert steps == [(i, 3 * FRAMES) for i in range(3 * FRAMES + 1)]  # poses, actors, and the frames
     next(copied.rglob(layout.REPORT)).unlink()
     with ThreadPoolExecutor(2) as threads:
         assert report(copied, run=Run(executor=threads, workers=2)).reports == again.reports
