@@ -115,9 +115,16 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
         ]
         if report.pose_share is not None:
             figures.append(f"{report.pose_share:.1%} of a scan's structure on that of an earlier scan under the poses")
+        if report.disagreement_m is not None and report.refined_m is not None:
+            figures.append(
+                f"scans agree within {100 * report.disagreement_m:.1f} cm ({100 * report.refined_m:.1f} cm with refined poses)"
+            )
         name = report.path or result.location
         text = f"{name}: {report.frames} frames, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
         out.print(line(text), soft_wrap=True)
+        if report.mounting:
+            mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
+            out.print(line(f"  sensor in the frame of the poses: {mounting}"), soft_wrap=True)
     counts = ", ".join(f"{result.count(severity)} {severity}s" for severity in SEVERITIES)
     out.print(line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"), soft_wrap=True)
 

@@ -13,7 +13,7 @@ from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
-from carlasc.inspection.misfit import describe_misfit
+from carlasc.inspection.pose_quality import describe_mounting
 from carlasc.inspection.structure import structure_of
 from carlasc.motion.options import PoseOptions
 from carlasc.storage import layout
@@ -240,7 +240,6 @@ def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.fl
             found=f"scans that are about ({x:.1f}, {y:.1f}, {z:.1f}) m away from each other",
             advice=f"check that poses and calibration belong to this sequence, {_ESTIMATE}, or {_ACCEPT}",
         )
-    if diagnosis.misfit is None:
-        return None
-    found, advice = describe_misfit(diagnosis.misfit)
-    return f"{found}: {advice}, or {_ESTIMATE}"
+    mounting = None if diagnosis.quality is None else diagnosis.quality.mounting
+    described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
+    return None if described is None else f"{described[0]}: {described[1]}, or {_ESTIMATE}"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, transform_points, translation
-from carlasc.inspection.misfit import Misfit, explain_misfit, match
+from carlasc.inspection.pose_quality import PoseQuality, measure_poses
 from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 
 Poses: TypeAlias = NDArray[np.float64]
@@ -77,8 +77,8 @@ class PoseDiagnosis:
         correction: the mistake that, undone, raises the share clearly; None if there is none.
         corrected_share: the share with the mistake undone, over the pairs on which this makes a difference.
         share_there: the share of the poses as they are, over the same pairs.
-        misfit: a lever arm or a delay that explains the differences between the poses and the motions that the scans show; None if there
-            is a known mistake, or neither explains them.
+        quality: how well neighbouring scans agree, and whether a lever arm or a delay explains what they do not agree in; None if there is
+            a known mistake.
         offset_m: (x, y, z) median distance between where the poses put a scan and where it fits, if nothing else explains it; else None.
     """
 
@@ -87,18 +87,25 @@ class PoseDiagnosis:
     correction: Correction | None = None
     corrected_share: float = 0.0
     share_there: float = 0.0
-    misfit: Misfit | None = None
+    quality: PoseQuality | None = None
     offset_m: tuple[float, float, float] | None = None
 
 
 def diagnose_poses(
-    structure: Callable[[int], NDArray[np.float64]], poses: Poses, *, max_pairs: int = 24
+    structure: Callable[[int], NDArray[np.float64]],
+    poses: Poses,
+    *,
+    points: Callable[[int], NDArray[np.floating]] | None = None,
+    seconds: NDArray[np.float64] | None = None,
+    max_pairs: int = 24,
 ) -> PoseDiagnosis:
     """Measure the overlap of scans under their poses, and under the poses with each known mistake undone.
 
     Args:
         structure: returns the (M, 3) structure of the i-th scan, metres, in the frame of the sensor (see `static_structure`).
         poses: (F, 4, 4) float64 first_T_sensor of each scan, in order of time; rigid.
+        points: returns (N, 3) all points of the i-th scan on things that stand; None takes its structure.
+        seconds: (F,) times of the scans, increasing; None for frames at 10 Hz.
         max_pairs: largest number of pairs of scans that are compared.
     """
     corrections = known_corrections()
@@ -133,11 +140,11 @@ def diagnose_poses(
         index, share_there, corrected_share = best
         return PoseDiagnosis(own, len(pairs), corrections[index - 1], corrected_share, share_there)
     ways = [relative(poses, earlier, later) for earlier, later in pairs]
-    matches = [match(target, moved, way) for (target, moved, _), way in zip(scans, ways, strict=True)]
-    misfit = explain_misfit(poses, pairs, matches)
-    search = misfit is None and own < _GOOD
+    quality = measure_poses(structure.again if points is None else points, poses, seconds)
+    explained = quality.mounting is not None and bool(quality.mounting.wrong.any())
+    search = not explained and own < _GOOD
     overlaps = [(target, few, way) for (target, _, few), way in zip(scans, ways, strict=True)]
-    return PoseDiagnosis(own, len(pairs), misfit=misfit, offset_m=_common_offset(overlaps) if search else None)
+    return PoseDiagnosis(own, len(pairs), quality=quality, offset_m=_common_offset(overlaps) if search else None)
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
@@ -262,6 +269,10 @@ class _Once:
     def __init__(self, structure: Callable[[int], NDArray[np.float64]], uses: Counter[int]) -> None:
         self._structure, self._uses = structure, uses
         self._kept: dict[int, NDArray[np.float64]] = {}
+
+    def again(self, index: int) -> NDArray[np.float64]:
+        """Return (M, 3) points, which are read again."""
+        return self._structure(index)
 
     def __call__(self, index: int) -> NDArray[np.float64]:
         """Return (M, 3) points."""

@@ -70,6 +70,10 @@ class SequenceReport:
             have no labels). A grid for which it could not be measured is left out.
         pose_share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses; None if it could not
             be measured.
+        disagreement_m: how far scans are from the surfaces that their neighbours saw, in metres, under the poses; None if nothing tells.
+        refined_m: the same under refined poses.
+        mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and how late these are, each with its standard
+            error, or "undetermined"; empty if nothing tells.
     """
 
     path: str
@@ -77,6 +81,9 @@ class SequenceReport:
     sampled: int
     voxel_share: Mapping[str, float] = field(default_factory=dict)
     pose_share: float | None = None
+    disagreement_m: float | None = None
+    refined_m: float | None = None
+    mounting: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

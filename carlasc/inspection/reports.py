@@ -158,15 +158,17 @@ class _ReportMaker:
 
     @property
     def steps_before(self) -> int:
-        """Number of scans of the pass that finds the actors."""
+        """Number of scans of the passes that refine poses and find the actors."""
         return 0 if self.inputs is None else self.inputs.steps_before
 
     def find_actors(self, run: Run, steps: Callable[[int], None]) -> None:
-        """Find the actors, if the grid was made with them; the inputs are given up if a scan cannot be read."""
-        if self.inputs is None or not self.inputs.feed.needs_actors:
+        """Refine poses, and find the actors, if the grid was made with them; the inputs are given up if a scan cannot be read."""
+        if self.inputs is None:
             return
         try:
-            self.inputs.actors = find_actors(self.inputs.feed, run, steps)
+            self.inputs.refine(None, run, steps)
+            if self.inputs.feed.needs_actors:
+                self.inputs.actors = find_actors(self.inputs.feed, run, steps)
         except (CarlascError, OSError):  # measuring the frame reports the scan
             self.inputs = None
 
@@ -239,7 +241,7 @@ def _options_of(record: Mapping[str, Any]) -> FromScans:
     if "window" in given:
         first, _, last = str(given["window"]).partition(":")
         given["window"] = (int(first), int(last))
-    given["poses"] = PoseOptions(record.get("poses", "file"), force=True)
+    given["poses"] = PoseOptions(record.get("poses", "file"), record.get("refine", "never"), force=True)
     if "motion" in given:
         given["motion"] = MotionOptions(given["motion"])
     return FromScans(**given)

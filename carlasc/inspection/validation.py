@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
+from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.heights import ground_of
+from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.facts import digest_of
 from carlasc.groundtruth.reporting.report import Report, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
-from carlasc.inspection.misfit import describe_misfit
+from carlasc.inspection.pose_quality import PoseQuality, describe_mounting
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
 from carlasc.running.processes import run_all
@@ -245,7 +247,17 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
     step()
     shares = {name: diagnosis.share for name, diagnosis in diagnoses.items() if not math.isnan(diagnosis.share)}
     pose_share = poses.share if poses is not None and poses.pairs else None
-    return found, SequenceReport(sequence.path, len(plan.frames), len(plan.read), shares, pose_share)
+    quality = None if poses is None else poses.quality
+    return found, SequenceReport(
+        sequence.path, len(plan.frames), len(plan.read), shares, pose_share, *_figures(quality)
+    )
+
+
+def _figures(quality: PoseQuality | None) -> tuple[float | None, float | None, dict[str, str]]:
+    """Return what a report says of the poses."""
+    if quality is None:
+        return None, None, {}
+    return quality.disagreement_m, quality.refined_m, {} if quality.mounting is None else quality.mounting.describe()
 
 
 def _is_described(sequence: Sequence) -> bool:
@@ -305,7 +317,20 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
         except CarlascError:
             return np.empty((0, 3))
 
-    return diagnose_poses(structure, poses)
+    def points(index: int) -> NDArray[np.float32]:
+        try:
+            return feed.static_points(frames[index])
+        except CarlascError:
+            return np.empty((0, 3), np.float32)
+
+    feed = ScanFeed(sequence, FromScans())
+    try:
+        seconds = np.array([feed.time(frame) for frame in frames])
+    except CarlascError:
+        seconds = None
+    if seconds is not None and not (np.diff(seconds) > 0).all():
+        seconds = None  # which is reported elsewhere
+    return diagnose_poses(structure, poses, points=points, seconds=seconds)
 
 
 def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDiagnosis) -> Iterator[Finding]:
@@ -340,12 +365,20 @@ def _largest_edge(spec: GridSpec) -> float:
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
     where = f"{sequence.location}/{layout.POSES}"
     expected = "scans that overlap under the poses"
+    quality = diagnosis.quality
+    mounting = None if quality is None else quality.mounting
+    described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
     if diagnosis.correction is not None:
         found = f"{diagnosis.share_there:.1%} of a scan's structure on that of an earlier scan; the likely cause is {diagnosis.correction.name}: with it undone, {diagnosis.corrected_share:.1%}"
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, diagnosis.correction.advice)
-    elif diagnosis.misfit is not None:
-        found, advice = describe_misfit(diagnosis.misfit)
-        yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)
+    elif described is not None:
+        yield Finding("warning", "poses-on-scans", sequence.path, where, expected, *described)
+    elif quality is not None and quality.is_poor:
+        found = f"scans that are {100 * (quality.disagreement_m or 0):.1f} cm from the surfaces that their neighbours saw; under refined poses {100 * (quality.refined_m or 0):.1f} cm"
+        advice = "grids are made with refined poses; `carlasc refine` writes them for those who stack scans"
+        yield Finding(
+            "warning", "pose-jitter", sequence.path, where, "scans that agree with their neighbours", found, advice
+        )
     elif diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
         found = f"{diagnosis.share:.1%} of a scan's structure on that of an earlier scan; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from where the poses put them"

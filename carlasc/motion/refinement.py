@@ -169,8 +169,8 @@ def refine_poses(
         held = poses[near].copy()
         found = align([scan.used for scan in kept], held, given[near], begin - start)
         measured = [scan.measured for scan in kept]
-        before[begin:end] = _disagreement(measured, given[near])[rows]
-        now = _disagreement(measured, found)[rows]
+        before[begin:end] = disagreement(measured, given[near])[rows]
+        now = disagreement(measured, found)[rows]
         chosen = _is_near(held, found) and (always or _is_better(before[begin:end], now))
         if chosen:
             poses[begin:end], refined[begin:end] = found[rows], True
@@ -204,7 +204,7 @@ def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
     return True
 
 
-def _disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (F,) how far each scan is from the planes of the others, metres, root mean square; NaN where nothing tells.
 
     Args:

@@ -65,5 +65,14 @@ def test_a_result_as_a_dictionary_holds_all_of_it():
     assert values["counts"] == {"error": 0, "warning": 1, "note": 0}
     assert (values["ok"], values["location"], values["findings"][0]["expected"]) == (True, "place", "b")
     assert values["sequences"] == [
-        {"path": "Val/A", "frames": 10, "sampled": 2, "voxel_share": {"evaluation": 0.5}, "pose_share": 0.25}
+        {
+            "path": "Val/A",
+            "frames": 10,
+            "sampled": 2,
+            "voxel_share": {"evaluation": 0.5},
+            "pose_share": 0.25,
+            "disagreement_m": None,
+            "refined_m": None,
+            "mounting": {},
+        }
     ]

@@ -57,7 +57,7 @@ def test_each_scan_is_read_once():
         reads[index] += 1
         return world - poses[index, :3, 3]
 
-    assert diagnose_poses(structure, poses).share > 0.5
+    assert diagnose_poses(structure, poses, points=lambda index: np.empty((0, 3))).share > 0.5
     assert reads == Counter(set(np.ravel(choose_pairs(poses, 24)).tolist()))
 
 

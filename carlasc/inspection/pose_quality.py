@@ -1,0 +1,141 @@
+"""How well neighbouring scans agree under their poses, and whether these are poses of another point of the vehicle, or late.
+
+Some runs of scans are aligned with each other (`carlasc.motion.joint_alignment`): where the sensor turns and changes its speed most, which is where
+a lever arm and a delay can be seen, and in the middle of the drive. What the scans show is compared with the given poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import invert, multiply, slerp
+from carlasc.motion.joint_alignment import align
+from carlasc.motion.mounting import Mounting, find_mounting
+from carlasc.motion.refinement import ThinnedScan, disagreement
+
+POOR_M = 0.03
+"""Scans that disagree by more than this have poses that cost quality, if the scans agree better under others."""
+
+_RUN = 30  # scans of a run
+_SHIFTS, _BETTER = (
+    (-2, 2),
+    0.9,
+)  # frames by which poses are moved for another start, which must be better by this factor
+_AGREE_M = 0.03  # scans that agree within this distance are aligned
+_LEVER_M = 15.0  # a turn counts by what it moves at this distance
+_PERIOD_S = 0.1
+
+
+@dataclass(frozen=True)
+class PoseQuality:
+    """What some runs of scans say about the poses of a drive.
+
+    Attributes:
+        disagreement_m: how far scans are from the surfaces that their neighbours saw, under the given poses; None if nothing tells.
+        refined_m: the same under the poses that the scans show.
+        mounting: where the sensor is in the frame of the poses, and how late these are; None if nothing tells.
+    """
+
+    disagreement_m: float | None
+    refined_m: float | None
+    mounting: Mounting | None
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether neighbouring scans would agree clearly better under other poses."""
+        before, after = self.disagreement_m, self.refined_m
+        return before is not None and after is not None and before > max(POOR_M, 1.5 * after)
+
+
+def measure_poses(
+    points: Callable[[int], NDArray[np.floating]],
+    poses: NDArray[np.float64],
+    seconds: NDArray[np.float64] | None = None,
+) -> PoseQuality:
+    """Measure how well scans agree under their poses, and what explains what they do not agree in.
+
+    Args:
+        points: returns (N, 3) points of the i-th scan on things that stand, metres, in the frame of the sensor.
+        poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
+        seconds: (F,) their times, increasing; None for frames at 10 Hz.
+    """
+    times = np.asarray(_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64)
+    before, after, runs = list[float](), list[float](), list[tuple[int, NDArray[np.float64]]]()
+    numbers = np.arange(len(poses), dtype=np.float64)
+    for first in _choose_runs(poses, times):
+        rows = slice(first, first + _RUN)
+        scans = [ThinnedScan.of(points(row).astype(np.float32), poses[row]) for row in range(len(poses))[rows]]
+        used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
+        was = _mean(disagreement(measured, poses[rows]))
+        found = align(used, poses[rows], poses[rows])
+        now = _mean(disagreement(measured, found))
+        for shift in _SHIFTS:  # of poses that are late, an alignment may not find to the right ones
+            start = slerp(poses, numbers, numbers[rows] + shift)
+            start = multiply(poses[first], invert(start[0]), start)
+            other = align(used, start, start)
+            other_now = _mean(disagreement(measured, other))
+            if other_now < _BETTER * now:
+                found, now = other, other_now
+        before.append(was)
+        after.append(now)
+        if now <= _AGREE_M:
+            runs.append((first, found))
+    if not np.isfinite(before).any():
+        return PoseQuality(None, None, None)
+    return PoseQuality(_mean(np.array(before)), _mean(np.array(after)), find_mounting(poses, times, runs))
+
+
+def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | None:
+    """Return what poses with this mounting look like, and what to do, for a message; None if they need no correction."""
+    wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
+    found, advice = [], "write corrected poses with `carlasc refine`"
+    if wrong[:6].any():
+        place = ", ".join(
+            f"{axis} = {value:.2f} ± {error:.2f} m" if known else f"{axis} undetermined"
+            for axis, value, error, known in zip("xyz", values, errors, mounting.determined, strict=False)
+        )
+        turned = [
+            f"{name} {np.rad2deg(value):.1f} degrees"
+            for name, value, is_wrong in zip(("roll", "pitch", "yaw"), values[3:6], wrong[3:6], strict=True)
+            if is_wrong
+        ]
+        found.append(
+            f"poses that look like those of another point of the vehicle, which have the sensor at about {place}"
+            + (f", turned by {' and '.join(turned)}" if turned else "")
+        )
+        advice = f"write the poses of the sensor: inv(T) @ P @ T, with T the sensor's pose in the frame of the poses (from the calibration), or {advice}"
+    if wrong[6]:
+        when = "late" if values[6] > 0 else "early"
+        frames = abs(values[6]) / period_s
+        found.append(f"poses that are {abs(values[6]):.2f} ± {errors[6]:.2f} s {when} ({frames:.1f} frames)")
+        advice += ", and compare the time stamps of both"
+    return (" and ".join(found), advice) if found else None
+
+
+def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> list[int]:
+    """Return the first rows of up to three runs that do not overlap: the sharpest turns, the greatest changes of speed, the middle."""
+    count = len(poses)
+    if count <= _RUN:
+        return [0] if count > 2 else []
+    motions = multiply(invert(poses[:-1]), poses[1:])
+    cosine = np.clip((motions[:, 0, 0] + motions[:, 1, 1] + motions[:, 2, 2] - 1) / 2, -1, 1)
+    speed = np.sqrt(np.square(motions[:, :3, 3]).sum(axis=1)) / np.maximum(np.diff(seconds), 1e-3)
+    changes = np.abs(speed[_RUN // 3 :] - speed[: -(_RUN // 3)]) if count > _RUN // 3 + 1 else np.zeros(1)
+    chosen: list[int] = []
+    for values in (_LEVER_M * np.arccos(cosine), changes, -np.abs(np.arange(count) - count / 2)):
+        sums = np.convolve(values, np.ones(min(_RUN, len(values))), "valid")
+        for row in np.argsort(-sums, kind="stable")[:: max(1, len(sums) // 50)].tolist():
+            first = min(row, count - _RUN)
+            if all(abs(first - other) >= _RUN for other in chosen):
+                chosen.append(first)
+                break
+    return sorted(chosen)
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else float("nan")

@@ -1,0 +1,137 @@
+"""Poses of another point of the vehicle, and late poses, are told from correct ones on a drive that turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from carlasc.core.geometry import invert, rotation_z, slerp, translation
+from carlasc.inspection.pose_quality import describe_mounting, measure_poses
+from carlasc.motion.mounting import Mounting
+from carlasc.testing import wrong_poses
+from carlasc.testing.drives import SimulatedDrive, Thing
+
+
+class Winding(SimulatedDrive):
+    """A drive that turns left and right, faster and slower, with a curvature of at most 1/15 m."""
+
+    bends = True
+
+    def world_T_vehicle(self, seconds):
+        at = np.asarray(seconds, np.float64)
+        fine = np.linspace(-1.0, 5.0, 6001)
+        speed = self.speed * (1 + 0.4 * np.sin(2.0 * fine))
+        yaw = np.cumsum(speed * np.sin(1.5 * fine)) * 0.001 / 15.0 * self.bends
+        x, y = np.cumsum(speed * np.cos(yaw)) * 0.001, np.cumsum(speed * np.sin(yaw)) * 0.001
+        now = np.interp(at, fine, yaw)
+        poses = np.tile(np.eye(4), (*at.shape, 1, 1))
+        poses[..., 0, 0], poses[..., 0, 1] = np.cos(now), -np.sin(now)
+        poses[..., 1, 0], poses[..., 1, 1] = np.sin(now), np.cos(now)
+        poses[..., 0, 3], poses[..., 1, 3] = np.interp(at, fine, x), np.interp(at, fine, y)
+        return poses
+
+
+def houses(seed=2):
+    rng = np.random.default_rng(seed)
+    for x in range(-15, 60, 7):
+        for side in (-1, 1):
+            middle = (x + rng.uniform(-2, 2), side * rng.uniform(14, 22), 3.0)
+            yield Thing("building", middle, (*rng.uniform(2, 6, 2), 6.0), rng.uniform(0, 3))
+
+
+def record(kind=None, *, rolling=False, frames=40):
+    """Return the points of each scan, and first_T_sensor."""
+    things = tuple(houses())
+    drive = (kind or Winding)(frames=frames, speed=8.0, channels=32, columns=400, things=things, rolling=rolling)
+    poses = drive.world_T_vehicle(drive.times) @ drive.sensors[0].vehicle_T_sensor
+    rng, scans = np.random.default_rng(0), []
+    for frame in range(drive.frames):
+        points = drive.scan(frame).points[:, :3]
+        away = np.linalg.norm(points, axis=1, keepdims=True)
+        scans.append(points * (1 + rng.normal(0, 0.02, away.shape) / away))
+    return scans, invert(poses[0]) @ poses
+
+
+class Straight(Winding):
+    """The same on a straight road."""
+
+    bends = False
+
+
+@pytest.fixture(scope="module")
+def winding():
+    return record()
+
+
+def mounting_of(scans, poses):
+    found = measure_poses(scans.__getitem__, poses)
+    assert found.mounting is not None
+    return found.mounting
+
+
+@pytest.mark.parametrize("jitter_m", [0.0, 0.03])
+def test_correct_poses_need_no_explanation(winding, jitter_m):
+    scans, poses = winding
+    mounting = mounting_of(scans, wrong_poses(poses, jitter_m=jitter_m, jitter_rad=0.002 * bool(jitter_m)))
+    assert not mounting.wrong.any()
+    assert mounting.determined.tolist() == [True, True, False, True, True, True, True]
+    assert (np.abs(mounting.values) < 4 * mounting.errors + 1e-3)[mounting.determined].all()
+    assert describe_mounting(mounting, 0.1) is None
+
+
+def test_scans_that_are_not_corrected_for_motion_raise_no_alarm():
+    assert not mounting_of(*record(rolling=True)).wrong[:6].any()
+
+
+@pytest.mark.parametrize("jitter_m", [0.0, 0.03])
+@pytest.mark.parametrize(
+    ("arm_m", "yaw_deg"), [((0.81, -0.32, -0.8), 0.0), ((-0.6, 0.0, 0.0), 0.0), ((1.0, 0.3, 0.0), 3.0)]
+)
+def test_poses_of_another_point_are_told_where_the_sensor_is(winding, arm_m, yaw_deg, jitter_m):
+    scans, poses = winding
+    stored = wrong_poses(poses @ invert(translation(arm_m) @ rotation_z(np.deg2rad(yaw_deg))), jitter_m=jitter_m)
+    mounting = mounting_of(scans, stored)
+    assert mounting.values[:2] == pytest.approx(arm_m[:2], abs=0.02 if jitter_m == 0 else 0.12)
+    assert np.rad2deg(mounting.values[5]) == pytest.approx(yaw_deg, abs=0.4)
+    assert not mounting.determined[2]
+    assert mounting.wrong[[0, 1, 5]].tolist() == [True, bool(arm_m[1]), bool(yaw_deg)]
+    corrected = mounting.correct(stored, 0.1 * np.arange(len(stored)))
+    off = (invert(corrected[:-10]) @ corrected[10:] - invert(poses[:-10]) @ poses[10:])[:, :2, 3]
+    assert np.abs(off).max() < (0.03 if jitter_m == 0 else 0.25)
+
+
+@pytest.mark.parametrize("late", [-1.0, 0.5, 2.0])
+@pytest.mark.parametrize("kind", [Winding, Straight])
+def test_late_poses_are_told_by_how_much(winding, kind, late):
+    scans, poses = winding if kind is Winding else record(kind)
+    numbers = np.arange(len(poses), dtype=np.float64)
+    mounting = mounting_of(scans, slerp(poses, numbers, numbers - late))
+    assert mounting.values[6] == pytest.approx(0.1 * late, abs=0.01)
+    assert mounting.wrong.tolist() == [False] * 6 + [True]
+
+
+def test_a_straight_drive_shows_no_lever_arm():
+    scans, poses = record(Straight)
+    mounting = mounting_of(scans, poses @ translation((0.8, -0.3, 0.8)))
+    assert not mounting.determined[:3].any() and not mounting.wrong.any()
+    assert mounting.describe()["x"] == "undetermined"
+
+
+def test_a_few_scans_tell_nothing(winding):
+    scans, poses = winding
+    assert measure_poses(scans.__getitem__, poses[:2]).mounting is None
+    assert measure_poses(lambda row: np.empty((0, 3)), poses).disagreement_m is None
+
+
+def test_the_messages_say_what_to_do():
+    def described(**values):
+        names = ("x", "y", "z", "roll", "pitch", "yaw", "late")
+        errors = np.array([0.02, 0.02, 9.0, 0.001, 0.001, 0.001, 0.005])
+        return describe_mounting(Mounting(np.array([values.get(name, 0.0) for name in names]), errors), 0.1)
+
+    late, fix_late = described(late=0.2)
+    assert late == "poses that are 0.20 ± 0.01 s late (2.0 frames)" and "compare the time stamps" in fix_late
+    assert "0.10 ± 0.01 s early" in described(late=-0.1)[0]
+    arm, fix_arm = described(x=0.8, y=-0.3, yaw=np.deg2rad(2.0))
+    assert "at about x = 0.80 ± 0.02 m, y = -0.30 ± 0.02 m, z undetermined, turned by yaw 2.0 degrees" in arm
+    assert "inv(T) @ P @ T" in fix_arm and "carlasc refine" in fix_arm
