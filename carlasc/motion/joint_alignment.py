@@ -203,7 +203,7 @@ def clusters(
 
 def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (G, 3) the normals of the planes in cells, and (G,) their variances across, metres squared, -1 where there is no plane."""
-    enough, covariances = spread_of(found, poses)
+    enough, covariances = spread_of(found, poses, _MIN_SCANS)
     values, vectors = principal_axes(covariances)
     flat = enough & (values[:, 0] < how.thick_m**2) & (values[:, 0] < how.flat * values[:, 1])
     flat &= values[:, 1] > _WIDE_M2
@@ -211,15 +211,15 @@ def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDAr
 
 
 @cached
-def spread_of(found: Clusters, poses: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return (G,) whether a cell has points of enough scans, and (G, 3, 3) the covariance of its points; a scan counts for some points only."""
+def spread_of(found: Clusters, poses: NDArray[np.float64], scans: int) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return (G,) whether a cell has points of so many scans, and (G, 3, 3) the covariance of its points; a scan counts for some points only."""
     start, scan, sums = found
     cells = len(start) - 1
     enough, covariances = np.zeros(cells, np.bool_), np.zeros((cells, 3, 3))
     total, to, center = np.empty(_SUMS), np.empty(3), np.empty(3)
     for g in range(cells):
         first = start[g]
-        if start[g + 1] - first < _MIN_SCANS:
+        if start[g + 1] - first < scans:
             continue
         for a in range(3):  # sums from nearby, so that rounding is small
             center[a] = poses[scan[first], a, 3] + sums[first, 1 + a] / sums[first, 0]

@@ -30,8 +30,10 @@ from carlasc.motion.joint_alignment import (
     blocks,
     cell_key,
     planes,
+    spread_of,
     to_plane,
 )
+from carlasc.motion.solving import principal_axes
 from carlasc.storage.arrays import ArrayFormat, open_npz
 
 MIN_SCANS = 3
@@ -43,8 +45,15 @@ _FORMATS = {
     "before_m": ArrayFormat(("<f8",), (None,)),
     "after_m": ArrayFormat(("<f8",), (None,)),
     "refined": ArrayFormat(("|b1",), (None,)),
+    "fits": ArrayFormat(("|b1",), (None,)),
 }
 _MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that do not fit are thick
+_WALL_M, _WALL_POINTS = 2.0, 8  # size of the cells in which walls are compared, and the fewest points of one
+_TALL_M2, _WIDE_M2 = 0.08, 0.04  # variances of a wall upwards, and along its second axis
+_FEW_WALLS, _COMMON = (
+    200,
+    0.5,
+)  # clusters on walls that tell something, and the share of them that must be flat with those of others
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point is used of each cell of this size
 _PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
@@ -92,6 +101,8 @@ class RefinedPoses:
         before_m: (F,) how far each scan is from the surfaces that its neighbours saw, under the given poses, in metres; NaN where nothing tells.
         after_m: (F,) the same under the refined poses.
         refined: (F,) bool, the scans whose motion is not the given one.
+        fits: (F,) bool, whether walls that one scan saw are walls together with the other scans, or nothing tells; where they are not,
+            the poses are of another drive, or of other frames, and are not refined.
     """
 
     given: NDArray[np.float64]
@@ -99,6 +110,7 @@ class RefinedPoses:
     before_m: NDArray[np.float64]
     after_m: NDArray[np.float64]
     refined: NDArray[np.bool_]
+    fits: NDArray[np.bool_]
 
     def changes(self) -> NDArray[np.float64]:
         """Return (F - 1, 6) by how much the motion from each scan to the next one differs from the given one: metres, then radians, frame of the sensor."""
@@ -152,6 +164,7 @@ def refine_poses(
     """
     count, poses = len(given), given.copy()
     before, after, refined = np.full(count, np.nan), np.full(count, np.nan), np.zeros(count, np.bool_)
+    fits = np.ones(count, np.bool_)
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
     begin = 0
     while begin < count and count >= MIN_SCANS:
@@ -164,19 +177,20 @@ def refine_poses(
                 steps(1)
         first = start
         near, rows = slice(start, last), slice(begin - start, end - start)
-        if begin:  # the correction of the scan before goes on
+        if refined.any():  # the correction of the scan before goes on
             poses[begin:last] = multiply(poses[begin - 1], invert(given[begin - 1]), given[begin:last])
         held = poses[near].copy()
         found = align([scan.used for scan in kept], held, given[near], begin - start)
         measured = [scan.measured for scan in kept]
         before[begin:end] = disagreement(measured, given[near])[rows]
         now = disagreement(measured, found)[rows]
-        chosen = _is_near(held, found) and (always or _is_better(before[begin:end], now))
+        fits[begin:end] = _is_near(held, found) and _fit([scan.used for scan in kept], found)
+        chosen = fits[begin] and (always or _is_better(before[begin:end], now))
         if chosen:
             poses[begin:end], refined[begin:end] = found[rows], True
         after[begin:end] = now if chosen else before[begin:end]
         begin = end
-    return RefinedPoses(given, poses, before, after, refined)
+    return RefinedPoses(given, poses, before, after, refined, fits)
 
 
 def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
@@ -185,6 +199,26 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
         return False
     was, now = float(before[both].mean()), float(after[both].mean())
     return now < min(_BETTER * was, was - _NEARER_M)
+
+
+def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> bool:
+    """Return whether most walls that single scans see are flat together with what the other scans saw there, or there are few walls."""
+    walls = common = 0
+    for found in blocks(points, poses, _WALL_M, shift=0.0):
+        alone = Clusters(np.arange(len(found.scan) + 1), found.scan, found.sums)
+        _, spread = spread_of(alone, poses, 1)
+        is_wall = (found.sums[:, 0] >= _WALL_POINTS) & _is_flat(spread) & (spread[:, 2, 2] > _TALL_M2)
+        shared, together = spread_of(found, poses, MIN_SCANS)
+        cell = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
+        is_wall &= shared[cell]
+        walls += int(is_wall.sum())
+        common += int((is_wall & _is_flat(together)[cell]).sum())
+    return walls < _FEW_WALLS or common > _COMMON * walls
+
+
+def _is_flat(covariances: NDArray[np.float64]) -> NDArray[np.bool_]:
+    values, _ = principal_axes(covariances)
+    return np.asarray((values[:, 0] < 0.1 * values[:, 1]) & (values[:, 1] > _WIDE_M2))
 
 
 def _changes(given: NDArray[np.float64], found: NDArray[np.float64], span: int = 1) -> NDArray[np.float64]:

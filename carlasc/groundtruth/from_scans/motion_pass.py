@@ -312,5 +312,9 @@ def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str
     if refined.refined.any():
         but = f"; those of frames {', '.join(f'{a} to {b}' for a, b in left[:3])} were left alone" if left else ""
         yield f"poses were refined: neighbouring scans disagreed by {100 * before:.1f} cm, now by {100 * after:.1f} cm{but}"
-    elif before > POOR_M:
+    if not refined.fits.all():
+        rows = np.flatnonzero(~refined.fits)
+        where = f"frames {frames[rows[0]]} to {frames[rows[-1]]}"
+        yield f"scans do not fit each other under the poses of {where}, which were not refined: check that these belong to them"
+    elif not refined.refined.any() and before > POOR_M:
         yield f"poses could not be refined, although neighbouring scans disagree by {100 * before:.1f} cm"
