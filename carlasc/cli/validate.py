@@ -137,6 +137,13 @@ def print_held_out(result: HoldoutResult) -> None:
         _print_scores(
             f"{name or result.location}: held-out rays, {result.spec}, {scores.frames} scans left out", scores
         )
+    for name, scores in result.given_poses.items():
+        shares = scores.all
+        figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
+        text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
+        console().print(
+            line(f"{name or result.location}: under the given poses: returns in {text} voxels"), soft_wrap=True
+        )
 
 
 def _print_scores(title: str, scores: HeldOutScores) -> None:

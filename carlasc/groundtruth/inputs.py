@@ -21,7 +21,7 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromScans, Observe, Voting
-from carlasc.groundtruth.reporting.facts import Residual
+from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.running.spreading import Run
@@ -225,6 +225,10 @@ class SequenceInput(ABC):
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return what `prepare` found of each actor, by number; None if no actor is tracked."""
+        return None
+
+    def pose_facts(self) -> PoseFacts | None:
+        """Return how poses were refined; None if they were not to be."""
         return None
 
     def notes(self) -> list[str]:

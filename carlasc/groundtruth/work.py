@@ -305,7 +305,8 @@ class SequenceJob:
         documents = {name: data for name, data in found.items() if data is not None}
         if facts:
             classes, actors = self.inputs.metadata.classes, self.inputs.summaries()
-            report = Report.make(grid, facts, self.params, classes, documents, actors=actors)
+            poses = self.inputs.pose_facts()
+            report = Report.make(grid, facts, self.params, classes, documents, actors=actors, poses=poses)
             writer.write_document(layout.report_file(grid), report.to_json())
 
 

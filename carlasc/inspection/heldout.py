@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import reduce
 from typing import Any
 
@@ -43,6 +43,7 @@ class HoldoutResult:
         spec: geometry of the grids.
         every: one of so many scans was left out.
         sequences: the scores of each sequence, by its path.
+        given_poses: the scores under the given poses, of each sequence whose poses were refined.
         failures: frames that could not be measured.
         elapsed_s: duration, in seconds.
     """
@@ -53,6 +54,7 @@ class HoldoutResult:
     sequences: Mapping[str, HeldOutScores]
     failures: tuple[FrameFailure, ...] = ()
     elapsed_s: float = field(default=0.0, compare=False)
+    given_poses: Mapping[str, HeldOutScores] = field(default_factory=dict)
 
     @property
     def total(self) -> HeldOutScores | None:
@@ -71,6 +73,7 @@ class HoldoutResult:
             "every": self.every,
             "total": None if total is None else total.to_dict(),
             "sequences": {path: scores.to_dict() for path, scores in self.sequences.items()},
+            "given_poses": {path: scores.to_dict() for path, scores in self.given_poses.items()},
             "failures": [asdict(failure) for failure in self.failures],
             "elapsed_s": self.elapsed_s,
         }
@@ -86,6 +89,7 @@ class _HeldOutFrame:
     whole: Sequence
     frame: int
     plan: GridPlan
+    is_used: bool  # whether the poses are those that grids are made with
 
 
 def holdout(
@@ -100,7 +104,8 @@ def holdout(
 ) -> HoldoutResult:
     """Leave every N-th scan out, make the grids at these frames from the other scans, and follow the rays of the scans through them.
 
-    A scan that is left out neither votes nor shows how actors move, in any grid. Frames at the ends of a drive, whose window has less than
+    A scan that is left out neither votes nor shows how actors move, in any grid; it is used only where poses are refined. Where they are, the
+    same frames are measured under the given poses, too. Frames at the ends of a drive, whose window has less than
     80 % of the scans of a whole one, are not measured, unless all windows are so. A frame that cannot be read is reported in the result.
     Nothing is written.
 
@@ -126,21 +131,31 @@ def holdout(
     plan = GridPlan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
     inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
     drives = [_HeldOutDrive.of(sequence, every) for sequence in inputs]
-    steps = RunProgress(run.progress, 0, sum(len(drive.frames) + drive.steps_before for drive in drives))
+    refining = sum(len(sequence.feed.frames) for sequence in inputs if sequence.refines)
+    steps = RunProgress(run.progress, 0, refining + sum(drive.steps for drive in drives))
+    for row, sequence in enumerate(inputs):
+        given = sequence.feed
+        sequence.refine(None, run, steps)
+        if sequence.feed is not given:
+            steps.total += drives[row].steps
+            drives.append(replace(drives[row], is_used=False))
+            drives[row] = _HeldOutDrive.of(sequence, every)
     tasks = [task for drive in drives for task in drive.tasks(run, steps)]
     scores: dict[str, HeldOutScores] = {}
+    before: dict[str, HeldOutScores] = {}
     failures = []
     with closing(run_all(_run_task, tasks, run, lost=_fail)) as results:
         for task, outcome in zip(tasks, results, strict=True):
-            if isinstance(outcome, str):
+            found = scores if task.is_used else before
+            if not isinstance(outcome, str):
+                found[task.path] = found[task.path].merge(outcome) if task.path in found else outcome
+            elif task.is_used:
                 failures.append(FrameFailure(task.whole.location, task.frame, outcome))
-            else:
-                scores[task.path] = scores[task.path].merge(outcome) if task.path in scores else outcome
             steps(1)
     for sequence in inputs:
         scores.setdefault(sequence.path, HeldOutScores.empty(sequence.metadata.classes))
     location = source.location if isinstance(source, Source) else str(source)
-    return HoldoutResult(location, spec, every, scores, tuple(failures), time.perf_counter() - start)
+    return HoldoutResult(location, spec, every, scores, tuple(failures), time.perf_counter() - start, before)
 
 
 @dataclass(frozen=True)
@@ -150,6 +165,7 @@ class _HeldOutDrive:
     inputs: ScanSequence
     feed: ScanFeed
     frames: tuple[int, ...]
+    is_used: bool = True
 
     @classmethod
     def of(cls, inputs: ScanSequence, every: int) -> _HeldOutDrive:
@@ -166,9 +182,9 @@ class _HeldOutDrive:
         return cls(inputs, whole.without(hidden), tuple(measured))
 
     @property
-    def steps_before(self) -> int:
-        """Number of scans that the pass that finds the actors reads."""
-        return self.feed.reads
+    def steps(self) -> int:
+        """Number of scans that are read to find the actors, and of frames."""
+        return self.feed.reads + len(self.frames)
 
     def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
         """Find the actors in the scans that are left, and return a task for each frame to measure."""
@@ -177,8 +193,9 @@ class _HeldOutDrive:
         if feed.needs_actors:
             actors = find_actors(feed, run, steps)
         first, last = feed.options.window
+        path, whole, plan = inputs.path, inputs.feed.sequence, inputs.plan
         return [
-            _HeldOutFrame(inputs.path, feed, actors.between(f + first, f + last), inputs.feed.sequence, f, inputs.plan)
+            _HeldOutFrame(path, feed, actors.between(f + first, f + last), whole, f, plan, self.is_used)
             for f in self.frames
         ]
 

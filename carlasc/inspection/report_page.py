@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.reporting.facts import ActorTrack
+from carlasc.groundtruth.reporting.facts import ActorTrack, PoseFacts
 from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
 from carlasc.inspection.reports import ReportResult
 from carlasc.inspection.texts import fill
@@ -50,6 +51,8 @@ def describe(report: Report) -> list[tuple[str, str]]:
         rows.append(("convergence", f"{changed} ({convergence.frames} frames)"))
     if actors is not None:
         rows.append(("actors", _count(actors)))
+    if report.poses is not None:
+        rows.append(("poses", _poses(report.poses)))
     if report.inferred_share is not None:
         rows.append(("inferred", f"{report.inferred_share:.1%} of the known voxels"))
     if report.holdout is not None:
@@ -71,13 +74,37 @@ def _count(actors: Sequence[ActorTrack]) -> str:
     return f"{len(actors)} that move ({kinds}){middle}"
 
 
+def _poses(facts: PoseFacts) -> str:
+    if facts.before_m is None or facts.after_m is None:
+        return "as given: too few points tell whether scans agree"
+    if not any(facts.changed_m):
+        return f"as given: neighbouring scans agree within {100 * facts.before_m:.1f} cm"
+    text = (
+        f"refined: neighbouring scans disagreed by {100 * facts.before_m:.1f} cm, now by {100 * facts.after_m:.1f} cm"
+    )
+    moved, turned = (
+        ", ".join(f"{scale * value:.{digits}f}" for value in values)
+        for scale, digits, values in ((100.0, 1, facts.changed_m), (180 / math.pi, 2, facts.changed_rad))
+    )
+    text += f"; corrected by {moved} cm along x, y, z and {turned} degrees of roll, pitch, yaw per scan"
+    text += f"; the given height drifts by {100 * facts.height_drift_m:.0f} cm within 100 scans"
+    left = ", ".join(f"{first} to {last}" for first, last in facts.left)
+    return f"{text}; as given in frames {left}" if left else text
+
+
 def _held_out(values: Mapping[str, Any]) -> str:
     rays, swept = values["rays"], values["swept"]["occupied_share"]
     if not rays["returns"]:
         return "none"
     text = f"{rays['returns']} returns: {rays['free']:.2%} in free voxels, {rays['unknown']:.2%} in unknown ones"
     text += f"; {rays['passed_object']:.2%} pass an object before"
-    return text if swept is None else f"{text}; {swept:.2%} of the vehicle's own path is occupied"
+    text += "" if swept is None else f"; {swept:.2%} of the vehicle's own path is occupied"
+    given = values.get("given_poses")
+    return (
+        text
+        if not given
+        else f"{text}; under the given poses {given['free']:.2%} are in free voxels, {given['unknown']:.2%} in unknown ones"
+    )
 
 
 def _section(name: str, report: Report) -> str:

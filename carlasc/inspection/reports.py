@@ -195,7 +195,8 @@ class _ReportMaker:
         classes, params = sequence.classes_of(self.grid), sequence.params(self.grid)
         facts = [result for result in measured if isinstance(result, FrameFacts)]
         actors = None if self.inputs is None else self.inputs.summaries()
-        return Report.make(self.grid, facts, params, classes, documents, actors=actors)
+        poses = None if self.inputs is None else self.inputs.pose_facts()
+        return Report.make(self.grid, facts, params, classes, documents, actors=actors, poses=poses)
 
     def held_out(self, run: Run) -> Mapping[str, Any] | None:
         """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans beside it."""
@@ -211,7 +212,10 @@ class _ReportMaker:
             every=every,
             run=replace(run, progress=None),
         )
-        return None if result.total is None else result.total.to_dict()
+        if result.total is None:
+            return None
+        given = [asdict(scores.all) for scores in result.given_poses.values()]  # of the one sequence
+        return {**result.total.to_dict(), **({"given_poses": given[0]} if given else {})}
 
 
 def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:

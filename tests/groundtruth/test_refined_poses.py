@@ -7,12 +7,16 @@ import json
 import numpy as np
 import pytest
 from helpers.datasets.captures import read_tree
+from typer.testing import CliRunner
 
 import carlasc
 from carlasc import FromScans, GridSpec, Run
+from carlasc.cli import app
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth.from_scans import motion_pass
+from carlasc.inspection import holdout
+from carlasc.inspection.report_page import describe
 from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.storage import FolderSink, Metadata, layout
 from carlasc.testing import KINDS, SimulatedDrive, wrong_poses
@@ -216,3 +220,50 @@ def test_frames_without_a_scan_get_the_correction_of_the_one_before(drive, wrong
     assert np.allclose(poses[5], poses[4] @ invert(wrong[4]) @ wrong[5])
     off = invert(invert(true[:-8]) @ true[8:]) @ invert(poses[:-8]) @ poses[8:]
     assert np.abs(np.delete(off, 5, axis=0)[8:, :3, 3]).max() < 0.03
+
+
+def test_the_report_says_how_poses_were_refined(folder, drive, tmp_path):
+    make(folder)
+    made = next(iter(carlasc.report(folder, run=Run(workers=1)).reports.values()))
+    assert made.poses.before_m > 0.03 and made.poses.after_m < 0.02
+    assert made.poses.changed_m == pytest.approx([0.06 * 2**0.5] * 3, rel=0.5)
+    assert made.poses.changed_rad == pytest.approx([0.004 * 2**0.5] * 3, rel=0.5)
+    assert 0.05 < made.poses.height_drift_m < 0.5 and made.poses.left == ()
+    again = next(iter(carlasc.report(folder, remake=True, run=Run(workers=1)).reports.values()))
+    assert again == made
+    text = dict(describe(made))["poses"]
+    assert (
+        text.startswith("refined: neighbouring scans disagreed by ") and "degrees of roll, pitch, yaw per scan" in text
+    )
+    make(folder, "never", refine="never")
+    reports = carlasc.report(folder, run=Run(workers=1)).reports
+    assert {name.rpartition("/")[2]: report.poses is None for name, report in reports.items()} == {
+        "mine": False,
+        "never": True,
+    }
+    exact = write(drive, tmp_path / "exact", drive[1])
+    make(exact)
+    (report,) = carlasc.report(exact, run=Run(workers=1)).reports.values()
+    assert report.poses.left == ((0, FRAMES - 1),) and report.poses.height_drift_m == 0.0
+    assert dict(describe(report))["poses"].startswith("as given: neighbouring scans agree within ")
+
+
+def test_held_out_rays_get_better_and_are_measured_before_and_after(folder, drive, tmp_path):
+    steps = []
+    run = Run(workers=1, progress=lambda *step: steps.append(step))
+    found = holdout(folder, SPEC, every=8, run=run)
+    (before,), (after,) = found.given_poses.values(), found.sequences.values()
+    assert before.frames == after.frames > 0
+    wrong, right = ((scores.all.free or 0) + (scores.all.unknown or 0) for scores in (before, after))
+    assert right < 0.75 * wrong
+    assert found.to_dict()["given_poses"] and steps[-1][0] == steps[-1][1]
+    exact = holdout(write(drive, tmp_path / "exact", drive[1]), SPEC, every=8, run=Run(workers=1))
+    assert not exact.given_poses
+    make(folder)
+    (report,) = carlasc.report(folder, holdout=True, save=True, run=Run(workers=1)).reports.values()
+    assert report.holdout["given_poses"]["returns"] == report.holdout["rays"]["returns"]
+    assert next(iter(carlasc.report(folder).reports.values())) == report
+    assert "under the given poses" in dict(describe(report))["held-out rays"]
+    result = CliRunner().invoke(app, ["validate", str(folder), "--holdout", "--every", "8", "--workers", "1"])
+    assert "under the given poses: returns in " in result.output
+    assert "scans agree within " in result.output

@@ -205,7 +205,9 @@ def test_executors_give_the_same_scores_and_progress_counts_frames(bare):
     with ThreadPoolExecutor(2) as threads:
         other = holdout(bare, every=3, run=Run(executor=threads, workers=2))
     assert one.to_dict() | {"elapsed_s": 0} == other.to_dict() | {"elapsed_s": 0}
-    assert steps == [(done, 9) for done in range(10)]  # six scans in which actors are found, and three frames
+    assert steps == [
+        (done, 18) for done in range(19)
+    ]  # nine scans for poses, six in which actors are found, three frames
 
 
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_are_measured(tmp_path):

@@ -34,7 +34,7 @@ from carlasc.groundtruth.inputs import (
     scan_fields,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting.facts import Residual
+from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
@@ -183,6 +183,10 @@ class ScanSequence(StoredSequence):
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return what was found of each actor, by number; None if no actor is tracked."""
         return self.actors.summary if self.feed.needs_actors else None
+
+    def pose_facts(self) -> PoseFacts | None:
+        """Return how poses were refined; None if they were not to be."""
+        return None if self.refined is None else PoseFacts.of(self.refined, self.feed.frames)
 
     def record(self) -> dict[str, Any]:
         """Return how scans are merged."""

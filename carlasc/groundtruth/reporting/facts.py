@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
+from carlasc.motion.refinement import RefinedPoses
 from carlasc.storage import layout
 
 _MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured
@@ -142,6 +143,7 @@ def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArra
 POWERS = 24
 """Number of bins of the histogram of votes: 1, 2 to 3, 4 to 7, ..."""
 _DIGEST_BYTES = 16
+_DRIFT = 100  # scans within which a drift of the height is measured
 _SAMPLED = 40  # one of so many frames is also made without a tenth of the scans
 
 
@@ -162,6 +164,41 @@ class Changes:
         """Compare two grids of the same geometry."""
         both = grid.known & other.known
         return cls(int(both.sum()), int((both & (grid.labels != other.labels)).sum()))
+
+
+@dataclass(frozen=True)
+class PoseFacts:
+    """How well neighbouring scans agree, and how their poses were refined.
+
+    Attributes:
+        before_m: mean distance of scans from the surfaces that their neighbours saw, under the given poses, in metres; None if nothing tells.
+        after_m: the same under the poses that were used.
+        changed_m: (x, y, z) root mean square by which the motion from each scan to the next one differs from the given one, in metres on the
+            axes of the sensor.
+        changed_rad: (roll, pitch, yaw) the same of the rotation, in radians.
+        height_drift_m: the most by which the given height runs away from the used one within 100 scans, in metres.
+        left: first and last frame of the stretches that keep the given motion.
+    """
+
+    before_m: float | None
+    after_m: float | None
+    changed_m: tuple[float, float, float]
+    changed_rad: tuple[float, float, float]
+    height_drift_m: float
+    left: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, refined: RefinedPoses, frames: NDArray[np.int64]) -> PoseFacts:
+        """Return the facts of refined poses; `frames` are the numbers of their frames."""
+        x, y, z, roll, pitch, yaw = np.sqrt(np.square(refined.changes()).mean(axis=0)).tolist()
+        off = refined.given[:, 2, 3] - refined.poses[:, 2, 3]
+        windows = np.lib.stride_tricks.sliding_window_view(off, min(_DRIFT, len(off)))
+        left = tuple((int(frames[a]), int(frames[b])) for a, b, changed in refined.stretches() if not changed)
+        means = [
+            float(m[np.isfinite(m)].mean()) if np.isfinite(m).any() else None
+            for m in (refined.before_m, refined.after_m)
+        ]
+        return cls(means[0], means[1], (x, y, z), (roll, pitch, yaw), float(np.ptp(windows, axis=1).max()), left)
 
 
 @dataclass(frozen=True, eq=False)

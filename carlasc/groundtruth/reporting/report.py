@@ -17,7 +17,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.plain import from_plain
 from carlasc.core.versions import carlasc_version
 from carlasc.errors import FormatError, reading
-from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, actors_of, digest_of_bytes
+from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, PoseFacts, actors_of, digest_of_bytes
 from carlasc.storage.files import parse_json, to_json
 
 REPORT_FORMAT = 1
@@ -160,6 +160,7 @@ class Report:
         coverage: known and occupied voxels, and their votes.
         convergence: how grids change if scans are left out; None for grids that are not made from scans.
         actors: moving actors that were tracked; None if none were looked for.
+        poses: how well scans agree, and how their poses were refined; None if they were not to be.
         inferred_share: share of the known voxels that were inferred, not seen; None if the grid does not say.
         holdout: held-out scores, as `carlasc.inspection.HeldOutScores.to_dict` returns them; None if they were not measured.
         digests: digests of each field beside the grid and of the grid, by name.
@@ -173,6 +174,7 @@ class Report:
     coverage: Coverage
     convergence: Convergence | None
     actors: tuple[ActorTrack, ...] | None
+    poses: PoseFacts | None
     inferred_share: float | None
     holdout: Mapping[str, Any] | None
     digests: Mapping[str, Digests]
@@ -189,6 +191,7 @@ class Report:
         documents: Mapping[str, bytes],
         *,
         actors: Sequence[Mapping[str, Any]] | None = None,
+        poses: PoseFacts | None = None,
         holdout: Mapping[str, Any] | None = None,
     ) -> Self:
         """Make a report.
@@ -200,6 +203,7 @@ class Report:
             classes: class table of the grid's labels.
             documents: the text files that belong to the grid, by name.
             actors: what was found of each actor, by number; None if none were looked for.
+            poses: as in the attributes.
             holdout: as in the attributes.
         """
         rows = sorted(facts, key=lambda row: row.frame)
@@ -215,6 +219,7 @@ class Report:
             if changes
             else None,
             actors=None if actors is None else actors_of(actors, (row.residuals for row in rows), classes),
+            poses=poses,
             inferred_share=_inferred(rows),
             holdout=holdout,
             digests={name: _digests(rows, name) for name in names},
@@ -243,6 +248,7 @@ class Report:
             if convergence is None
             else {"left_out": LEFT_OUT, **asdict(convergence), "changed_share": convergence.changed_share},
             "actors": None if self.actors is None else [_plain(actor) for actor in self.actors],
+            "poses": None if self.poses is None else asdict(self.poses),
             "inferred_share": self.inferred_share,
             "holdout": None if self.holdout is None else dict(self.holdout),
             "inputs": {name: value for name, value in digests.items() if not name.startswith(own)},
@@ -277,6 +283,7 @@ class Report:
                 coverage=from_plain(values["coverage"], Coverage, "coverage"),
                 convergence=from_plain(values["convergence"], Convergence | None, "convergence"),
                 actors=from_plain(values["actors"], tuple[ActorTrack, ...] | None, "actors"),
+                poses=from_plain(values["poses"], PoseFacts | None, "poses"),
                 inferred_share=from_plain(values["inferred_share"], float | None, "inferred_share"),
                 holdout=from_plain(values["holdout"], _HeldOut | None, "holdout"),
                 digests={**inputs, **outputs},
