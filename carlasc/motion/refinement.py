@@ -48,26 +48,22 @@ _FORMATS = {
     "fits": ArrayFormat(("|b1",), (None,)),
 }
 _MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that do not fit are thick
-_WALL_M, _WALL_POINTS = 2.0, 8  # size of the cells in which walls are compared, and the fewest points of one
-_TALL_M2, _WIDE_M2 = 0.08, 0.04  # variances of a wall upwards, and along its second axis
-_FEW_WALLS, _COMMON = (
-    200,
-    0.5,
-)  # clusters on walls that tell something, and the share of them that must be flat with those of others
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point is used of each cell of this size
 _PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
-_BETTER, _NEARER_M = 0.9, 0.003  # scans must come nearer to each other by this factor, and by this distance
+_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that do not fit are thick
 _FAR_M = 1e5  # points that are farther away are no returns
-_FARTHEST_M, _FARTHEST_RAD = (
-    0.5,
-    np.deg2rad(3.0),
-)  # a change of the motion from one scan to the next that is greater is no refinement,
-_SPAN, _OFF_M, _OFF_RAD = (
-    10,
-    1.0,
-    np.deg2rad(5.0),
-)  # nor is a greater one over so many scans: such poses are of another drive
+
+# Scans must come nearer to each other by a factor and a distance, or by less if it is so many standard errors; so many scans have one error.
+_BETTER, _NEARER_M = 0.9, 0.003
+_SURE, _SURELY_M, _ERRORS, _ALIKE = 0.95, 0.0005, 2.5, 5
+# A greater change of the motion from one scan to the next, or over some scans, is no refinement: such poses are of another drive.
+_FARTHEST_M, _FARTHEST_RAD = 0.7, np.deg2rad(3.0)
+_SPAN, _OFF_M, _OFF_RAD = 10, 1.0, np.deg2rad(5.0)
+# Nor do poses fit under which too few of the walls that single scans see are flat with what others saw there.
+_WALL_M, _WALL_POINTS = 2.0, 12  # size of the cells, and the fewest points of a wall
+_TALL_M2, _WIDE_M2 = 0.08, 0.04  # its variances upwards, and along its second axis
+_FEW_WALLS, _COMMON = 7, 0.4  # fewer walls per scan tell nothing; and the share of them
 
 
 @dataclass(frozen=True)
@@ -197,8 +193,10 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():
         return False
-    was, now = float(before[both].mean()), float(after[both].mean())
-    return now < min(_BETTER * was, was - _NEARER_M)
+    was, now, gain = float(before[both].mean()), float(after[both].mean()), before[both] - after[both]
+    error = float(gain.std()) * float(np.sqrt(_ALIKE / len(gain)))
+    sure = now < min(_SURE * was, was - _SURELY_M) and was - now > _ERRORS * error
+    return sure or now < min(_BETTER * was, was - _NEARER_M)
 
 
 def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> bool:
@@ -213,7 +211,7 @@ def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> b
         is_wall &= shared[cell]
         walls += int(is_wall.sum())
         common += int((is_wall & _is_flat(together)[cell]).sum())
-    return walls < _FEW_WALLS or common > _COMMON * walls
+    return walls < _FEW_WALLS * len(points) or common > _COMMON * walls
 
 
 def _is_flat(covariances: NDArray[np.float64]) -> NDArray[np.bool_]:
