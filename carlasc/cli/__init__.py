@@ -25,6 +25,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "regrid",
     "convert",
     "label",
+    "refine",
     "export",
     "pack",
     "unpack",

@@ -7,6 +7,8 @@ from .options import FromScans as FromScans
 from .options import GridOptions as GridOptions
 from .options import Observe as Observe
 from .options import Voting as Voting
+from .refining import RefineResult as RefineResult
+from .refining import refine as refine
 from .run import RegridResult as RegridResult
 from .run import regrid as regrid
 from .voting.ballot import Ballot as Ballot

@@ -72,7 +72,7 @@ def preprocessing(facts: Facts) -> list[str]:
     for near, far in sorted(ranges - {(None, None)}, key=str):
         limits = [f"nearer than {near:g} m" if near else "", f"farther than {far:g} m" if far else ""]
         sentences.append(say("ranges", limits=" or ".join(filter(None, limits))))
-    estimated = any(one.metadata.extra.get("poses") == "kiss-icp" for one in facts.sequences.values())
+    estimated = any(str(one.metadata.extra.get("poses")).startswith("kiss-icp") for one in facts.sequences.values())
     return sentences + ([say("estimated_poses")] if estimated else [])
 
 

@@ -1,0 +1,38 @@
+"""`carlasc refine`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import carlasc
+from carlasc.cli.common import Json, echo, place_argument, place_option, print_json
+from carlasc.cli.flags import RunFlags
+from carlasc.cli.grid_flags import PoseFlags
+
+
+def refine(
+    poses: PoseFlags,
+    run: RunFlags,
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")],
+    out: Annotated[str, place_option("-o", "--out", text="Folder of the data set with refined poses.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a copy of SOURCE whose poses were changed so that neighbouring scans agree. SOURCE is not changed.
+
+    Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
+    """
+    options = poses.options()
+    with run.spread("Refining poses", "scans and files") as spread:
+        result = carlasc.refine(source, out, poses=options, overwrite=overwrite, run=spread)
+    if json:
+        print_json(result)
+        return
+    for note in result.notes:
+        echo(note)
+    if result.left_out:
+        echo(f"note: without {', '.join(result.left_out)}, made with other poses")
+    files = f"{result.linked} files linked, {result.files} written"
+    echo(f"{result.out}: poses of {len(result.refined)} of {len(result.sequences)} sequences refined; {files}")

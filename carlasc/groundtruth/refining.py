@@ -1,0 +1,183 @@
+"""Refined poses as those of a data set: a copy of it with another poses.txt, whose other files are hard links to the same bytes."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from hashlib import blake2b
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import invert, multiply
+from carlasc.errors import ArgumentError
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import pose_notes, refine_sequence, with_refined_poses
+from carlasc.groundtruth.from_scans.sequences import check_trajectory, with_estimated_poses
+from carlasc.groundtruth.options import FromScans
+from carlasc.motion.options import PoseOptions
+from carlasc.motion.refinement import RefinedPoses
+from carlasc.running.processes import one_pool
+from carlasc.running.spreading import Run
+from carlasc.storage import as_source, layout
+from carlasc.storage.copying import counter
+from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
+from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.sinks import SequenceWriter
+
+_ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"  # what carlasc.json says of poses, with commas
+
+
+@dataclass
+class RefineResult(CopyResult):
+    """What `refine` did: what writing a copy did, and this.
+
+    Attributes:
+        refined: paths of the sequences whose poses were refined.
+        scans: number of scans whose motion is not the given one.
+        notes: what was done to the poses of each sequence, one line each.
+    """
+
+    refined: list[str] = field(default_factory=list)
+    scans: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def refine(
+    source: str | os.PathLike[str] | Source,
+    out: str | os.PathLike[str],
+    *,
+    poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
+    overwrite: bool = False,
+    run: Run = Run(),  # noqa: B008 (frozen)
+) -> RefineResult:
+    """Write a copy of a data set whose poses were changed so that neighbouring scans agree. The source is not changed.
+
+    Poses that are good already are left as they are. Sequences without scans are left out, and so are grids, which were made with other
+    poses. Files that do not change are hard links to those of the source, where both are folders of one file system: no file of either
+    may be edited in place, which carlasc never does. An interrupted run leaves `<out>.part`; the same call again finishes it.
+
+    Args:
+        source: what has the points: anything that `carlasc.open` takes, or a source.
+        out: the folder to write: a path, or a URL of an object store.
+        poses: where poses come from, and when they are refined. Estimated poses, of sequences that have none, are refined too.
+        overwrite: replace a data set at `out` that `refine` has made.
+        run: how the work is spread. Steps of progress are scans, then files. Each part refines the poses of all sequences.
+
+    Returns:
+        What was written, and what was done to the poses of each sequence.
+
+    Raises:
+        ArgumentError: poses are not to be refined.
+        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
+        MissingDataError: there are no scans, or no poses and `poses` says that they are those of the data.
+        FormatError: poses or times are not valid.
+        DependencyError: poses have to be estimated, and kiss-icp is not installed.
+        StorageError: the files cannot be written.
+    """
+    began = time.perf_counter()
+    if poses.refine == "never":
+        raise ArgumentError("refine", expected="auto or always", found="'never'")
+    source, options = as_source(source), FromScans(poses=poses)
+    given = sequences_with_scans(source)
+    for one in given.values():
+        if not _estimates(one, options):
+            check_trajectory(one, options)
+    copy = DerivedCopy.begin(
+        source,
+        out,
+        {"poses": vars(poses), "texts": _digest(given)},
+        kind="refined poses",
+        is_kind=_is_refined,
+        overwrite=overwrite,
+        run=run,
+    )
+    scans = sum(len(one.frames("points")) for one in given.values())
+    files = sum(len(one.frames(name)) for one in given.values() for name in one.fields() if "/" not in name)
+    progress = run.progress or (lambda done, total: None)
+    step, refined = counter(progress, scans + files), dict[str, _RefinedSequence]()
+    with one_pool(run) as pool:
+        for path, one in given.items():
+            refined[path] = _refine(one, options, copy.writer(path), pool, step)
+        after = replace(pool, progress=lambda done, total: progress(scans + done, scans + total))
+        copied = copy.write(refined, after)
+    return RefineResult(
+        **vars(copied) | {"elapsed_s": time.perf_counter() - began},
+        refined=[path for path, one in refined.items() if one.scans],
+        scans=sum(one.scans for one in refined.values()),
+        notes=[f"{path or one.name or one.location}: {one.note}" for path, one in refined.items()],
+    )
+
+
+class _RefinedSequence(DerivedSequence):
+    """A sequence with refined poses, or with its own ones if they were left alone.
+
+    Attributes:
+        scans: number of scans whose motion is not the given one.
+        note: what was done to the poses, in a line.
+    """
+
+    def __init__(self, whole: Sequence, posed: Sequence, change: RefinedPoses) -> None:
+        estimated = posed is not whole
+        self.scans = int(change.refined.sum())
+        self.note = next(pose_notes(change, whole.frames("points")), None) or _left(change)
+        said = whole.metadata.extra.get("poses")
+        if estimated:
+            said, self.note = _ESTIMATED, f"poses were estimated from the scans ({_ESTIMATED}); {self.note}"
+        words = [] if said is None else [word for word in str(said).split(", ") if word != _LEFT]
+        words += [] if _REFINED in words else [_REFINED if self.scans else _LEFT]
+        metadata = replace(whole.metadata, extra={**whole.metadata.extra, "poses": ", ".join(words)})
+        texts = {layout.METADATA: metadata.to_json()}
+        if self.scans or estimated:
+            texts[layout.POSES] = layout.encode_poses(_poses(posed, change))
+        super().__init__(whole, texts)
+
+
+def _estimates(sequence: Sequence, options: FromScans) -> bool:
+    """Return whether poses are estimated from the scans."""
+    source = options.poses.source
+    return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
+
+
+def _refine(
+    sequence: Sequence, options: FromScans, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
+) -> _RefinedSequence:
+    """Refine the poses of a sequence, or read what an interrupted run kept with `writer`."""
+    posed = with_estimated_poses(sequence) if _estimates(sequence, options) else sequence
+    check_trajectory(posed, options)
+    return _RefinedSequence(sequence, posed, refine_sequence(ScanFeed(posed, options), writer, run, step))
+
+
+def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
+    """Return the lines of poses.txt: that of the first scan stays, as poses are those in the frame of the first one."""
+    if not change.refined.any():
+        return posed.poses
+    frames = posed.frames("points")
+    poses = with_refined_poses(posed, frames, change).poses
+    poses = multiply(change.given[0], invert(change.poses[0]), poses)
+    poses[posed.line_of(int(frames[0]), len(poses), layout.POSES)] = change.given[0]
+    return poses
+
+
+def _left(change: RefinedPoses) -> str:
+    """Return the line that says that poses were left alone."""
+    found = change.before_m[np.isfinite(change.before_m)]
+    if not len(found):
+        return "poses left as they are: nothing tells how far neighbouring scans disagree"
+    return f"poses left as they are: neighbouring scans disagree by {100 * found.mean():.1f} cm"
+
+
+def _is_refined(metadata: Metadata) -> bool:
+    return str(metadata.extra.get("poses")).rpartition(", ")[2] in (_REFINED, _LEFT)
+
+
+def _digest(sequences: Mapping[str, Sequence]) -> str:
+    """Return a digest of the text files of sequences."""
+    digest = blake2b(digest_size=16)
+    for path, one in sequences.items():
+        for name in sorted(name for name in one.documents() if "/" not in name):
+            digest.update(f"{path}/{name}\0".encode(errors="surrogateescape") + one.read_document(name) + b"\0")
+    return digest.hexdigest()
