@@ -17,6 +17,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import pose_notes, refine_sequence, with_refined_poses
 from carlasc.groundtruth.from_scans.sequences import check_trajectory, with_estimated_poses
 from carlasc.groundtruth.options import FromScans
+from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.refinement import RefinedPoses
 from carlasc.running.processes import one_pool
@@ -28,6 +29,7 @@ from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
+_RUN = 60  # scans whose motions are compared to find where the sensor is
 _ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"  # what carlasc.json says of poses, with commas
 
 
@@ -56,7 +58,8 @@ def refine(
 ) -> RefineResult:
     """Write a copy of a data set whose poses were changed so that neighbouring scans agree. The source is not changed.
 
-    Poses that are good already are left as they are. Sequences without scans are left out, and so are grids, which were made with other
+    Poses that are good already are left as they are. Where scans show that poses are those of another point of the vehicle, or late, this is
+    corrected first, as far as the drive determines it. Sequences without scans are left out, and so are grids, which were made with other
     poses. Files that do not change are hard links to those of the source, where both are folders of one file system: no file of either
     may be edited in place, which carlasc never does. An interrupted run leaves `<out>.part`; the same call again finishes it.
 
@@ -120,10 +123,11 @@ class _RefinedSequence(DerivedSequence):
         note: what was done to the poses, in a line.
     """
 
-    def __init__(self, whole: Sequence, posed: Sequence, change: RefinedPoses) -> None:
-        estimated = posed is not whole
-        self.scans = int(change.refined.sum())
+    def __init__(self, whole: Sequence, posed: Sequence, change: RefinedPoses, corrected: str = "") -> None:
+        estimated = posed is not whole and not corrected
+        self.scans = len(change.refined) if corrected else int(change.refined.sum())
         self.note = next(pose_notes(change, whole.frames("points")), None) or _left(change)
+        self.note = f"{corrected}; {self.note}" if corrected else self.note
         said = whole.metadata.extra.get("poses")
         if estimated:
             said, self.note = _ESTIMATED, f"poses were estimated from the scans ({_ESTIMATED}); {self.note}"
@@ -131,7 +135,7 @@ class _RefinedSequence(DerivedSequence):
         words += [] if _REFINED in words else [_REFINED if self.scans else _LEFT]
         metadata = replace(whole.metadata, extra={**whole.metadata.extra, "poses": ", ".join(words)})
         texts = {layout.METADATA: metadata.to_json()}
-        if self.scans or estimated:
+        if self.scans or estimated or corrected:
             texts[layout.POSES] = layout.encode_poses(_poses(posed, change))
         super().__init__(whole, texts)
 
@@ -148,7 +152,34 @@ def _refine(
     """Refine the poses of a sequence, or read what an interrupted run kept with `writer`."""
     posed = with_estimated_poses(sequence) if _estimates(sequence, options) else sequence
     check_trajectory(posed, options)
-    return _RefinedSequence(sequence, posed, refine_sequence(ScanFeed(posed, options), writer, run, step))
+    feed = ScanFeed(posed, options)
+    change = refine_sequence(feed, writer, run, step)
+    mounting = _mounting(feed, change)
+    if mounting is None or not mounting.wrong.any():
+        return _RefinedSequence(sequence, posed, change)
+    seconds = np.array(list(feed.times.values()))
+    mounted = replace(change, poses=mounting.correct(change.given, seconds), refined=np.ones_like(change.refined))
+    corrected = with_refined_poses(posed, feed.frames, mounted)
+    change = refine_sequence(ScanFeed(corrected, options), writer, run)
+    wrong = [
+        f"{name} {value}"
+        for (name, value), is_wrong in zip(mounting.describe().items(), mounting.wrong, strict=True)
+        if is_wrong
+    ]
+    return _RefinedSequence(
+        sequence, corrected, change, f"poses were corrected for the sensor in their frame: {', '.join(wrong)}"
+    )
+
+
+def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
+    """Return where the sensor is in the frame of the given poses, and how late these are; None if nothing tells."""
+    runs = [
+        (row, change.poses[row : min(row + _RUN, last + 1)])
+        for first, last, refined in change.stretches()
+        if refined
+        for row in range(first, last + 1, _RUN)
+    ]
+    return find_mounting(change.given, np.array(list(feed.times.values())), runs)
 
 
 def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:

@@ -55,11 +55,11 @@ class Mounting:
         return self.determined & (np.abs(self.values) > np.maximum(_RELEVANT, _CERTAIN * self.errors))
 
     def correct(self, poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (F, 4, 4) poses of the sensor from given ones and their times: by the values that are wrong."""
+        """Return (F, 4, 4) poses of the sensor from given ones and their times: by the values that are wrong. The first pose stays."""
         values = np.where(self.wrong, self.values, 0.0)
         moved = slerp(poses, seconds, seconds + values[6]) if values[6] else poses
         sensor = multiply(moved, _transform(values))
-        return multiply(invert(sensor[0]), sensor)
+        return multiply(poses[0], invert(sensor[0]), sensor)
 
     def describe(self) -> dict[str, str]:
         """Return each value with its standard error and unit, or "undetermined", by name."""

@@ -8,16 +8,17 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.scenes.winding import record
 from numpy.testing import assert_array_equal
 
 import carlasc
 from carlasc import GridSpec, Run
 from carlasc.captures import Lidar, SimulatedCapture
-from carlasc.core.geometry import invert, multiply
+from carlasc.core.geometry import invert, multiply, slerp, translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.inspection import validate
 from carlasc.motion import PoseOptions
-from carlasc.storage import FolderSink, layout
+from carlasc.storage import FolderSink, Metadata, layout
 from carlasc.storage import open as open_store
 from carlasc.testing import wrong_poses
 
@@ -262,3 +263,21 @@ def test_wrong_arguments_and_wrong_poses_are_refused_before_anything_is_written(
     assert not list(tmp_path.glob("out*"))
     result = carlasc.refine(data, tmp_path / "out", poses=PoseOptions(force=True), run=ALONE)
     assert result.sequences == [ONE, TWO]
+
+
+def test_poses_of_another_point_and_late_ones_are_corrected(tmp_path):
+    scans, true = record(frames=40)
+    numbers = np.arange(len(true), dtype=np.float64)
+    given = slerp(true @ invert(translation((0.81, -0.32, 0.0))), numbers, numbers - 0.5)
+    source, out = tmp_path / "imu", tmp_path / "out"
+    with FolderSink(source).sequence("cartesian") as writer:
+        writer.write_document(layout.POSES, layout.encode_poses(invert(given[0]) @ given))
+        writer.write_document(layout.METADATA, Metadata("right").to_json())
+        for frame, points in enumerate(scans):
+            writer.write("points", frame, np.column_stack([points, np.zeros(len(points))]).astype(np.float32))
+    (note,) = carlasc.refine(source, out, run=Run(workers=1)).notes
+    assert "poses were corrected for the sensor in their frame: x 0.8" in note and "late 0.05" in note
+    (sequence,) = carlasc.open(out).sequences().values()
+    off = invert(invert(true[:-10]) @ true[10:]) @ invert(sequence.poses[:-10]) @ sequence.poses[10:]
+    assert np.abs(off[:, :3, 3]).max() < 0.04
+    assert sequence.metadata.extra["poses"] == "refined"
