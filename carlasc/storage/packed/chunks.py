@@ -64,7 +64,8 @@ class Encoding:
         try:
             if self.codec == "pcodec":
                 # numcodecs does not say how many numbers there were: fewer would leave the rest of `out` as it is.
-                progress = import_extra("pcodec", extra).standalone.simple_decompress_into(bytes(data), out.reshape(-1))
+                # PCodec before 1.1 has `standalone` as a module alone, not as an attribute of the package.
+                progress = import_extra("pcodec.standalone", extra).simple_decompress_into(bytes(data), out.reshape(-1))
                 if progress.n_processed != out.size or not progress.finished:
                     raise ValueError(f"{progress.n_processed} elements instead of {out.size}")
             else:
