@@ -87,7 +87,7 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         yield
     except _UsageError as error:
         path = f"carlasc {command.name}" if error.ctx is None else error.ctx.command_path
-        text = " ".join(error.format_message().split()).rstrip(".")
+        text = " ".join(error.format_message().replace(": Value error, ", ": ").split()).rstrip(".")
         fail(f"{text[:1].lower()}{text[1:]}: see `{path} --help`", WRONG_USAGE)
     except CarlascError as error:
         shown = copy.copy(error)

@@ -54,7 +54,7 @@ def test_regrid_and_convert_have_the_same_grid_options():
         (("info", "--jsn"), "carlasc: no such option: --jsn"),
         (("pack",), "carlasc: missing argument 'SOURCE'"),
         (("stats", "--workers", "0"), "carlasc: invalid value for '--workers'"),
-        (("regrid", "--preset", "finest"), "carlasc: invalid value for '--preset'"),
+        (("regrid", "--preset", "finest"), "carlasc: invalid value for '--preset': 'finest' is not one of 'coarse'"),
         (("regrid", "--res"), "carlasc: option '--res' requires an argument"),
         (("info", "a", "b"), "carlasc: got unexpected extra argument"),
     ],
