@@ -13,8 +13,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from carlasc.core.compiling import fused, inlined, jit
+from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 
@@ -118,3 +119,25 @@ def fast_azimuth(x: float, y: float) -> float:
     angle = math.pi / 2 - angle if steep else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
+
+
+@cached(error_model="python")
+def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (N,) which of (N, 3) cells are different from those before them."""
+    size = 2
+    while size < 2 * len(cells):
+        size *= 2
+    table = np.zeros(size, np.int64)  # 1 + the index of the first row of each cell, at the hash of the cell or after it
+    first = np.zeros(len(cells), np.bool_)
+    for i in range(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        slot = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
+        while True:
+            k = table[slot] - 1
+            if k < 0:
+                table[slot], first[i] = i + 1, True
+                break
+            if cells[k, 0] == x and cells[k, 1] == y and cells[k, 2] == z:
+                break
+            slot = (slot + 1) & (size - 1)
+    return first

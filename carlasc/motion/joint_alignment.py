@@ -36,8 +36,7 @@ _STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
 _PER_DIRECTION = 300  # planes of each direction that are used: more of one add little
 _SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
 _SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
-MIX = np.int64(-7046029254386353131)
-"""Spreads the keys of cells over a hash table."""
+_MIX = np.int64(-7046029254386353131)  # spreads the keys of cells over a hash table
 _BITS = 21  # of the number of a cell along an axis: cells that are so many apart have one key
 
 
@@ -189,7 +188,7 @@ def clusters(
             seen[a] = pose[a, 0] * points[i, 0] + pose[a, 1] * points[i, 1] + pose[a, 2] * points[i, 2]
             at[a] = (seen[a] + pose[a, 3]) / cell_m + shift
         key = cell_key(at[0], at[1], at[2])
-        place = ((key * MIX) >> 20) & (size - 1)
+        place = ((key * _MIX) >> 20) & (size - 1)
         while table[place] >= 0 and keys[table[place]] != key:
             place = (place + 1) & (size - 1)
         if table[place] < 0:

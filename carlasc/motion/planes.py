@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, thin
 from carlasc.motion.solving import principal_axes
@@ -80,28 +81,6 @@ def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
     flat[values[:, 1] < _LINE_M**2] = 0.0
     return vectors[:, :, 0] * np.sqrt(flat)[:, None]
-
-
-@cached(error_model="python")
-def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (N,) which of (N, 3) cells are different from those before them."""
-    size = 2
-    while size < 2 * len(cells):
-        size *= 2
-    table = np.zeros(size, np.int64)  # 1 + the index of the first row of each cell, at the hash of the cell or after it
-    first = np.zeros(len(cells), np.bool_)
-    for i in range(len(cells)):
-        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        slot = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
-        while True:
-            k = table[slot] - 1
-            if k < 0:
-                table[slot], first[i] = i + 1, True
-                break
-            if cells[k, 0] == x and cells[k, 1] == y and cells[k, 2] == z:
-                break
-            slot = (slot + 1) & (size - 1)
-    return first
 
 
 @cached(error_model="python")

@@ -17,18 +17,17 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, transform_points
 from carlasc.errors import reading
 from carlasc.motion.joint_alignment import (
     HALF_BLOCK,
-    MIX,
     POINT_M,
     Clusters,
     Pass,
     align,
     blocks,
-    cell_key,
     planes,
     spread_of,
     to_plane,
@@ -81,7 +80,8 @@ class ThinnedScan:
     @classmethod
     def of(cls, points: NDArray[np.float32], world_T_sensor: NDArray[np.float64]) -> Self:
         """Choose from the (N, 3) points of a scan, metres, those that are static as far as anybody knows."""
-        chosen = points[_first_of_cells(np.ascontiguousarray(points, np.float32), _THIN_M)]
+        near = points[(np.abs(points) < _FAR_M).all(axis=1)]
+        chosen = near[first_of_cells(np.floor(near / np.float32(_THIN_M)).astype(np.int64))]
         x, y, z = np.floor(transform_points(world_T_sensor, chosen) / _PLACE_M).astype(np.int64).T
         measured = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) % _PLACES == 0
         return cls(chosen[~measured], chosen[measured])
@@ -272,24 +272,3 @@ def _add_distances(
                 alone = off[i] * total / (total - weight[i])  # from the plane without this scan
                 result[scan[i], 0] += alone * alone
                 result[scan[i], 1] += 1.0
-
-
-@cached
-def _first_of_cells(points: NDArray[np.float32], cell_m: float) -> NDArray[np.int64]:
-    """Return the indices of the first point of each cell that has one, increasing; points that are not finite are in no cell."""
-    size = 16
-    while size < 2 * len(points):
-        size *= 2
-    table, keys = np.full(size, -1, np.int64), np.empty(len(points), np.int64)
-    chosen, count = np.empty(len(points), np.int64), 0
-    for i in range(len(points)):
-        if not (abs(points[i, 0]) < _FAR_M and abs(points[i, 1]) < _FAR_M and abs(points[i, 2]) < _FAR_M):
-            continue
-        key = cell_key(points[i, 0] / cell_m, points[i, 1] / cell_m, points[i, 2] / cell_m)
-        place = ((key * MIX) >> 20) & (size - 1)
-        while table[place] >= 0 and keys[table[place]] != key:
-            place = (place + 1) & (size - 1)
-        if table[place] < 0:
-            table[place], keys[count], chosen[count] = count, key, i
-            count += 1
-    return chosen[:count].copy()

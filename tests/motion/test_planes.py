@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from carlasc.core.cells import first_of_cells
 from carlasc.core.geometry import invert, rotation_z, thin, transform_points, translation
-from carlasc.motion.planes import Planes, covariances, extend_sums, first_of_cells, nearest_points, nearest_within
+from carlasc.motion.planes import Planes, covariances, extend_sums, nearest_points, nearest_within
 
 CELL_M, MOST, RADIUS_M = 0.15, 1200, 0.5
 
