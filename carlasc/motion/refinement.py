@@ -228,9 +228,10 @@ def _changes(given: NDArray[np.float64], found: NDArray[np.float64], span: int =
 
 def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
     """Return whether no motion changed by more than the poses of a drive can be wrong."""
+    off = found[:, :3, 3] - held[:, :3, 3]
     for span, most_m, most_rad in ((1, _FARTHEST_M, _FARTHEST_RAD), (_SPAN, _OFF_M, _OFF_RAD)):
-        changes = _changes(held, found, span)
-        moved, turned = (np.sqrt(np.square(part).sum(axis=1)) for part in (changes[:, :3], changes[:, 3:]))
+        moved = np.sqrt(np.square(off[span:] - off[:-span]).sum(axis=1))  # in the world: a turn moves nothing
+        turned = np.sqrt(np.square(_changes(held, found, span)[:, 3:]).sum(axis=1))
         if (moved > most_m).any() or (turned > most_rad).any():
             return False
     return True
