@@ -187,7 +187,8 @@ def _without_refused(content: Content) -> Content:
     return {
         name: data
         for name, data in content.items()
-        if not Path(name).name.startswith(".") and (Path(name).parts[0] != TEMPORARY or name == TEMPORARY)
+        if (not Path(name).name.startswith(".") or not name.endswith(".part"))
+        and (Path(name).parts[0] != TEMPORARY or name == TEMPORARY)
     }
 
 

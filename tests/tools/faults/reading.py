@@ -234,8 +234,10 @@ def regrid_again(root: Path, attempt: Attempt) -> None:
 
 
 def tracks_in(root: Path, attempt: Attempt) -> None:
-    """Read the tracks of actors that regrid keeps, which a run that goes on takes for damaged rather than stop."""
+    """Read the actors and the poses that regrid keeps, which a run that goes on takes for damaged rather than stop."""
+    from carlasc.motion.refinement import RefinedPoses
     from carlasc.motion.tracks import MovingActors
 
     for file in sorted(root.rglob("*.npz")):
-        attempt(MovingActors.from_bytes, file.read_bytes() if file.is_file() else b"", str(file))
+        read = RefinedPoses.from_bytes if file.name.startswith("poses") else MovingActors.from_bytes
+        attempt(read, file.read_bytes() if file.is_file() else b"", str(file))
