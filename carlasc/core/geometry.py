@@ -122,6 +122,13 @@ def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.where(leading < 0, -1.0, 1.0)[:, None] * unit
 
 
+def small_motions(motions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 6) the translations and the rotation vectors of (N, 4, 4) motions that turn by a few degrees at most."""
+    m = motions
+    turns = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
+    return np.concatenate([m[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
+
+
 def slerp(poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray[np.floating]) -> NDArray[np.float64]:
     """Interpolate poses in time: positions linearly, rotations by slerp. Outside of the poses, the nearest motion goes on.
 

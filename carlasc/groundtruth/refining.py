@@ -15,7 +15,7 @@ from carlasc.core.geometry import invert, multiply
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import pose_notes, refine_sequence, with_refined_poses
-from carlasc.groundtruth.from_scans.sequences import check_trajectory, with_estimated_poses
+from carlasc.groundtruth.from_scans.sequences import check_trajectory, must_estimate, with_estimated_poses
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
@@ -87,7 +87,7 @@ def refine(
     source, options = as_source(source), FromScans(poses=poses)
     given = sequences_with_scans(source)
     for one in given.values():
-        if not _estimates(one, options):
+        if not must_estimate(one, options):
             check_trajectory(one, options)
     copy = DerivedCopy.begin(
         source,
@@ -140,27 +140,23 @@ class _RefinedSequence(DerivedSequence):
         super().__init__(whole, texts)
 
 
-def _estimates(sequence: Sequence, options: FromScans) -> bool:
-    """Return whether poses are estimated from the scans."""
-    source = options.poses.source
-    return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
-
-
 def _refine(
     sequence: Sequence, options: FromScans, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
 ) -> _RefinedSequence:
     """Refine the poses of a sequence, or read what an interrupted run kept with `writer`."""
-    posed = with_estimated_poses(sequence) if _estimates(sequence, options) else sequence
-    check_trajectory(posed, options)
+    posed = sequence
+    if estimated := must_estimate(sequence, options):
+        posed = with_estimated_poses(sequence)
+        check_trajectory(posed, options)
     feed = ScanFeed(posed, options)
     change = refine_sequence(feed, writer, run, step)
-    mounting = _mounting(feed, change)
+    mounting = None if estimated else _mounting(feed, change)  # estimated poses are those of the sensor
     if mounting is None or not mounting.wrong.any():
         return _RefinedSequence(sequence, posed, change)
     seconds = np.array(list(feed.times.values()))
     mounted = replace(change, poses=mounting.correct(change.given, seconds), refined=np.ones_like(change.refined))
     corrected = with_refined_poses(posed, feed.frames, mounted)
-    change = refine_sequence(ScanFeed(corrected, options), writer, run)
+    change = refine_sequence(feed.under(corrected), writer, run)
     wrong = [
         f"{name} {value}"
         for (name, value), is_wrong in zip(mounting.describe().items(), mounting.wrong, strict=True)
@@ -195,10 +191,10 @@ def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
 
 def _left(change: RefinedPoses) -> str:
     """Return the line that says that poses were left alone."""
-    found = change.before_m[np.isfinite(change.before_m)]
-    if not len(found):
+    before, _ = change.disagreements_m
+    if before is None:
         return "poses left as they are: nothing tells how far neighbouring scans disagree"
-    return f"poses left as they are: neighbouring scans disagree by {100 * found.mean():.1f} cm"
+    return f"poses left as they are: neighbouring scans disagree by {100 * before:.1f} cm"
 
 
 def _is_refined(metadata: Metadata) -> bool:

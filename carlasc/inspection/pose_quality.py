@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import invert, multiply, slerp
 from carlasc.motion.joint_alignment import align
 from carlasc.motion.mounting import Mounting, find_mounting
-from carlasc.motion.refinement import ThinnedScan, disagreement
+from carlasc.motion.refinement import ThinnedScan, disagreement, finite_mean
+from carlasc.storage import layout
 
 POOR_M = 0.03
 """Scans that disagree by more than this have poses that cost quality, if the scans agree better under others."""
@@ -27,7 +28,6 @@ _SHIFTS, _BETTER = (
 )  # frames by which poses are moved for another start, which must be better by this factor
 _AGREE_M = 0.03  # scans that agree within this distance are aligned
 _LEVER_M = 15.0  # a turn counts by what it moves at this distance
-_PERIOD_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -63,21 +63,21 @@ def measure_poses(
         poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
         seconds: (F,) their times, increasing; None for frames at 10 Hz.
     """
-    times = np.asarray(_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64)
+    times = np.asarray(layout.FRAME_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64)
     before, after, runs = list[float](), list[float](), list[tuple[int, NDArray[np.float64]]]()
     numbers = np.arange(len(poses), dtype=np.float64)
     for first in _choose_runs(poses, times):
         rows = slice(first, first + _RUN)
         scans = [ThinnedScan.of(points(row).astype(np.float32), poses[row]) for row in range(len(poses))[rows]]
         used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
-        was = _mean(disagreement(measured, poses[rows]))
+        was = finite_mean(disagreement(measured, poses[rows]))
         found = align(used, poses[rows], poses[rows])
-        now = _mean(disagreement(measured, found))
+        now = finite_mean(disagreement(measured, found))
         for shift in _SHIFTS:  # of poses that are late, an alignment may not find to the right ones
             start = slerp(poses, numbers, numbers[rows] + shift)
             start = multiply(poses[first], invert(start[0]), start)
             other = align(used, start, start)
-            other_now = _mean(disagreement(measured, other))
+            other_now = finite_mean(disagreement(measured, other))
             if other_now < _BETTER * now:
                 found, now = other, other_now
         before.append(was)
@@ -86,7 +86,7 @@ def measure_poses(
             runs.append((first, found))
     if not np.isfinite(before).any():
         return PoseQuality(None, None, None)
-    return PoseQuality(_mean(np.array(before)), _mean(np.array(after)), find_mounting(poses, times, runs))
+    return PoseQuality(finite_mean(np.array(before)), finite_mean(np.array(after)), find_mounting(poses, times, runs))
 
 
 def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | None:
@@ -134,8 +134,3 @@ def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> li
                 chosen.append(first)
                 break
     return sorted(chosen)
-
-
-def _mean(values: NDArray[np.float64]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else float("nan")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp
+from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
 from carlasc.motion.solving import solve_positive
 
 _LAGS = (2, 5, 10, 20)  # scans between the ends of the motions that are compared
@@ -28,6 +28,7 @@ _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # by which derivat
 _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])  # greatest standard error of a known number
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])  # smaller values need no correction
 _CERTAIN = 4.0  # nor do values of fewer standard errors
+_LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # of values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
 
 
@@ -102,9 +103,6 @@ def find_mounting(
     return Mounting(values, np.sqrt(_SAME * np.diag(inverse)))
 
 
-_LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # of values
-
-
 @dataclass(frozen=True)
 class _Motions:
     """The given motions between scans of a run, and the poses that these scans show.
@@ -148,9 +146,7 @@ def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArra
     for part in parts:
         one, other = (slerp(part.found, part.seconds, part.at[:, end] - values[6]) for end in (0, 1))
         between.append(multiply(invert(multiply(invert(mounted), part.given, mounted)), invert(one), other))
-    off = np.concatenate(between)
-    turns = [off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]]
-    return np.concatenate([off[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
+    return small_motions(np.concatenate(between))
 
 
 def _transform(values: NDArray[np.float64]) -> Transform:

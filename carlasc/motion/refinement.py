@@ -9,6 +9,7 @@ clearly less keeps the motion that was given. Over longer times than a stretch t
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import invert, multiply, transform_points
+from carlasc.core.geometry import invert, multiply, small_motions, transform_points
 from carlasc.errors import reading
 from carlasc.motion.joint_alignment import (
     HALF_BLOCK,
@@ -46,7 +47,6 @@ _FORMATS = {
     "refined": ArrayFormat(("|b1",), (None,)),
     "fits": ArrayFormat(("|b1",), (None,)),
 }
-_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that do not fit are thick
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point is used of each cell of this size
 _PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
@@ -111,6 +111,16 @@ class RefinedPoses:
     def changes(self) -> NDArray[np.float64]:
         """Return (F - 1, 6) by how much the motion from each scan to the next one differs from the given one: metres, then radians, frame of the sensor."""
         return _changes(self.given, self.poses)
+
+    @property
+    def disagreements_m(self) -> tuple[float | None, float | None]:
+        """The means of `before_m` and `after_m`; None where nothing tells."""
+        before, after = (None if math.isnan(m := finite_mean(v)) else m for v in (self.before_m, self.after_m))
+        return before, after
+
+    def left(self, frames: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
+        """Return the first and the last frame of each stretch that was not refined; `frames` are the numbers of the scans."""
+        return tuple((int(frames[a]), int(frames[b])) for a, b, changed in self.stretches() if not changed)
 
     def stretches(self) -> Iterator[tuple[int, int, bool]]:
         """Yield (first, last, whether refined) of runs of scans, as rows."""
@@ -221,9 +231,7 @@ def _is_flat(covariances: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def _changes(given: NDArray[np.float64], found: NDArray[np.float64], span: int = 1) -> NDArray[np.float64]:
     before, after = (multiply(invert(poses[:-span]), poses[span:]) for poses in (given, found))
-    off = multiply(invert(before), after)
-    turns = [off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]]
-    return np.concatenate([off[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
+    return small_motions(multiply(invert(before), after))
 
 
 def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
@@ -235,6 +243,12 @@ def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
         if (moved > most_m).any() or (turned > most_rad).any():
             return False
     return True
+
+
+def finite_mean(values: NDArray[np.float64]) -> float:
+    """Return the mean of the values that are finite; NaN if none is."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else math.nan
 
 
 def disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -209,24 +209,34 @@ def _other_data(where: str, frame: int) -> ConflictError:
     )
 
 
-def derived_key(sequence: Sequence, frames: NDArray[np.int64], **settings: Any) -> str:
-    """Return a digest of settings and of a sequence, by which what is derived of it is kept: its actors, or its refined poses.
-
-    Poses, times, and the contents of 16 scans count, so that long drives need not be read: if others are replaced, that is not noticed.
-    """
-    about = {
-        **settings,
-        "frames": frames.tolist(),
-        "poses": sha256(sequence.poses.tobytes()).hexdigest(),
-        "times": sequence.times.tolist() if layout.TIMES in sequence.documents() else None,
-    }
-    digest = sha256(to_json(about))
+def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
+    """Return a digest of 16 of the scans of a sequence, so that long drives need not be read: if others are replaced, that is not noticed."""
+    digest = sha256()
     for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
         for name in sorted(sequence.fields() & layout.SCAN_FIELDS.keys()):
             if frames[row] in sequence.frames(name):
                 with suppress(CarlascError):  # one that cannot be read is reported when its grid is made
                     digest.update(np.ascontiguousarray(sequence.read(name, int(frames[row]))).tobytes())
     return digest.hexdigest()
+
+
+def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **settings: Any) -> str:
+    """Return a digest of settings, poses, times and scans, by which what is derived of a sequence is kept: its actors, or its refined poses.
+
+    Args:
+        sequence: the sequence.
+        frames: numbers of its frames with scans.
+        scans: as `scans_digest` returns it.
+        **settings: what else the result depends on.
+    """
+    about = {
+        **settings,
+        "frames": frames.tolist(),
+        "scans": scans,
+        "poses": sha256(sequence.poses.tobytes()).hexdigest(),
+        "times": sequence.times.tolist() if layout.TIMES in sequence.documents() else None,
+    }
+    return sha256(to_json(about)).hexdigest()
 
 
 def read_derived(

@@ -36,6 +36,7 @@ from carlasc.motion import (
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, SequenceView
+from carlasc.storage.resuming import scans_digest
 
 _SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground
@@ -119,6 +120,18 @@ class ScanFeed:
         What the vehicle itself drove through is no evidence either.
         """
         return ScanFeed(WithoutScans(self.sequence, hidden), replace(self.options, own_path=False))
+
+    def under(self, sequence: Sequence) -> ScanFeed:
+        """Return the same scans under other poses, which `sequence` has."""
+        other = ScanFeed(sequence, self.options)
+        if "digest" in vars(self):
+            other.digest = self.digest
+        return other
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of some scans, by which what was derived of the sequence is known again."""
+        return scans_digest(self.sequence, self.frames)
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
@@ -277,11 +290,7 @@ class ScanFeed:
     def static_points(self, frame: int) -> NDArray[np.float32]:
         """Return the (N, 3) points of a scan whose class cannot move, all of them without labels, metres, sensor frame."""
         scan = self.sequence.scan(frame, ("labels", "origins"))
-        origins = scan.others.get("origins")
-        seen = scan.points if origins is None else scan.points - origins
-        with np.errstate(invalid="ignore", over="ignore"):
-            distance = np.sqrt(np.square(seen).sum(axis=1))
-            static = (distance >= self.min_range_m) & (distance <= self.max_range_m)
+        static = self._in_range(scan)
         if scan.labels is not None:
             static &= ~np.isin(scan.labels, sorted(self.classes.movable))
         return np.ascontiguousarray(scan.points[static], np.float32)
@@ -334,13 +343,19 @@ class ScanFeed:
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
         origins = scan.others.get("origins")
-        distance = np.sqrt(np.square(scan.points if origins is None else scan.points - origins).sum(axis=1))
-        voting = (labels > 0) & (distance >= self.min_range_m) & (distance <= self.max_range_m)
+        voting = (labels > 0) & self._in_range(scan)
         if origins is None:
             return scan.select(voting)
         check_finite(origins, f"{self.sequence.location}: origins of frame {frame}")
         order = sorted_by_origin(origins)
         return scan.select(order[voting[order]])
+
+    def _in_range(self, scan: Scan) -> NDArray[np.bool_]:
+        """Return (N,) which points are neither too near to where their rays began nor too far away; those that are not finite are not."""
+        origins = scan.others.get("origins")
+        with np.errstate(invalid="ignore", over="ignore"):
+            distance = np.sqrt(np.square(scan.points if origins is None else scan.points - origins).sum(axis=1))
+            return (distance >= self.min_range_m) & (distance <= self.max_range_m)
 
     def _with_ground(self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:
         """Return labels in which geometry without a class that lies on the ground has a ground class, so that it votes as ground does."""

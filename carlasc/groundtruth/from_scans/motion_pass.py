@@ -44,10 +44,9 @@ from carlasc.storage.sinks import SequenceWriter
 
 TRACKS, POSES = "tracks", "poses"
 """What the files that keep actors and refined poses are called, in the folder of what is derived."""
-POOR_M = 0.04
-"""Scans that disagree by more than this, in metres, have poses that cost quality."""
 
 _VERSIONS = {TRACKS: 1, POSES: 1}  # of the methods: they change only when the same input gives another result
+_NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece
 _BLOCK = 100  # frames whose evidence is found in one piece
@@ -287,7 +286,7 @@ class _ThinScan:
 
 def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
     ranges = [feed.min_range_m, str(feed.max_range_m)]
-    return derived_key(feed.sequence, feed.frames, version=_VERSIONS[name], range_m=ranges, **settings)
+    return derived_key(feed.sequence, feed.frames, feed.digest, version=_VERSIONS[name], range_m=ranges, **settings)
 
 
 def with_refined_poses(sequence: StoredScans, frames: NDArray[np.int64], refined: RefinedPoses) -> StoredScans:
@@ -301,14 +300,10 @@ def with_refined_poses(sequence: StoredScans, frames: NDArray[np.int64], refined
     return sequence.with_poses(poses)
 
 
-def _mean(values: NDArray[np.float64]) -> float:
-    return float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else 0.0
-
-
 def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str]:
     """Yield what the refinement did, in a line: nothing if the given poses are good, and were left alone."""
-    before, after = (_mean(values) for values in (refined.before_m, refined.after_m))
-    left = [(int(frames[first]), int(frames[last])) for first, last, changed in refined.stretches() if not changed]
+    before, after = (value or 0.0 for value in refined.disagreements_m)
+    left = refined.left(frames)
     if refined.refined.any():
         but = f"; those of frames {', '.join(f'{a} to {b}' for a, b in left[:3])} were left alone" if left else ""
         yield f"poses were refined: neighbouring scans disagreed by {100 * before:.1f} cm, now by {100 * after:.1f} cm{but}"
@@ -316,5 +311,5 @@ def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str
         rows = np.flatnonzero(~refined.fits)
         where = f"frames {frames[rows[0]]} to {frames[rows[-1]]}"
         yield f"scans do not fit each other under the poses of {where}, which were not refined: check that these belong to them"
-    elif not refined.refined.any() and before > POOR_M:
+    elif not refined.refined.any() and before > _NOTED_M:
         yield f"poses could not be refined, although neighbouring scans disagree by {100 * before:.1f} cm"

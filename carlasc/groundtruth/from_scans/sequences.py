@@ -124,9 +124,9 @@ class ScanSequence(StoredSequence):
     @cached_property
     def estimates_poses(self) -> bool:
         """Whether poses are estimated from the scans: if that is asked for, or if the sequence has none but those of an earlier run."""
-        source, sequence, grid = self.options.poses.source, self.sequence, self.plan.grid
-        if source != "auto" or layout.POSES not in sequence.documents():
-            return source != "file"
+        sequence, grid = self.sequence, self.plan.grid
+        if self.options.poses.source != "auto" or must_estimate(sequence, self.options):
+            return must_estimate(sequence, self.options)
         record = sequence.params(grid).get(RECORD) if grid in sequence.grids else None
         return isinstance(record, dict) and record.get("poses") == "kiss-icp"
 
@@ -175,10 +175,9 @@ class ScanSequence(StoredSequence):
         """Refine the poses, or read what an earlier run kept with `writer`; the feed then has the refined poses."""
         if not self.refines:
             return
-        feed = ScanFeed(self.posed, self.options)
-        self.refined = refine_sequence(feed, writer, run, steps)
+        self.refined = refine_sequence(self.feed, writer, run, steps)
         if self.refined.refined.any():
-            self.feed = ScanFeed(with_refined_poses(self.posed, feed.frames, self.refined), self.options)
+            self.feed = self.feed.under(with_refined_poses(self.posed, self.feed.frames, self.refined))
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return what was found of each actor, by number; None if no actor is tracked."""
@@ -275,6 +274,12 @@ def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, opti
     if not chosen:
         raise MissingDataError(source, expected="sequences with scans (velodyne/)", found="none")
     return [ScanSequence(sequence, plan, options) for sequence in chosen]
+
+
+def must_estimate(sequence: Sequence, options: FromScans) -> bool:
+    """Return whether poses are estimated from the scans: if that is asked for, or if the sequence has none and may do without."""
+    source = options.poses.source
+    return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
 
 
 def with_estimated_poses(sequence: Sequence) -> Sequence:

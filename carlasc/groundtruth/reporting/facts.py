@@ -193,12 +193,8 @@ class PoseFacts:
         x, y, z, roll, pitch, yaw = np.sqrt(np.square(refined.changes()).mean(axis=0)).tolist()
         off = refined.given[:, 2, 3] - refined.poses[:, 2, 3]
         windows = np.lib.stride_tricks.sliding_window_view(off, min(_DRIFT, len(off)))
-        left = tuple((int(frames[a]), int(frames[b])) for a, b, changed in refined.stretches() if not changed)
-        means = [
-            float(m[np.isfinite(m)].mean()) if np.isfinite(m).any() else None
-            for m in (refined.before_m, refined.after_m)
-        ]
-        return cls(means[0], means[1], (x, y, z), (roll, pitch, yaw), float(np.ptp(windows, axis=1).max()), left)
+        drift = float(np.ptp(windows, axis=1).max())
+        return cls(*refined.disagreements_m, (x, y, z), (roll, pitch, yaw), drift, refined.left(frames))
 
 
 @dataclass(frozen=True, eq=False)
