@@ -32,6 +32,7 @@ GROUPS = {  # name -> module, function, and its first arguments
     "inspection": ("measuring.benchmarks", "measure_file"),
     "votes_file": ("measuring.benchmarks", "measure_file"),
     "merging": ("measuring.benchmarks", "measure_file"),
+    "poses": ("measuring.benchmarks", "measure_file"),
     "converting": ("measuring.benchmarks", "measure_file"),
     "rendering": ("measuring.benchmarks", "measure_file"),
     "startup": ("measuring.benchmarks", "measure_file"),

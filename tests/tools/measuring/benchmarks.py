@@ -62,6 +62,12 @@ FILES: dict[str, dict[str, Row]] = {
         for res, name in ((0.4, "coarse"), (0.2, "fine"), (0.1, "finest"))
         for kind in ("grid", "and evidence")
     },
+    "poses": {
+        f"test_poses_of_a_drive[{name}]": Row(
+            f"poses.{name.lower()}", "s", f"refining the poses of 60 scans of 28,800 rays, {name}: processor time"
+        )
+        for name in ("carlasc", "Open3D")
+    },
     "converting": {
         "test_bench_copy": Row("convert.copy", "ms", "copying the files of a scan", 8),
         "test_bench_convert": Row("convert.scan", "ms", "convert kitti --flow none --grids none, per scan", 8),
@@ -112,6 +118,10 @@ _RATIOS = {  # key -> slower, faster
 }
 
 
+_BESIDE = {  # what a benchmark says beside its time -> ending of the key, unit, what it is
+    "peak_mb": ("memory", "MB", "peak of what Python allocates"),
+    "error_cm": ("error", "cm", "what is left of the errors of motions over 30 scans"),
+}
 _COMPARED = ("votes", "metrics")  # files with ratios: they run several times, so that what is compared takes turns
 
 
@@ -122,21 +132,22 @@ def measure_file(name: str, size: Size, folder: Path) -> Iterator[tuple[str, Fig
         RuntimeError: a benchmark failed; the figures of the others were yielded before.
     """
     least: dict[str, float] = {}
-    memory: dict[str, float] = {}
+    beside: dict[str, dict[str, float]] = {}
     problems = []
     for turn in range(size.runs if name in _COMPARED else 1):  # every benchmark comes again in each
         found, problem = _run(name, size, folder / f"{turn}.json")
         problems += filter(None, [problem])
         for one in found:
             least[one["name"]] = min(one["stats"]["min"], least.get(one["name"], float("inf")))
-            memory[one["name"]] = one["extra_info"].get("peak_mb", 0)
+            beside[one["name"]] = one["extra_info"]
     figures = {}
     for test, row in FILES[name].items():
         if test in least:
             scale = {"ms": 1e3, "s": 1.0}[row.unit] / row.count
             figures[row.key] = Figure(least[test] * scale, row.unit, f"{row.what}: least time")
-        if memory.get(test):
-            figures[f"{row.key}.memory"] = Figure(memory[test], "MB", f"{row.what}: peak of what Python allocates")
+        for key, (ending, unit, what) in _BESIDE.items():
+            if beside.get(test, {}).get(key):
+                figures[f"{row.key}.{ending}"] = Figure(beside[test][key], unit, f"{row.what}: {what}")
     for key, (slower, faster) in _RATIOS.items():
         if {slower, faster} <= figures.keys():
             figures[key] = ratio(figures[slower], figures[faster], f"{slower} / {faster}")
