@@ -29,6 +29,7 @@ _NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
 _BACKWARDS_S = 12.0  # an actor that starts is looked for in the scans of this time before
 _FARTHEST_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
 _GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
+_OTHER_CLASS = 1.0  # cost of a class that is not that of the sighting before: its label may be wrong
 _LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
 _STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
 
@@ -71,9 +72,10 @@ def is_fast(flow: NDArray[np.floating], min_speed_m_s: float = MIN_SPEED_M_S) ->
 def segment_by_flow(
     frame: int, scan: Scan, world_T_sensor: Transform, *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> list[Segment]:
-    """Group the moving points of a scan into actors: points that are close together, of one class and with one velocity.
+    """Group the moving points of a scan into actors: points that are close together and have one velocity.
 
-    Two actors side by side with the same velocity may become one segment, which moves in the same way.
+    Two actors side by side with the same velocity may become one segment, which moves in the same way. Classes do not separate actors,
+    because labels may be wrong.
 
     Args:
         frame: frame number.
@@ -92,11 +94,11 @@ def segment_by_flow(
     points = transform_points(world_T_sensor, scan.points[moving])
     velocity = rotate_vectors(world_T_sensor, scan.flow[moving])
     labels = scan.labels[moving].astype(np.int64)
-    actor = _join(points, velocity, labels)
+    actor = _join(points, velocity)
     return [
         Segment(
             frame,
-            int(labels[own[0]]),
+            int(np.bincount(labels[own]).argmax()),
             moving[own],
             points[own],
             np.median(velocity[own], axis=0),
@@ -196,26 +198,21 @@ def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return [parts[i] for i in np.argsort(first)]
 
 
-def _join(points: NDArray[np.float64], velocity: NDArray[np.float64], labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the component number of each point: neighbouring cells of one class and one velocity are joined."""
-    keys = np.concatenate(
-        [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S), labels[:, None]], axis=1
-    ).astype(np.int64)
+def _join(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the component number of each point: neighbouring cells of one velocity are joined."""
+    keys = np.concatenate([np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S)], axis=1).astype(
+        np.int64
+    )
     _, cell = np.unique(keys, axis=0, return_inverse=True)
     count = np.bincount(cell)
     center = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], axis=1) / count[:, None]
     speed = np.stack([np.bincount(cell, velocity[:, a]) for a in range(3)], axis=1) / count[:, None]
-    kind = labels[np.unique(cell, return_index=True)[1]]
     offset = center[:, None] - center[None]
     ahead = speed / np.maximum(np.linalg.norm(speed, axis=1), 1e-9)[:, None]
     along2 = np.square(np.einsum("ijk,ik->ij", offset, ahead))
     across2 = np.square(offset).sum(axis=2) - along2
     near = (along2 < _REACH_M**2) & (across2 < _BESIDE_M**2)
-    joined = (
-        (kind[:, None] == kind[None])
-        & (near | near.T)
-        & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
-    )
+    joined = (near | near.T) & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
     component = np.arange(len(count))
     while True:  # each cell takes the lowest number among those it is joined with, until nothing changes
         lowest = np.where(joined, component[None], len(count)).min(axis=1)
@@ -231,8 +228,8 @@ Chain = list[Segment]
 class Linker:
     """Links segments, scan by scan.
 
-    Numbered actors are linked by their numbers, others by prediction: a segment continues the chain of its class whose predicted position
-    is nearest to it, also after the actor was hidden for some time.
+    Numbered actors are linked by their numbers, others by prediction: a segment continues the chain whose predicted position is nearest to
+    it, one of its class rather than another, also after the actor was hidden for some time.
     """
 
     def __init__(self) -> None:
@@ -328,7 +325,7 @@ def _is_slow(segment: Segment) -> bool:
 
 def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
     """Return how much a segment differs from the prediction of its predecessor; None if it cannot be the same actor."""
-    if last.label != segment.label or last.velocity is None or segment.velocity is None:
+    if last.velocity is None or segment.velocity is None:
         return None
     change = float(np.linalg.norm(segment.velocity - last.velocity, axis=0))
     predicted = last.points + (last.velocity + segment.velocity) / 2 * elapsed_s
@@ -340,4 +337,4 @@ def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
     if distance > _GATE_M or change > _LINKED_M_S:
         return None
     offset = float(np.linalg.norm(predicted.mean(axis=0) - segment.center, axis=0))
-    return distance + change + 0.1 * offset
+    return distance + change + 0.1 * offset + (last.label != segment.label) * _OTHER_CLASS

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -25,6 +26,7 @@ from carlasc.groundtruth.voting.certainty import (
     matter_of,
     probability,
 )
+from carlasc.groundtruth.voting.consensus import ClassConsensus, agree
 from carlasc.groundtruth.voting.kernel import mark
 from carlasc.motion import BODY_MARGIN_M, Track
 from carlasc.motion.tracks import MovingActors
@@ -70,7 +72,8 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     del ballot  # its memory is needed by the next ones
     if plan.rule != "ray":
         return MergedFrame(votes.to_grid(), votes)
-    made = steps.decide_seen(votes)
+    consensus = None if options.dynamic == "tube" else agree(votes.occupied, plan.spec, classes)
+    made = steps.decide_seen(votes, consensus)
 
     # What rays beside a body, or of other times, saw as free says nothing of these voxels.
     contested = steps.contested()
@@ -83,7 +86,7 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
         completing.append(merger.mirrored(now, window, bodies))
         if options.complete == "body":
             completing.append(merger.shells(now, bodies))
-    completed = [(_NO_VOXELS, votes.occupied)]
+    completed = list[tuple[NDArray[np.int64], NDArray[Any]]]()
     for observations in completing:
         completions = steps.vote(observations).votes(copy=False)
         completed.append(steps.complete(made, completions))
@@ -98,9 +101,23 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
     if made.occupied is None or views is None:
         return MergedFrame(grid, votes)
-    inferred, hits = (np.concatenate(parts) for parts in zip(*completed, strict=True))
-    flags, shares = steps.flags(inferred, contested), class_shares(hits, classes)
+    inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
+    flags, shares = steps.flags(inferred, contested), _join_shares(votes, consensus, completed, classes)
     return MergedFrame(grid, votes, VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views))
+
+
+def _join_shares(
+    votes: Votes,
+    consensus: ClassConsensus | None,
+    completed: list[tuple[NDArray[np.int64], NDArray[Any]]],
+    classes: ClassTable,
+) -> NDArray[Any]:
+    """Return the shares of classes: those that scans agree on, and of voxels that were completed those of the votes for them."""
+    seen = class_shares(votes.occupied, classes) if consensus is None else consensus.shares
+    later = [class_shares(hits, classes) for _, hits in completed]
+    taken = np.concatenate([_NO_VOXELS, *(hits["voxel"] for hits in later)])
+    joined = np.concatenate([seen[~np.isin(seen["voxel"], taken)], *later])
+    return joined[np.argsort(joined["voxel"], kind="stable")]
 
 
 @dataclass(frozen=True)
@@ -172,10 +189,12 @@ class _FrameSteps:
         """(V,) bool, the voxels of these regions."""
         return self.regions.of_voxel != STATIC
 
-    def decide_seen(self, votes: Votes) -> _UnfinishedGrid:
-        """Return what the votes for the static scene and in the actors' bodies say."""
+    def decide_seen(self, votes: Votes, consensus: ClassConsensus | None) -> _UnfinishedGrid:
+        """Return what the votes for the static scene and in the actors' bodies say, with the classes that scans agree on."""
         evidence = self.plan.needs_evidence
         labels, hits = votes.elect_occupied()
+        if consensus is not None:
+            labels = consensus.labels.copy()
         free = votes.free.reshape(-1)
         found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
         labels[found.voxels] = self._decide(found)

@@ -169,20 +169,27 @@ class PreparedScan:
         return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, rays)
 
     def observations(
-        self, grid_T_world: Transform, hits: NDArray[np.bool_] | None = None, *, free_region: int | None = None
+        self,
+        grid_T_world: Transform,
+        hits: NDArray[np.bool_] | None = None,
+        *,
+        labels: NDArray[np.uint16] | None = None,
+        free_region: int | None = None,
     ) -> Iterator[Observation]:
         """Yield the votes of the scan: one observation for each place where rays began.
 
         Args:
             grid_T_world: (4, 4).
             hits: (N,) bool, points that vote for their class; None: all.
+            labels: (N,) the classes that they vote for; None: their own.
             free_region: region of the grid in which rays vote; None for the whole grid.
         """
+        labels = self.labels if labels is None else labels
         for rays in self.rays:
             pose = grid_T_world @ self.world_T_sensor
             yield Observation(
                 rays.points,
-                self.labels[rays.part],
+                labels[rays.part],
                 pose if len(self.rays) == 1 and not rays.sensor_T_place[:3, 3].any() else pose @ rays.sensor_T_place,
                 None if hits is None else hits[rays.part],
                 free_region=free_region,
@@ -204,11 +211,13 @@ class Merger:
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         self._static: dict[int, NDArray[np.bool_]] = {}
+        self._labels: dict[int, NDArray[np.uint16]] = {}
         self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
 
     def forget_before(self, frame: int) -> None:
         """Remove what is kept of scans before a frame."""
         self._static = {key: value for key, value in self._static.items() if key >= frame}
+        self._labels = {key: value for key, value in self._labels.items() if key >= frame}
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
     def observations(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
@@ -227,7 +236,9 @@ class Merger:
             scan, own = self.scan_of(other), other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
             hits = None if everything else self.static(other)
-            yield from scan.observations(grid_T_world, hits, free_region=None if own else STATIC)
+            yield from scan.observations(
+                grid_T_world, hits, labels=self.labels(other), free_region=None if own else STATIC
+            )
         for region, number in bodies.items():
             pose = self.actors.tracks[number].pose(now.frame)
             if pose is None:
@@ -269,7 +280,7 @@ class Merger:
             moving = ~self.static(other)
             if other != now.frame and moving.any():
                 pose = now.grid_T_world @ scan.world_T_sensor
-                yield Observation(scan.points[moving], scan.labels[moving], pose, free_region=NOWHERE)
+                yield Observation(scan.points[moving], self.labels(other)[moving], pose, free_region=NOWHERE)
 
     def recent(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
         """Yield the scans of the instant: those just before and after the frame."""
@@ -300,6 +311,15 @@ class Merger:
             self._static[frame] = static
         return self._static[frame]
 
+    def labels(self, frame: int) -> NDArray[np.uint16]:
+        """Return (N,) the classes that the points of a scan vote for: all points of an actor for the class that most of them have in all scans."""
+        if frame not in self._labels:
+            labels = self.scan_of(frame).labels.copy()
+            for track in self.actors.tracks.values() if self.dynamic == "align" else ():
+                labels[track.members.get(frame, [])] = track.label
+            self._labels[frame] = labels
+        return self._labels[frame]
+
     def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
         """Return a scan's rays through an actor's body, in the actor's frame; none if it had another shape then."""
         track = self.actors.tracks[number]
@@ -314,6 +334,6 @@ class Merger:
                 actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
                 crossing = rays.through(actor_T_place, track.lower, track.upper)
                 if len(crossing):
-                    labels, hits = scan.labels[rays.part][crossing], own[rays.part][crossing]
+                    labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
                     found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
         return self._carried.setdefault((number, other), tuple(found))

@@ -26,7 +26,7 @@ from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
-OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64)])
+OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64), ("voters", np.int32)])
 
 
 @dataclass(frozen=True)
@@ -244,8 +244,8 @@ class Votes:
         spec: the grid.
         classes: class table of the labels.
         free: (X, Y, Z) unsigned integer, votes for free space.
-        occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0); one row
-            per voxel and class, sorted by voxel, then by label.
+        occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0) and `voters`
+            (int32), the number of observations that they are of; one row per voxel and class, sorted by voxel, then by label.
     """
 
     spec: GridSpec

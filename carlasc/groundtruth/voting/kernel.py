@@ -44,10 +44,17 @@ NOT_AT_ALL = -2  # region of rays that do not vote
 OUTSIDE = np.iinfo(np.uint16).max  # region of samples outside the grid
 
 CANDIDATE_DTYPE = np.dtype(
-    [("votes", np.int64), ("voxel", np.int32), ("next", np.int32), ("voter", np.int32), ("label", np.uint16)],
+    [
+        ("votes", np.int64),
+        ("voxel", np.int32),
+        ("next", np.int32),
+        ("voter", np.int32),
+        ("voters", np.int32),
+        ("label", np.uint16),
+    ],
     align=True,
 )
-"""A class that a voxel may have: its votes, the observation that voted for it last, and the voxel's next candidate."""
+"""A class that a voxel may have: its votes, the observation that voted for it last, how many did, and the voxel's next candidate."""
 
 
 class Tally(NamedTuple):
@@ -118,15 +125,16 @@ def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
     if entry == NONE:
         entry = tally.used[0]
         tally.used[0] += 1
-        candidates[entry].votes = 0
+        candidates[entry].votes = candidates[entry].voters = 0
         candidates[entry].voxel = voxel
         candidates[entry].next = tally.heads[voxel]
         candidates[entry].voter = NONE
         candidates[entry].label = label
         tally.heads[voxel] = entry
-    if not tally.once or candidates[entry].voter != voter:
-        candidates[entry].votes += 1
-        candidates[entry].voter = voter
+    is_new = candidates[entry].voter != voter
+    candidates[entry].voters += is_new
+    candidates[entry].votes += is_new or not tally.once
+    candidates[entry].voter = voter
 
 
 @jit
@@ -277,7 +285,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
     Args:
         heads: (V,) index of the first candidate of each voxel, or NONE.
         candidates: (C,) CANDIDATE_DTYPE.
-        rows: (C,) output, `voxel`, `label`, `votes`.
+        rows: (C,) output, `voxel`, `label`, `votes`, `voters`.
     """
     end = 0
     for head in heads:
@@ -290,6 +298,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
             rows[row].voxel = candidates[entry].voxel
             rows[row].label = candidates[entry].label
             rows[row].votes = candidates[entry].votes
+            rows[row].voters = candidates[entry].voters
             end += 1
             entry = candidates[entry].next
 
