@@ -40,6 +40,7 @@ from carlasc.storage.resuming import scans_digest
 
 _SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground
+_OTHERWISE = 0.1  # share of the points on the ground with other classes: feet of walls and kerbs have 2 to 4 %, labels that are often wrong 15 %
 _USED = ("labels", "flow", "instances", "origins")  # fields of a scan that are read for merging
 _PARTS = 30  # with `window_m`, scans are at least this fraction of it apart
 
@@ -154,9 +155,22 @@ class ScanFeed:
         if not self.classes.ground:
             return False
         ground = sorted(self.classes.ground)
-        labelled = self.sequence.frames("labels")  # some scans may have none
-        chosen = labelled[np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int))] if len(labelled) else []
-        return not any(np.isin(self.sequence.read("labels", int(frame)), ground).any() for frame in chosen)
+        return not any(np.isin(self.sequence.read("labels", frame), ground).any() for frame in self._sampled)
+
+    @cached_property
+    def names_ground(self) -> bool:
+        """Whether labels name the ground where it is: not if many points that lie on it have other classes, in some scans."""
+        scans = [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
+        found = [_labels(scan)[ground_points(scan.points)] for scan in scans]
+        others = np.concatenate([~np.isin(labels, sorted(self.classes.ground)) for labels in found] or [np.zeros(1)])
+        return bool(self.has_labels and others.sum() <= _OTHERWISE * len(others))
+
+    @property
+    def _sampled(self) -> list[int]:
+        """Some frames with labels, which not all need to have."""
+        labelled = self.sequence.frames("labels")
+        chosen = np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int)) if len(labelled) else []
+        return [int(frame) for frame in labelled[chosen]]
 
     @cached_property
     def motion(self) -> tuple[str, ...]:
@@ -306,7 +320,7 @@ class ScanFeed:
         explained = np.zeros(len(scan), np.bool_)
         for segment in self.segments(frame, boxes).segments:
             explained[segment.members] = True
-        ground = np.isin(_labels(scan), sorted(self.classes.ground))
+        ground = np.isin(_labels(scan), sorted(self.classes.ground)) if self.names_ground or self.finds_ground else None
         labels = _labels(scan) if self.has_labels else None
         origins = scan.others.get("origins")
         return Sighting(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)

@@ -34,6 +34,7 @@ from carlasc.motion.tracks import MovingActors
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
+_RETURNED_PROBABILITY = 0.6  # that a voxel is occupied in which this scan has a return, and which other scans call free
 _NO_VOXELS = np.empty(0, np.int64)
 
 
@@ -95,6 +96,8 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
         driven = steps.driven(made)
         made.labels[driven] = 0
         made.set_probability(driven, _OWN_PROBABILITY)
+    if consensus is not None:
+        steps.keep_returns(made, consensus)
     if feed.finds_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
@@ -278,6 +281,21 @@ class _FrameSteps:
         if not len(voxels):
             return voxels
         return voxels[~self.vote(self.merger.recent(self.now, self.window)).seen(voxels)]
+
+    def keep_returns(self, made: _UnfinishedGrid, consensus: ClassConsensus) -> None:
+        """Make voxels occupied in which the frame's own scan has returns, whatever other scans say; an isolated return is taken for an outlier."""
+        if self.now.frame not in self.window:
+            return
+        spec, scan = self.plan.spec, self.feed.read(self.now.frame)
+        points = scan.points if self.merger.dynamic != "drop" else scan.points[self.merger.static(self.now.frame)]
+        voxels = spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, points))
+        returns = np.bincount(voxels[voxels >= 0], minlength=spec.num_voxels).astype(np.int32)
+        lost = np.flatnonzero((returns > 0) & (made.labels == 0) & (consensus.labels > 0))
+        blocks = np.lib.stride_tricks.sliding_window_view(np.pad(returns.reshape(spec.size), 1), (3, 3, 3))
+        kept = lost[blocks[np.unravel_index(lost, spec.size)].sum(axis=(1, 2, 3)) > 1]
+        made.labels[kept] = consensus.labels[kept]
+        made.counts[kept] = np.maximum(made.counts[kept], returns[kept].astype(made.counts.dtype))
+        made.set_probability(kept, _RETURNED_PROBABILITY)
 
     def driven(self, made: _UnfinishedGrid) -> NDArray[np.int64]:
         """Return the occupied voxels that the recording vehicle drove through at other frames, without the ground and what is there now."""

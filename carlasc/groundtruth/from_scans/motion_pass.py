@@ -67,7 +67,8 @@ class _FindEvidence:
         near = [f for f, s in times.items() if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S]
         scans = (self.feed.sighting(frame, self.boxes) for frame in near)
         chosen = set(block)
-        found = find_evidence(scans, movable=self.feed.classes.movable)
+        # labels that are often wrong must not take things apart
+        found = find_evidence(scans, movable=self.feed.classes.movable if self.feed.names_ground else ())
         return [evidence.thinned() for evidence in found if evidence.frame in chosen]
 
 
