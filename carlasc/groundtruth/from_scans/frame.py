@@ -32,6 +32,7 @@ from carlasc.motion.tracks import MovingActors
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
+_DOUBTFUL = 0.1  # a voxel of an actor's body that is occupied with a greater probability is not called free
 _NO_VOXELS = np.empty(0, np.int64)
 
 
@@ -172,11 +173,17 @@ class _FrameSteps:
         """(V,) bool, the voxels of these regions."""
         return self.regions.of_voxel != STATIC
 
+    @cached_property
+    def in_actor(self) -> NDArray[np.bool_]:
+        """(V,) bool, the voxels of the bodies of actors."""
+        return np.isin(self.regions.of_voxel, list(self.regions.actors))
+
     def decide_seen(self, votes: Votes) -> _UnfinishedGrid:
         """Return what the votes for the static scene and in the actors' bodies say."""
         evidence = self.plan.needs_evidence
         labels, hits = votes.elect_occupied()
         free = votes.free.reshape(-1)
+        doubtful = self._doubtful(self._evidence(votes, labels, hits, np.flatnonzero(self.in_actor)))
         found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
         labels[found.voxels] = self._decide(found)
         counts = np.add(hits, free, out=hits)
@@ -184,7 +191,13 @@ class _FrameSteps:
         if evidence:
             made.occupied = np.full(len(labels), UNKNOWN, np.float32)
             made.occupied[found.voxels] = self._probability(found)
+        made.forget(doubtful)
         return made
+
+    def _doubtful(self, evidence: _VoxelEvidence) -> NDArray[np.int64]:
+        """Return those voxels that would be called free although they may well be occupied."""
+        free = (evidence.counts > 0) & (self._decide(evidence) == 0)
+        return evidence.voxels[free & (self._probability(evidence) > _DOUBTFUL)]
 
     def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
         """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes."""
