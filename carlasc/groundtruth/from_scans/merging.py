@@ -18,7 +18,6 @@ from carlasc.core.geometry import Transform, invert, transform_points, translati
 from carlasc.core.scans import runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
-from carlasc.motion import usual_shell
 from carlasc.motion.tracks import MovingActors
 
 STATIC = 0  # region of the voxels that belong to no actor
@@ -283,8 +282,8 @@ class Merger:
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            points = usual_shell(track.lower, track.upper, track.extent) if track.rigid else None
-            if points is not None and pose is not None:
+            points = track.surface
+            if len(points) and pose is not None:
                 labels = np.full(len(points), track.label, np.uint16)
                 yield Observation(points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE)
 
