@@ -21,6 +21,7 @@ _FACE_POINTS, _FACE_SHARE = (
 _FACE_SINE = 0.26  # a ray sees a face, and not along it, if it meets the face at 15 degrees or more
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 _SHORTEST = 0.6, 0.85  # no vehicle is shorter, or narrower, than these fractions of the usual size of its kind
+_HIGHER = 1.6  # less than this part of its height is hidden
 _EXAMPLES = 3  # a size is learned from at least this many actors, and a shape from at most this many
 _CELL_M, _BIN_M = 0.1, 0.2  # sizes of the cells in which surfaces are kept, and in which those of several actors are compared
 _ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # vehicles that are narrower, or shorter, have two wheels
@@ -145,6 +146,8 @@ class Sizes:
                 upper[axis] += missing
             else:
                 lower[axis] -= missing
+        if not extent.exemplary:  # what is nearer, or the lowest ray, may hide the wheels
+            lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
         if _is_lorry(*(upper - lower).tolist()):  # the top of a lorry beside the sensor is above the highest ray
             upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
@@ -153,11 +156,18 @@ class Sizes:
         """Return the length or the width of actors whose other size is that of `extent`, and the height too if there are such."""
         other = 1 - axis
         sizes = self._known.get(label, np.empty((0, 3)))
-        alike = np.abs(sizes - extent.size) < _ALIKE * extent.size
-        for chosen in (sizes[alike[:, other] & alike[:, 2]], sizes[alike[:, other]]):
+        far = (sizes - extent.size) / extent.size
+        alike, as_high = np.abs(far[:, other]) < _ALIKE, far[:, 2] > -_ALIKE
+        for chosen in (sizes[alike & as_high & (far[:, 2] < _ALIKE)], sizes[alike & as_high]):
             if len(chosen) >= _EXAMPLES:
                 return float(np.median(chosen[:, axis]))
         return _table(extent, axis)
+
+    def _height(self, label: int, size: NDArray[np.float64]) -> float:
+        """Return the height of actors that are as long and as wide as `size`, (3,) metres; if there are none, its own."""
+        sizes = self._known.get(label, np.empty((0, 3)))
+        alike = sizes[(np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1) & (sizes[:, 2] < _HIGHER * size[2])]
+        return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
 
     def surface(
         self, label: int, lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
