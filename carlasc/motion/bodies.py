@@ -199,8 +199,8 @@ class Sizes:
             bins.append(cells)
             points.append(np.stack(sums, axis=1) / count[:, None])
         _, place, count = np.unique(np.concatenate(bins), axis=0, return_inverse=True, return_counts=True)
-        common = 2 * count[place.reshape(-1)] > len(chosen)
-        return (np.concatenate(points)[common] + lower).astype(np.float32)
+        found = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
+        return (found[found[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
 
 
 def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -243,13 +243,13 @@ class Merger:
     def mirrored(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield what the scans of actors would have seen if they had looked at the actors' other side.
 
-        Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body.
+        Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body, if that is known.
         """
         window, grid_T_world = list(window), now.grid_T_world
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            if not track.rigid or pose is None:
+            if not track.rigid or pose is None or not any(track.extent.known):
                 continue
             for other in window:
                 for carried in self._carry(number, other, now):
