@@ -8,7 +8,7 @@ those of similar actors of the same data, or of a table, and the body extends fr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ _HIGHER = 1.6  # less than this part of its height is hidden
 _EXAMPLES = 3  # a size is learned from at least this many actors, and a shape from at most this many
 _CELL_M, _BIN_M = 0.1, 0.2  # sizes of the cells in which surfaces are kept, and in which those of several actors are compared
 _ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # vehicles that are narrower, or shorter, have two wheels
+_WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: what seems wider has points of a neighbour
+_LOWEST_M = 1.0  # of what seems lower, only a part was seen
 
 MARGIN_M = 0.1  # by which the box of an actor is larger than its body
 _CLEARANCE_M, _SPACING_M = 0.15, 0.1
@@ -129,11 +131,12 @@ class Sizes:
     def complete(self, label: int, extent: Extent) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of the whole body: lengths and widths that are not known are those of similar actors.
 
-        A body is never smaller than what was seen of it.
+        A body is never smaller than what was seen of it, unless no vehicle is so wide.
 
         Returns:
             (3,) lower and (3,) upper corner, metres, actor frame.
         """
+        extent = _without_neighbours(extent)
         lower, upper = extent.lower.copy(), extent.upper.copy()
         known, plausible = extent.known, extent.plausible
         if not any(known):  # seen too little, or too far away, to say what it is
@@ -209,6 +212,19 @@ def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
     return (cells[count > 1] * _CELL_M).astype(np.float32)
 
 
+def _without_neighbours(extent: Extent) -> Extent:
+    """Return the extent, no wider than a vehicle of its length: on the side that the sensor looked at are its own points."""
+    long = bool(extent.size[LENGTH] > _LORRY_LONG_M)
+    if extent.size[WIDTH] <= _WIDEST_M[long]:
+        return extent
+    lower, upper, width = extent.lower.copy(), extent.upper.copy(), (_CAR, _LORRY)[long][WIDTH]
+    if extent.seen_from[WIDTH] < 0:
+        upper[WIDTH] = lower[WIDTH] + width
+    else:
+        lower[WIDTH] = upper[WIDTH] - width
+    return replace(extent, lower=lower, upper=upper)
+
+
 def _is_lorry(length: float, width: float, height: float) -> bool:
     return width > _LORRY_WIDE_M or height > _LORRY_HIGH_M or length > _LORRY_LONG_M
 
@@ -238,7 +254,7 @@ def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: 
     """
     length, width, height = (upper - lower).tolist()
     lower, upper = lower + _INSET_M, upper - _INSET_M
-    if width < _ACTORS_WIDE_M or not any(extent.known):
+    if width < _ACTORS_WIDE_M or height < _LOWEST_M or not any(extent.known):
         return np.empty((0, 3), np.float32)
     if _is_lorry(length, width, height):
         return _box_surface(lower + (0, 0, _CLEARANCE_M), upper)
