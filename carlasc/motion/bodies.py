@@ -151,7 +151,7 @@ class Sizes:
                 lower[axis] -= missing
         if not extent.exemplary:  # what is nearer, or the lowest ray, may hide the wheels
             lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
-        if _is_lorry(*(upper - lower).tolist()):  # the top of a lorry beside the sensor is above the highest ray
+        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:  # the top of a lorry beside the sensor is above the highest ray
             upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
 

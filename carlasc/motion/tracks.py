@@ -146,6 +146,13 @@ def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
     return sorted(whole, key=lambda track: (track.first, track.instance, track.label, *track.world_T_actor[0, :3, 3]))
 
 
+def with_surfaces(tracks: Sequence[Track]) -> list[Track]:
+    """Return tracks whose bodies are known, as those of boxes, with surfaces like those of the actors among them that were seen well."""
+    sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
+    shapes = (sizes.surface(t.label, t.lower + BODY_MARGIN_M, t.upper - BODY_MARGIN_M, t.extent) for t in tracks)
+    return [replace(track, surface=surface) for track, surface in zip(tracks, shapes, strict=True)]
+
+
 def _with_body(track: Track, sizes: Sizes) -> Track:
     lower, upper = sizes.complete(track.label, track.extent)
     middle = (lower + upper) / 2
