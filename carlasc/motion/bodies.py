@@ -23,12 +23,12 @@ _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 _SHORTEST = 0.6, 0.85  # no vehicle is shorter, or narrower, than these fractions of the usual size of its kind
 _HIGHER = 1.6  # less than this part of its height is hidden
 _EXAMPLES = 3  # a size is learned from at least this many actors, and a shape from at most this many
-_CELL_M, _BIN_M = 0.1, 0.2  # sizes of the cells in which surfaces are kept, and in which those of several actors are compared
+_CELL_M, _BIN_M = 0.1, 0.2  # cells in which surfaces are kept, and in which those of several actors are compared
 _ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # vehicles that are narrower, or shorter, have two wheels
 _WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: what seems wider has points of a neighbour
 _LOWEST_M = 1.0  # of what seems lower, only a part was seen
 
-MARGIN_M = 0.1  # by which the box of an actor is larger than its body
+BODY_MARGIN_M = 0.1  # by which the box of an actor is larger than its body
 _CLEARANCE_M, _SPACING_M = 0.15, 0.1
 _INSET_M = 0.22  # by which the usual shell is inside the box: a voxel needs some depth of the body to be occupied
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
@@ -151,7 +151,7 @@ class Sizes:
                 lower[axis] -= missing
         if not extent.exemplary:  # what is nearer, or the lowest ray, may hide the wheels
             lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
-        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:  # the top of a lorry beside the sensor is above the highest ray
+        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:  # the top of a lorry may be above the highest ray
             upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
 
@@ -159,7 +159,7 @@ class Sizes:
         """Return the length or the width of actors whose other size is that of `extent`, and the height too if there are such."""
         other = 1 - axis
         sizes = self._known.get(label, np.empty((0, 3)))
-        far = (sizes - extent.size) / extent.size
+        far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
         alike, as_high = np.abs(far[:, other]) < _ALIKE, far[:, 2] > -_ALIKE
         for chosen in (sizes[alike & as_high & (far[:, 2] < _ALIKE)], sizes[alike & as_high]):
             if len(chosen) >= _EXAMPLES:
@@ -191,7 +191,7 @@ class Sizes:
         best = np.argsort([far.sum() for far in unlike], kind="stable")[:_EXAMPLES].tolist()
         chosen = [self._shapes[label][row] for row in best if unlike[row].max() < _ALIKE]
         if not chosen or not any(extent.known):
-            return usual_shell(lower - MARGIN_M, upper + MARGIN_M, extent)
+            return usual_shell(lower - BODY_MARGIN_M, upper + BODY_MARGIN_M, extent)
         fitted = [(own - other.lower) * (size / other.size) for other, own in chosen]
         bins, points = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
         for own in fitted:
@@ -214,10 +214,11 @@ def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
 
 def _without_neighbours(extent: Extent) -> Extent:
     """Return the extent, no wider than a vehicle of its length: on the side that the sensor looked at are its own points."""
-    long = bool(extent.size[LENGTH] > _LORRY_LONG_M)
-    if extent.size[WIDTH] <= _WIDEST_M[long]:
+    length, wide, height = extent.size.tolist()
+    if wide <= _WIDEST_M[length > _LORRY_LONG_M or not extent.known[LENGTH]]:
         return extent
-    lower, upper, width = extent.lower.copy(), extent.upper.copy(), (_CAR, _LORRY)[long][WIDTH]
+    width = (_LORRY if length > _LORRY_LONG_M or height > _LORRY_HIGH_M else _CAR)[WIDTH]
+    lower, upper = extent.lower.copy(), extent.upper.copy()
     if extent.seen_from[WIDTH] < 0:
         upper[WIDTH] = lower[WIDTH] + width
     else:

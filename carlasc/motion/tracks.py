@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
-from carlasc.motion.bodies import MARGIN_M as BODY_MARGIN_M
-from carlasc.motion.bodies import Extent, Sizes, measure, surface_of
+from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
 from carlasc.motion.paths import estimate_path, headings_of, is_standing, resample
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.storage.arrays import ArrayFormat, open_npz

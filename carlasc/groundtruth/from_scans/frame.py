@@ -32,7 +32,10 @@ from carlasc.motion.tracks import MovingActors
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
-_DOUBTFUL = 0.1  # a voxel of an actor's body that is occupied with a greater probability is not called free
+_DOUBTFUL, _UNSURE = (
+    0.1,
+    0.6,
+)  # probabilities above which a voxel of a body is not free, and below which it is not occupied
 _NO_VOXELS = np.empty(0, np.int64)
 
 
@@ -195,17 +198,21 @@ class _FrameSteps:
         return made
 
     def _doubtful(self, evidence: _VoxelEvidence) -> NDArray[np.int64]:
-        """Return those voxels that would be called free although they may well be occupied."""
-        free = (evidence.counts > 0) & (self._decide(evidence) == 0)
-        return evidence.voxels[free & (self._probability(evidence) > _DOUBTFUL)]
+        """Return those voxels that would be called free although they may well be occupied, or an actor although they may well not be."""
+        likely, is_free = self._probability(evidence), self._decide(evidence) == 0
+        unsure = np.where(is_free, likely > _DOUBTFUL, (likely < _UNSURE) & (evidence.matter == Matter.BODY))
+        return evidence.voxels[(evidence.counts > 0) & unsure]
 
     def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes."""
+        """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes.
+
+        It says where they are, and not where they are not: what is free on one side of an actor need not be so on the other.
+        """
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
-        found = found.at((made.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
-        made.labels[found.voxels] = self._decide(found)
+        found = found.at((made.counts[found.voxels] == 0) & (self._decide(found) > 0) & ~unseen)
+        made.labels[found.voxels] = found.labels
         made.counts[found.voxels] = found.counts
         made.set_probability(found.voxels, self._probability(found))
         return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
