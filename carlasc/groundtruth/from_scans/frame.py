@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -143,11 +143,13 @@ class _UnfinishedGrid:
         labels: (V,) classes.
         counts: (V,) hits and free samples; 0 means unknown.
         occupied: (V,) float32, probability that the voxel is occupied; None if it is not needed.
+        passed: (P,) flat indices of unknown voxels that rays went through on the other side of an actor.
     """
 
     labels: NDArray[np.unsignedinteger]
     counts: NDArray[np.unsignedinteger]
     occupied: NDArray[np.float32] | None = None
+    passed: NDArray[np.int64] = field(default_factory=lambda: _NO_VOXELS)
 
     def forget(self, voxels: NDArray[np.integer]) -> None:
         """Make voxels unknown."""
@@ -176,17 +178,13 @@ class _FrameSteps:
         """(V,) bool, the voxels of these regions."""
         return self.regions.of_voxel != STATIC
 
-    @cached_property
-    def in_actor(self) -> NDArray[np.bool_]:
-        """(V,) bool, the voxels of the bodies of actors."""
-        return np.isin(self.regions.of_voxel, list(self.regions.actors))
-
     def decide_seen(self, votes: Votes) -> _UnfinishedGrid:
         """Return what the votes for the static scene and in the actors' bodies say."""
         evidence = self.plan.needs_evidence
         labels, hits = votes.elect_occupied()
         free = votes.free.reshape(-1)
-        doubtful = self._doubtful(self._evidence(votes, labels, hits, np.flatnonzero(self.in_actor)))
+        bodies = np.flatnonzero(np.isin(self.regions.of_voxel, list(self.regions.actors)))
+        doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
         found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
         labels[found.voxels] = self._decide(found)
         counts = np.add(hits, free, out=hits)
@@ -206,12 +204,16 @@ class _FrameSteps:
     def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
         """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes.
 
-        It says where they are, and not where they are not: what is free on one side of an actor need not be so on the other.
+        What it says is free stays unknown, and nothing else fills it: free on one side of an actor need not be so on the other.
         """
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
-        found = found.at((made.counts[found.voxels] == 0) & (self._decide(found) > 0) & ~unseen)
+        unseen |= np.isin(found.voxels, made.passed)
+        found = found.at((made.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
+        is_there = self._decide(found) > 0
+        made.passed = found.voxels[~is_there]
+        found = found.at(is_there)
         made.labels[found.voxels] = found.labels
         made.counts[found.voxels] = found.counts
         made.set_probability(found.voxels, self._probability(found))
