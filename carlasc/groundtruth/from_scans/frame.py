@@ -202,10 +202,7 @@ class _FrameSteps:
         return evidence.voxels[(evidence.counts > 0) & unsure]
 
     def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes.
-
-        What it says is free stays unknown, and nothing else fills it: free on one side of an actor need not be so on the other.
-        """
+        """Take what completes actors where nothing else is known of them: return these voxels, and the votes. What it says is free stays unknown."""
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
