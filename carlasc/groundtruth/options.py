@@ -31,7 +31,8 @@ class FromScans:
             frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
             were seen, as in SemanticKITTI, and moving actors leave traces.
         complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": a vehicle's side that was
-            not seen is taken from its other side; "body": and what is still missing from the usual shape of vehicles.
+            not seen is taken from its other side; "body": and what is still missing from vehicles of the same drive that were seen well, or
+            from the usual shape of vehicles. These voxels are marked as inferred.
         own_path: count what the recording vehicle drove through as free space.
         motion: what tells which points move, and how.
         poses: where poses come from. Those of a sequence without any are estimated from its scans, unless `PoseOptions("file")` is given.
@@ -46,7 +47,7 @@ class FromScans:
     window_m: float | None = None
     stride: int = 1
     dynamic: Dynamic = "align"
-    complete: Complete = "mirror"
+    complete: Complete = "body"
     own_path: bool = True
     motion: MotionOptions = MotionOptions()  # noqa: RUF009 (frozen)
     poses: PoseOptions = PoseOptions()  # noqa: RUF009 (frozen)

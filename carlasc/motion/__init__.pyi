@@ -1,3 +1,4 @@
+from .bodies import BODY_MARGIN_M as BODY_MARGIN_M
 from .bodies import Extent as Extent
 from .bodies import seen_from as seen_from
 from .bodies import usual_shell as usual_shell
@@ -23,7 +24,6 @@ from .segments import is_fast as is_fast
 from .segments import segment_by_flow as segment_by_flow
 from .segments import segment_by_instances as segment_by_instances
 from .segments import standing_points as standing_points
-from .tracks import BODY_MARGIN_M as BODY_MARGIN_M
 from .tracks import LONGEST_M as LONGEST_M
 from .tracks import Track as Track
 from .tracks import complete_bodies as complete_bodies

@@ -8,7 +8,7 @@ those of similar actors of the same data, or of a table, and the body extends fr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +20,24 @@ _FACE_POINTS, _FACE_SHARE = (
 )  # a face was seen if scans with so many points, and this share of them, looked at it
 _FACE_SINE = 0.26  # a ray sees a face, and not along it, if it meets the face at 15 degrees or more
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
-_SHORTEST = 0.6  # no vehicle is shorter than this fraction of the usual length of its kind
-_EXAMPLES = 3  # a size is learned from at least this many actors
-_ACTORS_WIDE_M = 1.3  # vehicles that are narrower have two wheels
+_SHORTEST = 0.6, 0.85  # no vehicle is shorter, or narrower, than these fractions of the usual size of its kind
+_HIGHER = 1.6  # less than this part of its height is hidden
+_EXAMPLES = 3  # a size is learned from at least this many actors, and a shape from at most this many
+_CELL_M, _BIN_M = 0.1, 0.2  # cells in which surfaces are kept, and in which those of several actors are compared
+_ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # vehicles that are narrower, or shorter, have two wheels
+_WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: what seems wider has points of a neighbour
+_LOWEST_M = 1.0  # of what seems lower, only a part was seen
 
+BODY_MARGIN_M = 0.1  # by which the box of an actor is larger than its body
 _CLEARANCE_M, _SPACING_M = 0.15, 0.1
 _INSET_M = 0.22  # by which the usual shell is inside the box: a voxel needs some depth of the body to be occupied
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
 LENGTH, WIDTH = 0, 1
-# Length and width, metres, of vehicles with two wheels, cars, and lorries and buses (at least so wide, or so high).
-_TWO_WHEELS, _CAR, _LORRY = (1.8, 0.7), (4.4, 1.85), (7.5, 2.5)
-_LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M = 2.25, 2.3, 6.0, 2.8
+# Length and width, metres, of vehicles with two wheels, cars, vans (at least so high), and lorries and buses (at least so wide).
+_TWO_WHEELS, _CAR, _VAN, _LORRY = (1.8, 0.7), (4.4, 1.85), (5.4, 2.0), (7.5, 2.5)
+_LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M, _VAN_HIGH_M = 2.25, 2.3, 6.0, 2.8, 1.95
 
 
 @dataclass(frozen=True)
@@ -65,9 +70,16 @@ class Extent:
         return (rear and front) or low or high, (low and high) or rear or front
 
     @property
-    def plausible(self) -> bool:
-        """Whether the length is one that a vehicle of this width and height can have; a shorter one is only a part of it."""
-        return bool(self.size[LENGTH] > _SHORTEST * _table(self, LENGTH))
+    def plausible(self) -> tuple[bool, bool]:
+        """Whether length and width are those that a vehicle of this width or length, and this height, can have; less is only a part of it."""
+        length, width = (bool(self.size[axis] > share * _table(self, axis)) for axis, share in enumerate(_SHORTEST))
+        return length, width
+
+    @property
+    def exemplary(self) -> bool:
+        """Whether others can be completed by its shape: its front, its rear and one of its sides were seen."""
+        rear, front, low, high = self.faces
+        return rear and front and (low or high) and all(self.plausible)
 
 
 def measure(sightings: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
@@ -105,47 +117,113 @@ def seen_from(
 
 
 class Sizes:
-    """Lengths and widths of actors that were seen well, by class."""
+    """Lengths, widths and shapes of actors that were seen well, by class."""
 
-    def __init__(self, extents: Sequence[tuple[int, Extent]]) -> None:
-        """Learn from the extents of actors with their classes."""
+    def __init__(self, examples: Sequence[tuple[int, Extent, NDArray[np.float32]]]) -> None:
+        """Learn from the classes of actors, their extents, and the points of their surfaces, (P, 3) each, actor frame; none if not kept."""
         self._known: dict[int, NDArray[np.float64]] = {}
-        for label in {label for label, _ in extents}:
-            sizes = [e.size[:2] for other, e in extents if other == label and all(e.known) and e.plausible]
-            self._known[label] = np.array(sizes).reshape(-1, 2)
+        self._shapes = {label: list[tuple[Extent, NDArray[np.float32]]]() for label, _, _ in examples}
+        for label, shapes in self._shapes.items():
+            own = [(e, surface) for other, e, surface in examples if other == label]
+            self._known[label] = np.array([e.size for e, _ in own if all(e.known + e.plausible)]).reshape(-1, 3)
+            shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 
     def complete(self, label: int, extent: Extent) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of the whole body: lengths and widths that are not known are those of similar actors.
 
-        A body is never smaller than what was seen of it.
+        A body is never smaller than what was seen of it, unless no vehicle is so wide.
 
         Returns:
             (3,) lower and (3,) upper corner, metres, actor frame.
         """
+        extent = _without_neighbours(extent)
         lower, upper = extent.lower.copy(), extent.upper.copy()
-        known = extent.known
+        known, plausible = extent.known, extent.plausible
         if not any(known):  # seen too little, or too far away, to say what it is
             return lower, upper
         for axis in (LENGTH, WIDTH):
-            if known[axis] and (axis == WIDTH or extent.plausible):
+            if known[axis] and plausible[axis]:
                 continue
             missing = max(self._expected(label, extent, axis) - (upper[axis] - lower[axis]), 0.0)
             if extent.seen_from[axis] < 0:
                 upper[axis] += missing
             else:
                 lower[axis] -= missing
-        if _is_lorry(*(upper - lower).tolist()):  # the top of a lorry beside the sensor is above the highest ray
+        if not extent.exemplary:  # what is nearer, or the lowest ray, may hide the wheels
+            lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
+        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:  # the top of a lorry may be above the highest ray
             upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
 
     def _expected(self, label: int, extent: Extent, axis: int) -> float:
-        """Return the length or the width of actors whose other size is that of `extent`."""
+        """Return the length or the width of actors whose other size is that of `extent`, and the height too if there are such."""
         other = 1 - axis
-        sizes = self._known.get(label, np.empty((0, 2)))
-        alike = sizes[np.abs(sizes[:, other] - extent.size[other]) < _ALIKE * extent.size[other]]
-        if len(alike) >= _EXAMPLES:
-            return float(np.median(alike[:, axis]))
+        sizes = self._known.get(label, np.empty((0, 3)))
+        far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
+        alike, as_high = np.abs(far[:, other]) < _ALIKE, far[:, 2] > -_ALIKE
+        for chosen in (sizes[alike & as_high & (far[:, 2] < _ALIKE)], sizes[alike & as_high]):
+            if len(chosen) >= _EXAMPLES:
+                return float(np.median(chosen[:, axis]))
         return _table(extent, axis)
+
+    def _height(self, label: int, size: NDArray[np.float64]) -> float:
+        """Return the height of actors that are as long and as wide as `size`, (3,) metres; if there are none, its own."""
+        sizes = self._known.get(label, np.empty((0, 3)))
+        alike = sizes[(np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1) & (sizes[:, 2] < _HIGHER * size[2])]
+        return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
+
+    def surface(
+        self, label: int, lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
+    ) -> NDArray[np.float32]:
+        """Return points on the surface that a vehicle of this size has: those of the actors most alike, otherwise the usual ones.
+
+        Args:
+            label: its class.
+            lower: (3,) lower corner of its body, metres, actor frame.
+            upper: (3,) upper corner.
+            extent: what was seen of it.
+
+        Returns:
+            (P, 3) float32, metres, actor frame.
+        """
+        size = np.maximum(upper - lower, _CELL_M)
+        unlike = [np.abs(np.log(np.maximum(other.size, _CELL_M) / size)) for other, _ in self._shapes.get(label, [])]
+        best = np.argsort([far.sum() for far in unlike], kind="stable")[:_EXAMPLES].tolist()
+        chosen = [self._shapes[label][row] for row in best if unlike[row].max() < _ALIKE]
+        if not chosen or not any(extent.known):
+            return usual_shell(lower - BODY_MARGIN_M, upper + BODY_MARGIN_M, extent)
+        fitted = [(own - other.lower) * (size / other.size) for other, own in chosen]
+        bins, points = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
+        for own in fitted:
+            whole = np.concatenate([own, own * (1, -1, 1) + (0, size[1], 0)])
+            cells, place = np.unique(np.floor(whole / _BIN_M).astype(np.int64), axis=0, return_inverse=True)
+            count = np.bincount(place.reshape(-1))
+            sums = [np.bincount(place.reshape(-1), whole[:, axis]) for axis in range(3)]
+            bins.append(cells)
+            points.append(np.stack(sums, axis=1) / count[:, None])
+        _, place, count = np.unique(np.concatenate(bins), axis=0, return_inverse=True, return_counts=True)
+        found = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
+        return (found[found[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
+
+
+def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the centres of the cells that two points or more are in, (P, 3) float32, of points (M, 3), metres."""
+    cells, count = np.unique(np.round(points / _CELL_M).astype(np.int32), axis=0, return_counts=True)
+    return (cells[count > 1] * _CELL_M).astype(np.float32)
+
+
+def _without_neighbours(extent: Extent) -> Extent:
+    """Return the extent, no wider than a vehicle of its length: on the side that the sensor looked at are its own points."""
+    length, wide, height = extent.size.tolist()
+    if wide <= _WIDEST_M[length > _LORRY_LONG_M or not extent.known[LENGTH]]:
+        return extent
+    width = (_LORRY if length > _LORRY_LONG_M or height > _LORRY_HIGH_M else _CAR)[WIDTH]
+    lower, upper = extent.lower.copy(), extent.upper.copy()
+    if extent.seen_from[WIDTH] < 0:
+        upper[WIDTH] = lower[WIDTH] + width
+    else:
+        lower[WIDTH] = upper[WIDTH] - width
+    return replace(extent, lower=lower, upper=upper)
 
 
 def _is_lorry(length: float, width: float, height: float) -> bool:
@@ -155,21 +233,15 @@ def _is_lorry(length: float, width: float, height: float) -> bool:
 def _table(extent: Extent, axis: int) -> float:
     """Return a usual length or width for an actor of which the other size is known."""
     length, width, height = extent.size.tolist()
-    if axis == LENGTH:
-        kind = (
-            _LORRY
-            if width > _LORRY_WIDE_M or height > _LORRY_HIGH_M
-            else _CAR
-            if width > _ACTORS_WIDE_M
-            else _TWO_WHEELS
-        )
-    else:
-        kind = _LORRY if length > _LORRY_LONG_M or height > _LORRY_HIGH_M else _CAR if length > 2.6 else _TWO_WHEELS
-    return kind[axis]
+    if width > _LORRY_WIDE_M if axis == LENGTH else length > _LORRY_LONG_M:
+        return _LORRY[axis]
+    if width > _ACTORS_WIDE_M if axis == LENGTH else length > _ACTORS_LONG_M:
+        return (_VAN if height > _VAN_HIGH_M else _CAR)[axis]
+    return _TWO_WHEELS[axis]
 
 
-def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent) -> NDArray[np.float32] | None:
-    """Return points on the surface that a vehicle of this size usually has; None for vehicles with two wheels.
+def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent) -> NDArray[np.float32]:
+    """Return points on the surface that a vehicle of this size usually has; none for vehicles with two wheels.
 
     A car has a body of 60 % of its height, and a narrower cabin above its rear three quarters. Lorries and buses are boxes.
 
@@ -183,8 +255,8 @@ def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: 
     """
     length, width, height = (upper - lower).tolist()
     lower, upper = lower + _INSET_M, upper - _INSET_M
-    if width < _ACTORS_WIDE_M or not any(extent.known):
-        return None
+    if width < _ACTORS_WIDE_M or height < _LOWEST_M or not any(extent.known):
+        return np.empty((0, 3), np.float32)
     if _is_lorry(length, width, height):
         return _box_surface(lower + (0, 0, _CLEARANCE_M), upper)
     belt = lower[2] + _BELT * height

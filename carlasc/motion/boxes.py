@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan
-from carlasc.motion.bodies import Extent
+from carlasc.motion.bodies import BODY_MARGIN_M, Extent
 from carlasc.motion.paths import resample, smooth
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import nearest_rotation
-from carlasc.motion.tracks import BODY_MARGIN_M, Track
+from carlasc.motion.tracks import Track
 
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
 _FILLED_IN = 0.3  # weight of a box that was not annotated in its frame

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,7 @@ class FreeSpaceEvidence:
         clusters: (M,) int64 indices of the points of each thing that moved.
         points: (M, 3) float64 of the same points, metres, world.
         labels: class of most points of each cluster; 0 without labels.
+        origin: (3,) metres, world: the sensor that saw them.
     """
 
     frame: int
@@ -88,6 +89,7 @@ class FreeSpaceEvidence:
     clusters: tuple[NDArray[np.int64], ...]
     points: tuple[NDArray[np.float64], ...]
     labels: tuple[int, ...]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most so many `points` for each cluster; `clusters` stay complete."""
@@ -168,7 +170,8 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     clusters = [candidates[own] for own in _clusters(world, kind, moved, left, static)]
     points = [transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64)) for members in clusters]
     classes = [0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax()) for own in clusters]
-    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), tuple(clusters), tuple(points), tuple(classes))
+    about = scan.frame, own.seconds, len(scan.points)
+    return FreeSpaceEvidence(*about, tuple(clusters), tuple(points), tuple(classes), scan.world_T_sensor[:3, 3])
 
 
 def _places(scan: Sighting) -> list[tuple[slice, NDArray[np.float32]]]:

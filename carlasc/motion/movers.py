@@ -90,7 +90,8 @@ class _Link:
     @classmethod
     def of(cls, evidence: FreeSpaceEvidence, index: int) -> _Link:
         points = evidence.points[index]
-        segment = Segment(evidence.frame, evidence.labels[index], evidence.clusters[index], points, None)
+        label, members = evidence.labels[index], evidence.clusters[index]
+        segment = Segment(evidence.frame, label, members, points, None, origin=evidence.origin)
         return cls(evidence.seconds, segment, points.min(axis=0), points.max(axis=0))
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
-from carlasc.motion.bodies import Extent, Sizes, measure
+from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
 from carlasc.motion.paths import estimate_path, headings_of, is_standing, resample
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.storage.arrays import ArrayFormat, open_npz
@@ -22,7 +22,6 @@ from carlasc.storage.files import parse_json
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last segment
 _STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
 LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
-BODY_MARGIN_M = 0.1  # by which the box of an actor is larger than its body
 FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
 _FORMATS = {
     "members": ArrayFormat(("<i4",), (None,)),
@@ -30,7 +29,8 @@ _FORMATS = {
     "poses": ArrayFormat(("<f8",), (None, 4, 4)),
     "velocities": ArrayFormat(("<f8",), (None, 3)),
     "bounds": ArrayFormat(("<f8",), (None, 18)),
-    "table": ArrayFormat(("<i8",), (None, 7)),
+    "table": ArrayFormat(("<i8",), (None, 8)),
+    "surfaces": ArrayFormat(("<f4",), (None, 3)),
     "moving": ArrayFormat(("<i4",), (None,)),
     "moving_frames": ArrayFormat(("<i8",), (None, 2)),
 }
@@ -51,6 +51,7 @@ class Track:
         upper: (3,) metres, upper corner.
         extent: what was seen of the body.
         rigid: whether it keeps its shape, as vehicles do.
+        surface: (P, 3) float32, points of its surface, metres, actor frame: of one that was seen well; of every vehicle once bodies are complete.
     """
 
     label: int
@@ -63,6 +64,7 @@ class Track:
     upper: NDArray[np.float64]
     extent: Extent
     rigid: bool = True
+    surface: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
 
     def pose(self, frame: int) -> Transform | None:
         """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
@@ -123,21 +125,31 @@ def make_track(
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
         positions = _integrate(velocities, seconds, chain)
     headings = headings_of(velocities)
-    positions, extent = _fit_box(chain, positions, headings)
+    positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     path, speed = resample(at, seconds, positions, velocities)
     poses = np.stack([rotation_z(angle) for angle in np.interp(at, seconds, headings)])
     poses[:, :3, 3] = path
     members = {segment.frame: segment.members.astype(np.int32) for segment in chain}
     lower, upper = extent.lower - BODY_MARGIN_M, extent.upper + BODY_MARGIN_M
-    return Track(label, chain[0].instance, members, int(frames[0]), poses, speed, lower, upper, extent, keeps_shape)
+    surface = surface_of(body if keeps_shape and extent.exemplary else body[:0])
+    return Track(
+        label, chain[0].instance, members, int(frames[0]), poses, speed, lower, upper, extent, keeps_shape, surface
+    )
 
 
 def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
     """Return tracks in order of their first segment, each with a body as large as similar actors', and not only as what was seen of it."""
-    sizes = Sizes([(track.label, track.extent) for track in tracks if track.rigid])
+    sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
     whole = [_with_body(track, sizes) if track.rigid else track for track in tracks]
     return sorted(whole, key=lambda track: (track.first, track.instance, track.label, *track.world_T_actor[0, :3, 3]))
+
+
+def with_surfaces(tracks: Sequence[Track]) -> list[Track]:
+    """Return tracks whose bodies are known, as those of boxes, with surfaces like those of the actors among them that were seen well."""
+    sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
+    shapes = (sizes.surface(t.label, t.lower + BODY_MARGIN_M, t.upper - BODY_MARGIN_M, t.extent) for t in tracks)
+    return [replace(track, surface=surface) for track, surface in zip(tracks, shapes, strict=True)]
 
 
 def _with_body(track: Track, sizes: Sizes) -> Track:
@@ -152,6 +164,7 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
         lower=lower - middle - BODY_MARGIN_M,
         upper=upper - middle + BODY_MARGIN_M,
         extent=seen,
+        surface=sizes.surface(track.label, lower, upper, track.extent) - middle.astype(np.float32),
     )
 
 
@@ -167,8 +180,8 @@ def _integrate(
 
 def _fit_box(
     chain: Sequence[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], Extent]:
-    """Move the path to the centre of what was seen of the actor, and return it with the extent of its points around it.
+) -> tuple[NDArray[np.float64], Extent, NDArray[np.float64]]:
+    """Move the path to the centre of what was seen of the actor, and return it with the extent of its points around it, and these.
 
     The path is known except for a constant offset in the world. If the actor turns, the segments overlap only with the correct
     offset, which is the one that moves the origin to their centre.
@@ -185,7 +198,7 @@ def _fit_box(
         middle = (extent.lower + extent.upper) / 2
         positions = positions + rotate_vectors(rotation_z(headings[best]), middle)
         extent = replace(extent, lower=extent.lower - middle, upper=extent.upper - middle)
-    return positions, extent
+    return positions, extent, np.concatenate(body) - middle
 
 
 def _frames_around(first: int, last: int, times: Mapping[int, float]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -234,7 +247,7 @@ class MovingActors:
 
     def to_bytes(self, key: str) -> bytes:
         """Return the content of a file for these actors. `key` says what they were made from."""
-        table, poses, velocities, bounds, members, frames = [], [], [], [], [], []
+        table, poses, velocities, bounds, members, frames, surfaces = [], [], [], [], [], [], []
         for number, track in self.tracks.items():
             table.append(
                 (
@@ -245,10 +258,12 @@ class MovingActors:
                     len(track.world_T_actor),
                     track.extent.points,
                     track.rigid,
+                    len(track.surface),
                 )
             )
             poses.append(track.world_T_actor)
             velocities.append(track.velocity)
+            surfaces.append(track.surface)
             extent = track.extent
             bounds.append(
                 np.concatenate([track.lower, track.upper, extent.lower, extent.upper, extent.faces, extent.seen_from])
@@ -257,9 +272,10 @@ class MovingActors:
                 members.append(own)
                 frames.append((number, frame, len(own)))
         arrays = {
-            "table": np.array(table, np.int64).reshape(-1, 7),
+            "table": np.array(table, np.int64).reshape(-1, 8),
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
             "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
+            "surfaces": np.concatenate([np.empty((0, 3), np.float32), *surfaces]),
             "bounds": np.array(bounds, np.float64).reshape(-1, 18),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
@@ -295,8 +311,8 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
     for number, frame, count in arrays["frames"].tolist():
         members.setdefault(number, {})[frame] = arrays["members"][offset : offset + count]
         offset += count
-    tracks, row = {}, 0
-    for (number, label, instance, first, length, points, rigid), bounds in zip(
+    tracks, row, point = {}, 0, 0
+    for (number, label, instance, first, length, points, rigid, size), bounds in zip(
         arrays["table"].tolist(), arrays["bounds"], strict=True
     ):
         rear, front, low, high = (bounds[12:16] > 0).tolist()
@@ -311,8 +327,9 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
             bounds[3:6],
             Extent(bounds[6:9], bounds[9:12], (rear, front, low, high), points, (float(bounds[16]), float(bounds[17]))),
             bool(rigid),
+            arrays["surfaces"][point : point + size],
         )
-        row += length
+        row, point = row + length, point + size
     return tracks
 
 

@@ -13,7 +13,7 @@ from carlasc.core.tables import CARLA
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.inputs import GridPlan
-from carlasc.motion import Extent, MotionOptions, PoseOptions, Track
+from carlasc.motion import Extent, MotionOptions, PoseOptions, Track, usual_shell
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
 
@@ -116,19 +116,20 @@ class TestBodies:
 
     HALF = np.array([2.0, 1.0, 0.8])
 
-    def make(self, folder, spec=SPEC, evidence=True, **options):
+    def make(self, folder, spec=SPEC, evidence=True, beyond=(), **options):
         side = [((x, 3.1, z), VEHICLE) for x in np.arange(-1.9, 2.0, 0.2) for z in (-0.5, -0.1, 0.3, 0.5)]
         ground = [((0.1, 4.1, -0.7), ROAD), ((0.1, 4.9, -0.7), ROAD)]  # seen under the car
-        feed = feed_of(folder, dict.fromkeys(FRAMES, side + ground), own_path=False, **options)
+        feed = feed_of(folder, dict.fromkeys(FRAMES, side + ground + list(beyond)), own_path=False, **options)
         members = {frame: np.arange(len(side), dtype=np.int32) for frame in FRAMES}
         poses = np.tile(translation((0.0, 4.0, 0.0)), (len(FRAMES), 1, 1))
         lower, upper = -self.HALF - 0.1, self.HALF + 0.1
         extent = Extent(-self.HALF, self.HALF, (False, False, True, False), 1000, (0.0, -4.0))
-        track = Track(VEHICLE, 0, members, 0, poses, np.zeros((len(FRAMES), 3)), lower, upper, extent)
+        surface = usual_shell(lower, upper, extent)
+        track = Track(VEHICLE, 0, members, 0, poses, np.zeros((len(FRAMES), 3)), lower, upper, extent, surface=surface)
         return merge(feed, MovingActors({3: track}), spec=spec, evidence=evidence)
 
     def test_the_side_that_no_scan_saw_is_taken_from_the_other_one_and_marked(self, tmp_path):
-        merged = self.make(tmp_path)
+        merged = self.make(tmp_path, complete="mirror")
         seen, other = (at(merged, (0.3, y, -0.1)) for y in (3.1, 4.9))
         assert seen[0] == other[0] == VEHICLE
         assert other[1] > 0
@@ -145,9 +146,17 @@ class TestBodies:
 
     def test_the_usual_shape_closes_the_ends_that_a_mirror_image_does_not_show(self, tmp_path):
         front = (1.75, 4.1, -0.1)
-        assert at(self.make(tmp_path / "mirror"), front)[0] != VEHICLE
-        label, _, flags = at(self.make(tmp_path / "body", complete="body"), front)
+        assert at(self.make(tmp_path / "mirror", complete="mirror"), front)[0] != VEHICLE
+        label, _, flags = at(self.make(tmp_path / "body"), front)
         assert label == VEHICLE and VoxelFlag.INFERRED in flags
+
+    def test_what_rays_went_through_is_not_filled(self, tmp_path):
+        roof = np.array([0.3, 4.1, 0.5])
+        label, _, flags = at(self.make(tmp_path / "unseen"), roof)
+        assert label == VEHICLE and VoxelFlag.INFERRED in flags
+        beyond = [(tuple((1 + 0.1 * i) * 2 * roof), BUILDING) for i in range(10)]
+        label, count, flags = at(self.make(tmp_path / "seen", beyond=beyond), roof)
+        assert (label, count > 0) == (0, True) and VoxelFlag.INFERRED not in flags
 
     @pytest.mark.parametrize("complete", ["seen", "mirror", "body"])
     def test_a_body_does_not_swallow_the_road(self, tmp_path, complete):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.motion import Extent, usual_shell
-from carlasc.motion.bodies import Sizes, measure
+from carlasc.motion.bodies import Sizes, measure, surface_of
 
 CAR, BUS, BICYCLE = 10, 11, 12
 EVERY_SIDE = (True, True, True, True)
@@ -84,6 +84,9 @@ def test_a_body_extends_from_the_face_that_was_seen_away_from_the_sensor(seen, l
     assert (low[2], high[2]) == (-0.75, 0.75)
 
 
+NO_SURFACE = np.empty((0, 3), np.float32)
+
+
 def test_what_is_known_stays_as_it_was_seen_and_nothing_gets_smaller():
     for size, faces in (((3.9, 1.7, 1.4), EVERY_SIDE), ((5.5, 1.9, 1.5), REAR), ((4.4, 2.1, 1.5), LOW)):
         lower, upper = Sizes([]).complete(CAR, extent(size, faces))
@@ -100,17 +103,17 @@ def test_sizes_are_learned_from_three_similar_actors_of_the_same_class():
     vans = [(CAR, extent((5.2, 1.8 + 0.02 * i, 2.0), EVERY_SIDE)) for i in range(3)]
     others = [(CAR, extent((5.2, 2.2, 2.0), EVERY_SIDE))] * 3 + [(CAR, extent((5.2, 1.8, 2.0), REAR))] * 3
     for known, length in ((vans, 5.2), (vans[:2], 4.4), (others, 4.4), ([(BUS, e) for _, e in vans], 4.4)):
-        lower, upper = Sizes(known).complete(CAR, seen)
+        lower, upper = Sizes([(*one, NO_SURFACE) for one in known]).complete(CAR, seen)
         assert upper[0] - lower[0] == pytest.approx(length)
 
 
 def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_side_was_seen():
     part = extent((1.5, 1.9, 1.5), (True, False, True, False))
-    assert part.known == (True, True) and not part.plausible
+    assert part.known == (True, True) and part.plausible == (False, True)
     lower, upper = Sizes([]).complete(CAR, part)
     assert upper[0] - lower[0] == pytest.approx(4.4)
     assert lower[0] == pytest.approx(-0.75)
-    examples = [(CAR, part)] * 5  # nor is it an example for others
+    examples = [(CAR, part, NO_SURFACE)] * 5  # nor is it an example for others
     assert np.ptp(Sizes(examples).complete(CAR, extent((1.0, 1.9, 1.5), REAR)), axis=0)[0] == pytest.approx(4.4)
 
 
@@ -120,7 +123,12 @@ def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_si
         (extent((0.5, 0.6, 1.7), REAR), (1.8, 0.6, 1.7)),  # a cyclist
         (extent((1.8, 0.3, 1.7), LOW, (0.0, -20.0)), (1.8, 0.7, 1.7)),
         (extent((1.0, 2.5, 3.2), REAR), (7.5, 2.5, 3.2)),  # a lorry, by its width
-        (extent((1.0, 2.0, 2.6), REAR), (7.5, 2.0, 2.8)),  # by its height; its top is above what was seen
+        (extent((1.0, 2.0, 2.6), REAR), (5.4, 2.0, 2.6)),  # a van, by its height
+        (
+            extent((11.0, 1.9, 2.0), (True, False, True, False), (0.0, -20.0)),
+            (11.0, 2.5, 2.8),
+        ),  # a rear that was hidden in part
+        (extent((11.0, 3.3, 2.9), EVERY_SIDE, (0.0, -20.0)), (11.0, 2.5, 2.9)),  # with points of a neighbour
         (extent((11.0, 0.4, 2.0), LOW, (0.0, -20.0)), (11.0, 2.5, 2.8)),  # by its length
     ],
 )
@@ -156,5 +164,60 @@ class TestUsualShell:
         assert np.allclose(np.ptp(top[:, :2], axis=0), (10.0 - 0.44, 2.5 - 0.44), atol=1e-4)
 
     def test_there_is_none_for_two_wheels_or_what_was_hardly_seen(self):
-        assert self.of((1.8, 0.7, 1.7))[0] is None
-        assert self.of((4.4, 1.85, 1.5), (False,) * 4)[0] is None
+        assert not len(self.of((1.8, 0.7, 1.7))[0])
+        assert not len(self.of((4.4, 1.85, 1.5), (False,) * 4)[0])
+        assert not len(self.of((4.4, 1.85, 0.5))[0])
+
+
+class TestLearnedShapes:
+    """Cars with a box on their hood, which only those show that were seen from the front and from one side."""
+
+    HALF = np.array([2.2, 0.9, 0.75])
+
+    def example(self, stretch=1.0):
+        """Return a car of which the front, the rear, the side of low y and the box were seen."""
+        half = self.HALF * stretch
+        x, y, z = (np.arange(-h, h + 0.01, 0.05) for h in half)
+        side = np.stack(np.meshgrid(x, [-half[1]], z), axis=-1).reshape(-1, 3)
+        ends = np.stack(np.meshgrid([-half[0], half[0]], y, z), axis=-1).reshape(-1, 3)
+        box = np.stack(np.meshgrid(np.arange(1.3, 1.8, 0.05), y[y < 0], [half[2]]), axis=-1).reshape(-1, 3)
+        points = np.concatenate([side, ends, box])
+        return CAR, Extent(-half, half, (True, True, True, False), len(points), (0.0, -9.0)), surface_of(points)
+
+    def surface(self, examples, size=(4.3, 1.8, 1.5)):
+        half = np.array(size) / 2
+        seen = extent((0.5, size[1], size[2]), REAR)
+        return Sizes(examples).surface(CAR, -half, half, seen)
+
+    def test_the_rest_of_a_car_that_showed_its_rear_is_that_of_cars_seen_well(self):
+        found = self.surface([self.example(), self.example(1.02), self.example(0.98)])
+        on_hood = (found[:, 0] > 1.1) & (found[:, 0] < 1.9) & (found[:, 2] > 0.65)
+        low, high = found[:, 1] < -0.8, found[:, 1] > 0.8
+        assert found.dtype == np.float32
+        assert (np.abs(found) <= np.array([2.15, 0.9, 0.75]) + 0.15).all()
+        assert on_hood.sum() > 10
+        assert low.sum() == pytest.approx(high.sum(), rel=0.1)  # the other side is its mirror image
+        for around in (low, high, found[:, 0] > 2.0, found[:, 0] < -2.0):
+            assert around.sum() > 30
+
+    def test_what_most_of_them_do_not_have_is_left_out(self):
+        label, whole, surface = self.example()
+        bare = (
+            label,
+            whole,
+            surface[~((np.abs(surface[:, 0] - 1.55) < 0.3) & (surface[:, 2] > 0.6) & (surface[:, 1] > -0.8))],
+        )
+        found = self.surface([self.example(), bare, bare])
+        assert not ((np.abs(found[:, 0] - 1.55) < 0.2) & (np.abs(found[:, 1]) < 0.6)).any()
+
+    def test_unlike_actors_and_other_classes_teach_nothing(self):
+        usual = self.surface([])
+        _, whole, surface = self.example()
+        for others in ([self.example(1.3)] * 3, [(BUS, whole, surface)] * 3):
+            np.testing.assert_array_equal(self.surface(others), usual)
+
+    def test_wheels_that_are_hidden_lengthen_the_body_downwards(self):
+        examples = [self.example(scale) for scale in (1.0, 1.01, 0.99)]
+        lower, upper = Sizes(examples).complete(CAR, extent((0.4, 1.8, 1.1), REAR, (-20.0, 0.0)))
+        assert np.allclose(upper - lower, (4.4, 1.8, 1.5), atol=0.05)
+        assert upper[2] == pytest.approx(0.55)

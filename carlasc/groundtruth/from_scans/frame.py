@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.core.grids import Grid, GridSpec, VoxelFlag
+from carlasc.core.geometry import transform_points
+from carlasc.core.grids import Grid, VoxelFlag
+from carlasc.groundtruth.from_scans.body_regions import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
 from carlasc.groundtruth.inputs import GridPlan
@@ -28,13 +29,14 @@ from carlasc.groundtruth.voting.certainty import (
 )
 from carlasc.groundtruth.voting.consensus import ClassConsensus, agree
 from carlasc.groundtruth.voting.kernel import mark
-from carlasc.motion import BODY_MARGIN_M, Track
 from carlasc.motion.tracks import MovingActors
 
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
 _RETURNED_PROBABILITY = 0.6  # that a voxel is occupied in which this scan has a return, and which other scans call free
+# Probabilities above which a voxel of a body is not free, and below which it is not occupied.
+_DOUBTFUL, _UNSURE = 0.1, 0.6
 _NO_VOXELS = np.empty(0, np.int64)
 
 
@@ -159,11 +161,13 @@ class _UnfinishedGrid:
         labels: (V,) classes.
         counts: (V,) hits and free samples; 0 means unknown.
         occupied: (V,) float32, probability that the voxel is occupied; None if it is not needed.
+        passed: (P,) flat indices of unknown voxels that rays went through on the other side of an actor.
     """
 
     labels: NDArray[np.unsignedinteger]
     counts: NDArray[np.unsignedinteger]
     occupied: NDArray[np.float32] | None = None
+    passed: NDArray[np.int64] = field(default_factory=lambda: _NO_VOXELS)
 
     def forget(self, voxels: NDArray[np.integer]) -> None:
         """Make voxels unknown."""
@@ -199,6 +203,8 @@ class _FrameSteps:
         if consensus is not None:
             labels = consensus.labels.copy()
         free = votes.free.reshape(-1)
+        bodies = np.flatnonzero(np.isin(self.regions.of_voxel, list(self.regions.actors)))
+        doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
         found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
         labels[found.voxels] = self._decide(found)
         counts = np.add(hits, free, out=hits)
@@ -206,15 +212,26 @@ class _FrameSteps:
         if evidence:
             made.occupied = np.full(len(labels), UNKNOWN, np.float32)
             made.occupied[found.voxels] = self._probability(found)
+        made.forget(doubtful)
         return made
 
+    def _doubtful(self, evidence: _VoxelEvidence) -> NDArray[np.int64]:
+        """Return those voxels that would be called free although they may well be occupied, or an actor although they may well not be."""
+        likely, is_free = self._probability(evidence), self._decide(evidence) == 0
+        unsure = np.where(is_free, likely > _DOUBTFUL, (likely < _UNSURE) & (evidence.matter == Matter.BODY))
+        return evidence.voxels[(evidence.counts > 0) & unsure]
+
     def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Take what completes actors where nothing else is known of their bodies: return these voxels, and the votes for their classes."""
+        """Take what completes actors where nothing else is known of them: return these voxels, and the votes. What it says is free stays unknown."""
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
+        unseen |= np.isin(found.voxels, made.passed)
         found = found.at((made.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
-        made.labels[found.voxels] = self._decide(found)
+        is_there = self._decide(found) > 0
+        made.passed = found.voxels[~is_there]
+        found = found.at(is_there)
+        made.labels[found.voxels] = found.labels
         made.counts[found.voxels] = found.counts
         made.set_probability(found.voxels, self._probability(found))
         return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
@@ -313,105 +330,3 @@ class _FrameSteps:
             scan = self.feed.read(self.now.frame)
             there_now = there_now | mark(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec)
         return voxels[solid & ~there_now[voxels]]
-
-
-@dataclass(frozen=True)
-class BodyRegions:
-    """Which voxels belong to which actor.
-
-    Attributes:
-        of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
-        actors: number of the actor by region, for the regions that have voxels.
-        hidden: (H,) flat indices of voxels of a body's face that no scan saw. Rays beside the body go through them: they say nothing of it.
-        hidden_ends: (E,) those of a face that is hidden also if the body is completed by its mirror image.
-    """
-
-    of_voxel: NDArray[np.uint16]
-    actors: Mapping[int, int]
-    hidden: NDArray[np.int64]
-    hidden_ends: NDArray[np.int64]
-
-    @classmethod
-    def at(cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec) -> BodyRegions:
-        """Return the regions of a frame: of the bodies of what moves, and of moving points without a body.
-
-        Args:
-            merger: what moves, and the scans.
-            now: the frame.
-            window: frames whose scans are merged.
-            spec: the grid.
-        """
-        tracks = merger.actors.tracks.items() if merger.dynamic == "align" else ()
-        present = [(number, track, pose) for number, track in tracks if (pose := track.pose(now.frame)) is not None]
-        regions = cls.of_bodies(spec, now.world_T_grid, present)
-        if merger.dynamic in ("align", "current") and now.frame in window:
-            scan = merger.scan_of(now.frame)
-            moving = scan.points[~merger.static(now.frame)]
-            return regions.with_points(spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving))
-        return regions
-
-    def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
-        """Return the regions with one more, of the voxels of points that move and belong to no body: only the frame's own rays vote there.
-
-        Args:
-            spec: the grid.
-            points: (M, 3) metres, grid frame.
-        """
-        of_voxel = self.of_voxel.copy()
-        voxels = spec.flat_index(points)
-        voxels = voxels[voxels >= 0]
-        of_voxel[voxels[of_voxel[voxels] == STATIC]] = max(self.actors, default=0) + 1
-        return replace(self, of_voxel=of_voxel)
-
-    @classmethod
-    def of_bodies(cls, spec: GridSpec, world_T_grid: Transform, bodies: Sequence[tuple[int, Track, Transform]]) -> Self:
-        """Return the regions of bodies: (number, track, world_T_actor) of each actor.
-
-        A body has all voxels that it touches. Where bodies overlap, the smaller one takes precedence.
-        """
-        of_voxel = np.zeros(spec.num_voxels, np.uint16)
-        hidden, hidden_ends = np.zeros(spec.num_voxels, np.bool_), np.zeros(spec.num_voxels, np.bool_)
-        size = spec.voxel_size
-        # x and y of the centres of the columns of cells, (C, 2), z of the centres in each, and half the extent of the cells.
-        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[:, :, 0, :2].reshape(-1, 2)
-        columns, heights = columns.astype(np.float64), spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2]
-        width = np.hypot(columns[:, 0], columns[:, 1]) * size[1] if spec.coordinates == "cylindrical" else size[1]
-        across, up = np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)), float(size[2] / 2)
-        largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
-        for region, (_, track, pose) in enumerate(largest_first, 1):
-            actor_T_grid = invert(pose) @ world_T_grid
-            turned = np.abs(actor_T_grid[:3, :3])
-            middle = invert(actor_T_grid)[:2, 3]
-            reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
-            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
-            cells = np.column_stack([np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))])
-            slack = np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1) + up * turned[:, 2]
-            body = transform_points(actor_T_grid, cells)
-            inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
-            own = (near[:, None] * len(heights) + np.arange(len(heights))).reshape(-1)[inside]
-            of_voxel[own] = region
-            rear, front, low, high = track.extent.faces
-            mirrored = (rear, front, low or high, low or high)
-            hidden[own] = _on_hidden_face(track, body[inside], slack[inside], track.extent.faces)
-            hidden_ends[own] = _on_hidden_face(track, body[inside], slack[inside], mirrored)
-        present = np.unique(of_voxel[of_voxel != STATIC]).tolist()
-        actors = {region: largest_first[region - 1][0] for region in present}
-        return cls(of_voxel, actors, np.flatnonzero(hidden), np.flatnonzero(hidden_ends))
-
-
-def _on_hidden_face(
-    track: Track, cells: NDArray[np.float64], slack: NDArray[np.float64], faces: tuple[bool, bool, bool, bool]
-) -> NDArray[np.bool_]:
-    """Return which cells, (C, 3) centres in the actor's frame, touch a face that was not seen, and none that was seen.
-
-    Args:
-        track: the actor.
-        cells: centres of cells that its body touches.
-        slack: (C, 3) half the extent of each cell along the axes of the actor.
-        faces: whether the rear, the front, the side of low y and the side of high y were seen.
-    """
-    lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
-    away = np.stack([cells[:, 0] - lower[0], upper[0] - cells[:, 0], cells[:, 1] - lower[1], upper[1] - cells[:, 1]])
-    touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
-    seen = np.array(faces)[:, None]
-    return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)

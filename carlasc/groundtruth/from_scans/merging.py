@@ -18,7 +18,6 @@ from carlasc.core.geometry import Transform, invert, transform_points, translati
 from carlasc.core.scans import runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
-from carlasc.motion import usual_shell
 from carlasc.motion.tracks import MovingActors
 
 STATIC = 0  # region of the voxels that belong to no actor
@@ -255,13 +254,13 @@ class Merger:
     def mirrored(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield what the scans of actors would have seen if they had looked at the actors' other side.
 
-        Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body.
+        Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body, if that is known.
         """
         window, grid_T_world = list(window), now.grid_T_world
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            if not track.rigid or pose is None:
+            if not track.rigid or pose is None or not any(track.extent.known):
                 continue
             for other in window:
                 for carried in self._carry(number, other, now):
@@ -294,8 +293,8 @@ class Merger:
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            points = usual_shell(track.lower, track.upper, track.extent) if track.rigid else None
-            if points is not None and pose is not None:
+            points = track.surface
+            if len(points) and pose is not None:
                 labels = np.full(len(points), track.label, np.uint16)
                 yield Observation(points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE)
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import invert, multiply, transform_points
+from carlasc.core.geometry import invert, multiply, thin, transform_points
 from carlasc.errors import CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.motion import (
@@ -33,8 +33,9 @@ from carlasc.motion import (
     seen_from,
     tracks_from_boxes,
 )
+from carlasc.motion.bodies import surface_of
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors
+from carlasc.motion.tracks import FIRST_MOVER, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -45,10 +46,11 @@ from carlasc.storage.sinks import SequenceWriter
 TRACKS, POSES = "tracks", "poses"
 """What the files that keep actors and refined poses are called, in the folder of what is derived."""
 
-_VERSIONS = {TRACKS: 1, POSES: 1}  # of the methods: they change only when the same input gives another result
+_VERSIONS = {TRACKS: 2, POSES: 1}  # of the methods: they change only when the same input gives another result
 _NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece
+_SHAPE_POINTS = 64  # points of a boxed object in a scan that show its shape
 _BLOCK = 100  # frames whose evidence is found in one piece
 
 Item = TypeVar("Item")
@@ -131,9 +133,10 @@ class _MotionPass:
         with self._each(partial(self.feed.segments, boxes=moving), list(self.feed.times)) as scans:
             for scan in scans:
                 for segment in scan.segments:
-                    segments.setdefault(segment.instance, []).append(replace(segment, points=segment.points[:0]))
+                    few = replace(segment, points=thin(segment.points, _SHAPE_POINTS))
+                    segments.setdefault(segment.instance, []).append(few)
                 self._count(1)
-        return [_with_members(track, segments.get(track.instance, [])) for track in boxes]
+        return with_surfaces([_with_members(track, segments.get(track.instance, [])) for track in boxes])
 
     def movers(self, boxes: tuple[Track, ...]) -> tuple[list[Track], dict[int, NDArray[np.integer]]]:
         """Return the tracks of what moved although no field shows it, and the moved points of each frame that belong to none."""
@@ -211,7 +214,10 @@ def _with_members(track: Track, segments: list[Segment]) -> Track:
     counts = np.array([len(segment.members) for segment, _ in present])
     sensors = np.stack([transform_points(invert(pose), segment.origin) for segment, pose in present])
     members = {segment.frame: segment.members.astype(np.int32) for segment, _ in present}
-    return replace(track, members=members, extent=seen_from(track.extent.lower, track.extent.upper, counts, sensors))
+    extent = seen_from(track.extent.lower, track.extent.upper, counts, sensors)
+    body = np.concatenate([transform_points(invert(pose), segment.points) for segment, pose in present])
+    surface = surface_of(body if extent.exemplary else body[:0])
+    return replace(track, members=members, extent=extent, surface=surface)
 
 
 def _box_tracks(feed: ScanFeed) -> list[Track]:
