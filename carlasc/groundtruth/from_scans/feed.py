@@ -162,15 +162,15 @@ class ScanFeed:
         """Whether labels name the ground where it is: not if many points that lie on it have other classes, in some scans."""
         scans = [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
         found = [_labels(scan)[ground_points(scan.points)] for scan in scans]
-        others = np.concatenate([~np.isin(labels, sorted(self.classes.ground)) for labels in found] or [np.zeros(1)])
-        return bool(self.has_labels and others.sum() <= _OTHERWISE * len(others))
+        others = sum(int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground)))) for labels in found)
+        return self.has_labels and others <= _OTHERWISE * sum(map(len, found))
 
     @property
     def _sampled(self) -> list[int]:
         """Some frames with labels, which not all need to have."""
         labelled = self.sequence.frames("labels")
-        chosen = np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int)) if len(labelled) else []
-        return [int(frame) for frame in labelled[chosen]]
+        chosen = np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int)) if len(labelled) else labelled
+        return labelled[chosen].tolist()
 
     @cached_property
     def motion(self) -> tuple[str, ...]:

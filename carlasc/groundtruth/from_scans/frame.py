@@ -35,6 +35,9 @@ from carlasc.motion.tracks import MovingActors
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
 _RETURNED_PROBABILITY = 0.6  # that a voxel is occupied in which this scan has a return, and which other scans call free
+# Hits per metre of free path, in a voxel with a return of the frame's own scan, below which this return is an outlier: with other returns around
+# it, and alone.
+_OUTLIER_PER_M, _SINGLE_PER_M = 0.02, 0.05
 # Probabilities above which a voxel of a body is not free, and below which it is not occupied.
 _DOUBTFUL, _UNSURE = 0.1, 0.6
 _NO_VOXELS = np.empty(0, np.int64)
@@ -99,7 +102,7 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
         made.labels[driven] = 0
         made.set_probability(driven, _OWN_PROBABILITY)
     if consensus is not None:
-        steps.keep_returns(made, consensus)
+        steps.keep_returns(made, votes, consensus)
     if feed.finds_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
@@ -299,8 +302,8 @@ class _FrameSteps:
             return voxels
         return voxels[~self.vote(self.merger.recent(self.now, self.window)).seen(voxels)]
 
-    def keep_returns(self, made: _UnfinishedGrid, consensus: ClassConsensus) -> None:
-        """Make voxels occupied in which the frame's own scan has returns, whatever other scans say; an isolated return is taken for an outlier."""
+    def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
+        """Make voxels occupied in which the frame's own scan has returns, whatever other scans say, unless these are outliers."""
         if self.now.frame not in self.window:
             return
         spec, scan = self.plan.spec, self.feed.read(self.now.frame)
@@ -308,8 +311,11 @@ class _FrameSteps:
         voxels = spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, points))
         returns = np.bincount(voxels[voxels >= 0], minlength=spec.num_voxels).astype(np.int32)
         lost = np.flatnonzero((returns > 0) & (made.labels == 0) & (consensus.labels > 0))
-        blocks = np.lib.stride_tricks.sliding_window_view(np.pad(returns.reshape(spec.size), 1), (3, 3, 3))
-        kept = lost[blocks[np.unravel_index(lost, spec.size)].sum(axis=(1, 2, 3)) > 1]
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(returns.reshape(spec.size), 1), (3, 3, 3))
+        is_single = around[np.unravel_index(lost, spec.size)].sum(axis=(1, 2, 3)) == 1
+        free_m = votes.free.reshape(-1)[lost] * self.plan.voting.free_step_m
+        hits = votes.occupied_counts().reshape(-1)[lost]
+        kept = lost[hits >= np.where(is_single, _SINGLE_PER_M, _OUTLIER_PER_M) * free_m]
         made.labels[kept] = consensus.labels[kept]
         made.counts[kept] = np.maximum(made.counts[kept], returns[kept].astype(made.counts.dtype))
         made.set_probability(kept, _RETURNED_PROBABILITY)
