@@ -29,8 +29,10 @@ def test_points_up_to_two_metres_apart_are_one_actor():
     assert count((0, 0, CAR, 8.0), (3.0, 0, CAR, 8.0)) == 2
 
 
-def test_actors_of_different_classes_or_velocities_are_kept_apart():
-    assert count((0, 0, CAR, 8.0), (0.5, 0, PERSON, 8.0)) == 2
+def test_actors_of_different_velocities_are_kept_apart_and_wrong_classes_do_not_divide_one():
+    assert count((0, 0, CAR, 8.0), (0.5, 0, PERSON, 8.0)) == 1
+    (one,) = segment_by_flow(0, scan((0, 0, CAR, 8.0), (0.5, 0, CAR, 8.0), (0.2, 0, PERSON, 8.0)), np.eye(4))
+    assert one.label == CAR
     assert count((0, 0, CAR, 8.0), (0.5, 0, CAR, 7.2)) == 2
     assert count((0, 0, CAR, 8.0), (0.5, 0, CAR, 7.9)) == 1
 

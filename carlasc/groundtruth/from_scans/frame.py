@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import transform_points
-from carlasc.core.grids import Grid, VoxelFlag
+from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.body_regions import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
@@ -126,6 +126,15 @@ def _join_shares(
     taken = np.concatenate([_NO_VOXELS, *(hits["voxel"] for hits in later)])
     joined = np.concatenate([seen[~np.isin(seen["voxel"], taken)], *later])
     return joined[np.argsort(joined["voxel"], kind="stable")]
+
+
+def _have_neighbours(voxels: NDArray[np.int64], others: NDArray[np.int64], spec: GridSpec) -> NDArray[np.bool_]:
+    """Return which of some voxels, (N,) flat indices, have one of others, (M,) increasing, among the 26 around them."""
+    around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    near = np.stack(np.unravel_index(voxels, spec.size), axis=-1)[:, None] + around[np.any(around != 0, axis=1)]
+    inside = ((near >= 0) & (near < spec.size)).all(axis=2)
+    flat = np.ravel_multi_index(tuple(np.moveaxis(near, 2, 0)), spec.size, mode="clip")
+    return (np.isin(flat, others) & inside).any(axis=1)
 
 
 @dataclass(frozen=True)
@@ -308,16 +317,20 @@ class _FrameSteps:
             return
         spec, scan = self.plan.spec, self.feed.read(self.now.frame)
         points = scan.points if self.merger.dynamic != "drop" else scan.points[self.merger.static(self.now.frame)]
-        voxels = spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, points))
-        returns = np.bincount(voxels[voxels >= 0], minlength=spec.num_voxels).astype(np.int32)
-        lost = np.flatnonzero((returns > 0) & (made.labels == 0) & (consensus.labels > 0))
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(returns.reshape(spec.size), 1), (3, 3, 3))
-        is_single = around[np.unravel_index(lost, spec.size)].sum(axis=(1, 2, 3)) == 1
-        free_m = votes.free.reshape(-1)[lost] * self.plan.voting.free_step_m
-        hits = votes.occupied_counts().reshape(-1)[lost]
-        kept = lost[hits >= np.where(is_single, _SINGLE_PER_M, _OUTLIER_PER_M) * free_m]
-        made.labels[kept] = consensus.labels[kept]
-        made.counts[kept] = np.maximum(made.counts[kept], returns[kept].astype(made.counts.dtype))
+        found = spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, points))
+        returned, returns = np.unique(found[found >= 0], return_counts=True)
+        is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
+        lost, is_single = (
+            returned[is_lost],
+            (returns[is_lost] == 1) & ~_have_neighbours(returned[is_lost], returned, spec),
+        )
+        rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
+        hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
+        free = votes.free.reshape(-1)[lost]
+        enough = np.where(is_single, _SINGLE_PER_M, _OUTLIER_PER_M) * self.plan.voting.free_step_m
+        is_kept = hits >= enough * free
+        kept = lost[is_kept]
+        made.labels[kept], made.counts[kept] = consensus.labels[kept], (hits + free)[is_kept]
         made.set_probability(kept, _RETURNED_PROBABILITY)
 
     def driven(self, made: _UnfinishedGrid) -> NDArray[np.int64]:

@@ -72,7 +72,8 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
 
     confusion, frequency = np.zeros((len(present), len(present))), np.zeros(len(present))
     _compare(voxels, begins, own, weight, rows, size, confusion, frequency)
-    wrong = max(1 - float(np.trace(confusion)) / max(float(confusion.sum()), 1.0), _LEAST_WRONG)
+    compared = float(confusion.sum())
+    wrong = max(1 - float(np.trace(confusion)) / compared, _LEAST_WRONG) if compared else _LEAST_WRONG
     usual = np.full_like(confusion, wrong / max(len(present) - 1, 1))
     np.fill_diagonal(usual, 1 - wrong)
     confusion += _SMOOTHING * usual
