@@ -211,3 +211,26 @@ class TestOwnPath:
 
     def test_what_the_frame_itself_sees_stays(self, tmp_path):
         assert at(self.make(tmp_path, seen_now=True), self.TRACE)[0] == VEHICLE
+
+
+class TestOwnReturns:
+    """A thing of two points that only the frame's own scan hit; the rays of the other scans go through it."""
+
+    THING = ((8.1, 0.2, 0.1), (8.1, 0.3, 0.1))
+
+    def make(self, folder, things=THING, label=BUILDING, through=1, **options):
+        behind = [(tuple(np.array(place) * (1 + 7.5 / np.linalg.norm(place))), BUILDING) for place in self.THING]
+        scans = {frame: behind * through if frame != NOW else [(place, label) for place in things] for frame in FRAMES}
+        return merge(feed_of(folder, scans, own_path=False, **options), MovingActors())
+
+    @pytest.mark.parametrize("dynamic", ["align", "current", "drop"])
+    def test_they_are_occupied_whatever_other_scans_say(self, tmp_path, dynamic):
+        merged = self.make(tmp_path, dynamic=dynamic)
+        assert at(merged, self.THING[0])[0] == BUILDING
+        assert merged.evidence.occupied.reshape(-1)[SPEC.flat_index(np.array(self.THING[:1]))[0]] > 0.5
+
+    def test_one_alone_is_an_outlier(self, tmp_path):
+        assert at(self.make(tmp_path, self.THING[:1]), self.THING[0])[0] == 0
+
+    def test_so_are_some_that_hundreds_of_rays_contradict(self, tmp_path):
+        assert at(self.make(tmp_path, through=4), self.THING[0])[0] == 0

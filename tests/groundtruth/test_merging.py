@@ -305,3 +305,13 @@ class TestFeed:
             folder.write("labels", frame, np.array(labels, np.uint32))
             (sequence,) = FolderSource(tmp_path).sequences().values()
             assert ScanFeed(sequence, FromScans()).finds_ground == (ROAD not in labels)
+
+
+def test_all_points_of_an_actor_vote_for_its_class():
+    scans = {frame: scan(frame, PEDESTRIAN if frame % 4 else VEHICLE) for frame in FRAMES}
+    actors = MovingActors({0: track(VEHICLE)})
+    merger = Merger(scans.__getitem__, actors, CARLA, "align")
+    for frame in FRAMES:
+        assert merger.labels(frame).tolist() == [ROAD, VEHICLE, 1]
+    assert scans[1].labels.tolist() == [ROAD, PEDESTRIAN, 1]  # the scan keeps its own
+    assert Merger(scans.__getitem__, actors, CARLA, "tube").labels(1).tolist() == [ROAD, PEDESTRIAN, 1]

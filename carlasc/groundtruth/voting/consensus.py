@@ -29,6 +29,7 @@ _SURE = 0.999  # a voxel whose own votes say more is not changed by its neighbou
 _UNHEARD = 1e-3  # least probability that neighbours give a class
 _PRIOR = 6.0  # weight of the likeliest class in the shares of a voxel, in votes
 _HEARD = 5.0  # votes after which more of them make no class likelier: a voxel may hold two things
+_FEW = 2.5  # fewer votes are of one thing
 _SHARES = 5  # steps in which shares are found
 
 
@@ -179,13 +180,13 @@ def _ask(
         place: (N,) row of each voxel in `shares`; -1 if it is plainly of the class of its only row.
         shares: (D, K) output.
     """
-    # Where two things share a voxel, each must explain the points of the other as badly as the other way round.
-    logarithms, kinds = np.log(confusion), len(frequency)
-    logarithms = (logarithms + logarithms.T) / 2
+    kinds, few = len(frequency), np.log(confusion)
+    # Many votes for two classes are of two things in the voxel: each explains the points of the other as badly as the other way round.
+    many = (few + few.T) / 2
     doubtful, asked = np.empty(len(shares), np.int64), 0
     for i in range(len(voxels)):
         if place[i] >= 0:
-            _weigh(i, begins, own, weight, logarithms, frequency, shares[place[i]])
+            _weigh(i, begins, own, weight, few, many, frequency, shares[place[i]])
             if shares[place[i]].max() < _SURE:
                 doubtful[asked] = i
                 asked += 1
@@ -194,7 +195,7 @@ def _ask(
         for k in range(asked):
             i = doubtful[k]
             _hear(voxels[i], begins, own, weight, rows, size, frequency, place, shares, prior)
-            _weigh(i, begins, own, weight, logarithms, prior, changed[k])
+            _weigh(i, begins, own, weight, few, many, prior, changed[k])
         for k in range(asked):
             shares[place[doubtful[k]]] = changed[k]
     likeliest, left = np.empty(kinds), np.empty(kinds)
@@ -209,7 +210,8 @@ def _weigh(
     begins: NDArray[np.int64],
     own: NDArray[np.int64],
     weight: NDArray[np.float64],
-    logarithms: NDArray[np.float64],
+    few: NDArray[np.float64],
+    many: NDArray[np.float64],
     prior: NDArray[np.float64],
     out: NDArray[np.float32],
 ) -> None:
@@ -217,7 +219,8 @@ def _weigh(
     scores = np.log(prior + _UNHEARD)
     total = weight[begins[i] : begins[i + 1]].sum()
     for row in range(begins[i], begins[i + 1]):
-        scores += min(1.0, _HEARD / total) * weight[row] * logarithms[:, own[row]]
+        likely = few[:, own[row]] if total < _FEW else many[:, own[row]]
+        scores += min(1.0, _HEARD / total) * weight[row] * likely
     best = scores.max()
     total = 0.0
     for c in range(len(prior)):
