@@ -28,6 +28,7 @@ class Changed(Sequence):
         sequence: the sequence.
         keep: returns which points of a frame are kept; None keeps all.
         instances: returns the instances of a frame; None for those of the sequence.
+        labels: returns the labels of a frame; None for those of the sequence.
         boxes: the boxes by frame; None for those of the sequence.
     """
 
@@ -37,9 +38,11 @@ class Changed(Sequence):
         *,
         keep: Keep | None = None,
         instances: Callable[[int], NDArray[np.uint32]] | None = None,
+        labels: Callable[[int], NDArray[np.unsignedinteger]] | None = None,
         boxes: Mapping[int, Boxes] | None = None,
     ) -> None:
-        self._sequence, self._keep, self._instances, self._boxes = sequence, keep, instances, boxes
+        self._sequence, self._keep, self._boxes = sequence, keep, boxes
+        self._made = {name: made for name, made in (("instances", instances), ("labels", labels)) if made}
         self.path, self.location, self.split = sequence.path, sequence.location, sequence.split
         self.name, self.coordinates = sequence.name, sequence.coordinates
 
@@ -57,10 +60,7 @@ class Changed(Sequence):
         """Read one field of one frame."""
         if field == "boxes":
             return self._sequence.read(field, frame) if self._boxes is None else self._boxes[frame].to_table()
-        if field == "instances" and self._instances is not None:
-            values: NDArray[Any] = self._instances(frame)
-        else:
-            values = self._sequence.read(field, frame)
+        values: NDArray[Any] = self._made[field](frame) if field in self._made else self._sequence.read(field, frame)
         return values if self._keep is None else values[self._keep(frame)]
 
     def documents(self) -> tuple[str, ...]:

@@ -1,0 +1,170 @@
+"""What wrong labels do to ground truth from scans: `python docs/studies/labels.py [WORK]` prints the tables of docs/ground-truth.md as rows finish.
+
+The labels of the drives of `movers.py` are made wrong in several ways, and their grids are compared with what 40 other sensors saw at the same instant.
+WORK keeps drives and references, as that of `movers.py` does.
+
+    --town, --street SEED ...   other drives (61 to 65 and 261 to 265)
+    --hint flow|evidence        what tells how things move (flow)
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from movers import SEEDS
+from movers_drives import GRIDS, Recorded, Reference, record, reference
+from movers_rows import EVIDENCE, FLOW, Changed
+from numpy.typing import NDArray
+
+from carlasc import FromScans, Grid
+from carlasc.core.frames import FrameRange
+from carlasc.core.geometry import transform_points
+from carlasc.core.tables import CARLA
+from carlasc.groundtruth import Voting
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.voting.certainty import class_shares
+from carlasc.storage import Sequence
+from carlasc.testing import wrong_labels
+
+NAMES = ("Vehicle", "Pedestrian", "Pole", "Road", "Sidewalk", "Building", "Vegetation")
+CONFUSED = {
+    "Road": "Sidewalk",
+    "Sidewalk": "Road",
+    "Vegetation": "Terrain",
+    "Terrain": "Vegetation",
+    "Building": "Wall",
+}
+Labels = NDArray[np.unsignedinteger]
+
+
+def at_random(labels: Labels, points: NDArray[np.float64], frame: int) -> Labels:
+    """A fifth of the points, each for itself."""
+    return wrong_labels(labels, points, 0.2, seed=frame)
+
+
+def in_clumps(labels: Labels, points: NDArray[np.float64], frame: int) -> Labels:
+    """A quarter of the points, in cubes of 1 m that are others in each scan."""
+    return wrong_labels(labels, points, 0.25, clump_m=1.0, seed=frame)
+
+
+def confused(labels: Labels, points: NDArray[np.float64], frame: int) -> Labels:
+    """A fifth of the points of some classes, which are taken for one other class."""
+    rng, made = np.random.default_rng(frame), labels.copy()
+    for name, other in CONFUSED.items():
+        made[(labels == CARLA.id_of(name)) & (rng.random(len(labels)) < 0.2)] = CARLA.id_of(other)
+    return made
+
+
+CASES: dict[str, Callable[[Labels, NDArray[np.float64], int], Labels] | None] = {
+    "right": None,
+    "20 % wrong, at random": at_random,
+    "25 % wrong, in clumps of 1 m": in_clumps,
+    "20 % confused with one other class": confused,
+}
+
+
+class Score:
+    """What is counted of grids beside references, and the figures of it."""
+
+    def __init__(self) -> None:
+        self.classes = np.zeros((len(NAMES), 3))
+        self.right, self.occupied = np.zeros(2), np.zeros(3)
+        self.returns = np.zeros((2, 2))
+        self.shares: list[NDArray[np.float64]] = []
+
+    def add(self, grid: Grid, seen: Reference, shares: NDArray[np.void], drive: Recorded, frame: int) -> None:
+        """Count a frame."""
+        made, truth, both = grid.labels, seen.labels, seen.judged & grid.known
+        for index, name in enumerate(NAMES):
+            own, found = both & (truth == CARLA.id_of(name)), both & (made == CARLA.id_of(name))
+            self.classes[index] += (own & found).sum(), own.sum(), found.sum()
+        there, full = both & (truth > 0), both & (made > 0)
+        self.occupied += (there & full).sum(), there.sum(), full.sum()
+        self.right += (there & full & (truth == made)).sum(), (there & full).sum()
+        top = np.zeros(grid.spec.num_voxels)
+        np.maximum.at(top, shares["voxel"], shares["votes"] / 65535)
+        judged = (there & full).reshape(-1)
+        self.shares.append(np.stack([top[judged], (truth == made).reshape(-1)[judged]]))
+        scan = drive.sequence.scan(frame, ("labels",))
+        voxels = grid.spec.flat_index(scan.points)
+        solid = (voxels >= 0) & (scan.labels > 0) & ~np.isin(scan.labels, sorted(CARLA.ground))
+        for index, own in enumerate((solid, solid & (scan.labels == CARLA.id_of("Vehicle")))):
+            self.returns[index] += (made.reshape(-1)[voxels[own]] > 0).sum(), own.sum()
+
+    def figures(self) -> dict[str, float]:
+        """Return IoUs, the share of occupied voxels of the right class, the calibration error of the class, and the share of own returns that are occupied."""
+        hit, own, found = self.classes.T
+        likely, right = np.concatenate(self.shares, axis=1)
+        bins = np.array_split(np.argsort(likely, kind="stable"), 15)
+        error = sum(abs(float((likely[b] - right[b]).sum())) for b in bins) / len(likely)
+        values = dict(zip(NAMES, hit / (own + found - hit), strict=True))
+        both, there, full = self.occupied
+        return {
+            "occupied": both / (there + full - both),
+            "class right": self.right[0] / self.right[1],
+            "ECE of the class": error,
+            **values,
+            "own returns": self.returns[0, 0] / self.returns[0, 1],
+            "of vehicles": self.returns[1, 0] / self.returns[1, 1],
+        }
+
+
+def with_labels(drive: Recorded, case: str) -> Sequence:
+    """Return a drive with wrong labels."""
+    change = CASES[case]
+    if change is None:
+        return drive.sequence
+
+    def labels(frame: int) -> Labels:
+        points = transform_points(drive.sequence.read_pose(frame), drive.sequence.scan(frame, ()).points)
+        return change(drive.sequence.read("labels", frame), points, frame)
+
+    return Changed(drive.sequence, labels=labels)
+
+
+def judge(drive: Recorded, references: dict[int, Reference], case: str, observe: FromScans) -> dict[str, float]:
+    """Make the judged frames of a drive, and return the figures."""
+    plan = GridPlan(GRIDS["coarse"], "grid", observe, Voting(keep_evidence=True), FrameRange())
+    feed, score = ScanFeed(with_labels(drive, case), observe), Score()
+    actors = find_actors(feed)
+    for frame, seen in references.items():
+        merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        shares = merged.evidence.classes if merged.evidence else class_shares(merged.votes.occupied, CARLA)
+        score.add(merged.grid, seen, shares, drive, frame)
+    return score.figures()
+
+
+def main() -> None:
+    """Print the rows of each drive, and the means."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", nargs="?", type=Path)
+    parser.add_argument("--hint", choices=("flow", "evidence"), default="flow")
+    for kind, seeds in SEEDS.items():
+        parser.add_argument(f"--{kind}", nargs="*", type=int, default=seeds)
+    given = parser.parse_args()
+    found: dict[str, list[dict[str, float]]] = {case: [] for case in CASES}
+    with tempfile.TemporaryDirectory() as temporary:
+        work = given.work or Path(temporary)
+        for kind, seed in [(world, number) for world in SEEDS for number in getattr(given, world)]:
+            (drive,) = record(kind, seed, [32], work)
+            references = {
+                frame: seen for (grid, frame), seen in reference(kind, seed, work).items() if grid == "coarse"
+            }
+            for case, rows in found.items():
+                rows.append(judge(drive, references, case, FLOW if given.hint == "flow" else EVIDENCE))
+                print(kind, seed, case, " ".join(f"{k} {v:.3f}" for k, v in rows[-1].items()), flush=True)
+    names = list(found["right"][0])
+    print(f"\n| labels | {' | '.join(names)} |\n|---|{'---:|' * len(names)}")
+    for case, rows in found.items():
+        print(f"| {case} | {' | '.join(f'{np.mean([row[name] for row in rows]):.3f}' for name in names)} |")
+
+
+if __name__ == "__main__":
+    main()
