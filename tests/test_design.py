@@ -10,7 +10,9 @@ from entered import cases, count_case
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
-MOST_FILES, DEEPEST = 42, 16  # of the package, that one frame of `regrid` from scans enters: see tests/tools/entered.py
+# Of the package, that one frame of `regrid` from scans enters: see tests/tools/entered.py. 42 before scans agreed on classes (consensus.py), and the
+# regions of bodies had a file of their own.
+MOST_FILES, DEEPEST = 44, 16
 
 
 def rooms():

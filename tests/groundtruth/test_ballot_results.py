@@ -67,7 +67,7 @@ def test_an_observation_without_points_is_a_voter_without_votes() -> None:
 
 def test_sparse_votes_are_sorted_and_those_that_do_not_fit_are_kept_as_the_most_that_does() -> None:
     spec = GridSpec("cartesian", (2, 1, 1), (0.0, 0.0, 0.0), (2.0, 1.0, 1.0))
-    occupied = np.array([(0, 7, 70_000, 1), (1, 3, 65_535, 1), (1, 9, 5, 1)], OCCUPIED_DTYPE)
+    occupied = np.array([(0, 7, 70_000, 1, 1), (1, 3, 65_535, 1, 1), (1, 9, 5, 1, 1)], OCCUPIED_DTYPE)
     votes = Votes(spec, CARLA, np.array([0, 100_000], np.int64).reshape(spec.size), occupied)
     sparse = votes.to_sparse()
     assert sparse.dtype == VOTES_DTYPE

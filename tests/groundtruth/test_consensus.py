@@ -35,7 +35,7 @@ def votes_of(truth, wrong, seed=0, scans=(1, 1, 2, 5, 20)):
     pairs, place = np.unique(voxel * 100 + labels, return_inverse=True)
     rows = np.zeros(len(pairs), OCCUPIED_DTYPE)
     rows["voxel"], rows["label"] = np.divmod(pairs, 100)
-    rows["votes"] = np.bincount(place)
+    rows["votes"] = rows["sure"] = np.bincount(place)
     voters = np.unique(place * 1000 + scan)
     rows["voters"] = np.bincount(voters // 1000, minlength=len(pairs))
     return rows
@@ -109,7 +109,7 @@ def test_shares_say_how_often_the_class_is_right(street):
 def test_a_voxel_with_two_things_keeps_the_shares_of_both(street):
     votes = votes_of(street, lambda rng, labels: labels)
     place = SPEC.num_voxels - 1  # far from everything
-    mixed = np.array([(place, BUILDING, 60, 20), (place, POLE, 40, 20)], OCCUPIED_DTYPE)
+    mixed = np.array([(place, BUILDING, 60, 20, 60), (place, POLE, 40, 20, 40)], OCCUPIED_DTYPE)
     found = agree(np.concatenate([votes, mixed]), SPEC, CARLA)
     shares = {int(row["label"]): row["votes"] / 65535 for row in found.shares if row["voxel"] == place}
     assert found.labels[place] == BUILDING
@@ -121,7 +121,7 @@ def test_scans_count_and_not_their_points(street):
     votes = votes_of(street, at_random(0.25))
     voxel = np.flatnonzero(street.reshape(-1) == BUILDING)[100]
     others = votes[votes["voxel"] != voxel]
-    own = np.array([(voxel, BUILDING, 6, 3), (voxel, OTHER, 5, 1)], OCCUPIED_DTYPE)
+    own = np.array([(voxel, BUILDING, 6, 3, 6), (voxel, OTHER, 5, 1, 5)], OCCUPIED_DTYPE)
     rows = np.concatenate([others[others["voxel"] < voxel], own, others[others["voxel"] > voxel]])
     assert agree(rows, SPEC, CARLA).labels[voxel] == BUILDING
 
@@ -129,6 +129,24 @@ def test_scans_count_and_not_their_points(street):
 def test_no_votes_and_one_class():
     nothing = agree(np.empty(0, OCCUPIED_DTYPE), SPEC, CARLA)
     assert not nothing.labels.any() and not len(nothing.shares)
-    one = agree(np.array([(3, ROAD, 2, 1), (9, ROAD, 1, 1)], OCCUPIED_DTYPE), SPEC, CARLA)
+    one = agree(np.array([(3, ROAD, 2, 1, 2), (9, ROAD, 1, 1, 1)], OCCUPIED_DTYPE), SPEC, CARLA)
     assert one.labels[[3, 9]].tolist() == [ROAD, ROAD]
     assert one.shares["votes"].tolist() == [65535, 65535]
+
+
+def test_votes_of_which_a_network_is_not_sure_count_less(street):
+    """Half of the points are wrong, and a network says of them, and of one in four right ones, that it is not sure."""
+    rng = np.random.default_rng(3)
+    voxels = np.flatnonzero(street)
+    rows = np.zeros(2 * len(voxels), OCCUPIED_DTYPE)
+    rows["voxel"], rows["votes"], rows["voters"] = np.repeat(voxels, 2), 5, 5
+    own = street.reshape(-1)[voxels]
+    other = np.array(CLASSES)[(np.searchsorted(np.sort(CLASSES), own) + rng.integers(1, 5, len(own))) % 5]
+    other = np.where(other == own, np.where(own == ROAD, OTHER, ROAD), other)
+    pair = np.sort(np.stack([own, other], axis=1), axis=1)
+    rows["label"] = pair.reshape(-1)
+    rows["sure"] = np.where(rows["label"] == np.repeat(own, 2), 4.0, 1.5)
+    found = agree(rows, SPEC, CARLA)
+    rows["sure"] = 5
+    assert right(found.labels, street) > 0.99
+    assert right(agree(rows, SPEC, CARLA).labels, street) < 0.9

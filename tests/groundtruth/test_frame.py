@@ -213,6 +213,20 @@ class TestOwnPath:
         assert at(self.make(tmp_path, seen_now=True), self.TRACE)[0] == VEHICLE
 
 
+def test_labels_of_which_a_network_is_not_sure_count_less(tmp_path):
+    names, likely = [BUILDING] * 3 + [ROAD] * 2, [0.3] * 3 + [0.9] * 2
+    scans = {frame: [((8.1, 0.2 + 0.02 * i, 0.1), name) for i, name in enumerate(names)] for frame in FRAMES}
+    feed = feed_of(tmp_path / "sure", scans, own_path=False)
+    assert at(merge(feed, MovingActors()), (8.1, 0.2, 0.1))[0] == BUILDING
+    writer = FolderSink(tmp_path / "unsure").sequence("Val/Street/cartesian")
+    pairs = np.zeros((5, 6), np.uint16)
+    pairs[:, 0], pairs[:, 1] = names, np.array(likely) * layout.CERTAIN
+    for frame in FRAMES:
+        writer.write("probabilities", frame, pairs)
+    feed = feed_of(tmp_path / "unsure", scans, own_path=False)
+    assert at(merge(feed, MovingActors()), (8.1, 0.2, 0.1))[0] == ROAD
+
+
 class TestOwnReturns:
     """A thing of two points that only the frame's own scan hit; the rays of the other scans go through it."""
 

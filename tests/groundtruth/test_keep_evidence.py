@@ -177,6 +177,6 @@ def test_the_probability_of_a_class_is_its_share_of_the_votes(classes, dtype):
 
 
 def test_a_class_alone_is_certain_and_one_with_hardly_any_vote_is_left_out():
-    rows = np.array([(2, 7, 1, 1), (2, 1, 100_000, 1), (0, 10, 3, 1)], OCCUPIED_DTYPE)
+    rows = np.array([(2, 7, 1, 1, 1), (2, 1, 100_000, 1, 1), (0, 10, 3, 1, 1)], OCCUPIED_DTYPE)
     assert class_shares(rows, CARLA).tolist() == [(0, 10, 65535), (2, 1, 65534)]
     assert len(class_shares(rows[:0], CARLA)) == 0

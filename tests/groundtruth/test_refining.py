@@ -16,6 +16,7 @@ from carlasc import GridSpec, Run
 from carlasc.captures import Lidar, SimulatedCapture
 from carlasc.core.geometry import invert, multiply, slerp, translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
+from carlasc.groundtruth import refining
 from carlasc.inspection import validate
 from carlasc.motion import PoseOptions
 from carlasc.storage import FolderSink, Metadata, layout
@@ -155,8 +156,9 @@ def test_lines_of_frames_without_a_scan_move_with_the_scan_before_them(data, tru
     assert off_m(np.delete(found, 7, axis=0), np.delete(truth, 7, axis=0)) < 0.005
 
 
-def test_missing_poses_are_estimated_unless_those_of_the_data_are_asked_for(exact, truth, tmp_path):
+def test_missing_poses_are_estimated_unless_those_of_the_data_are_asked_for(exact, truth, tmp_path, monkeypatch):
     pytest.importorskip("kiss_icp")
+    monkeypatch.setattr(refining, "find_mounting", lambda *_: pytest.fail("estimated poses are those of the sensor"))
     (exact / ONE / "poses.txt").unlink()
     with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=PoseOptions\(\"kiss-icp\"\)"):
         carlasc.refine(exact, tmp_path / "file", poses=PoseOptions("file"), run=ALONE)

@@ -41,7 +41,7 @@ from carlasc.storage.resuming import scans_digest
 _SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground
 _OTHERWISE = 0.1  # share of the points on the ground with other classes: feet of walls and kerbs have 2 to 4 %, labels that are often wrong 15 %
-_USED = ("labels", "flow", "instances", "origins")  # fields of a scan that are read for merging
+_USED = ("labels", "flow", "instances", "origins", "probabilities")  # fields of a scan that are read for merging
 _PARTS = 30  # with `window_m`, scans are at least this fraction of it apart
 
 
@@ -294,6 +294,7 @@ class ScanFeed:
                     seconds=self.time(frame),
                     moving=np.flatnonzero(moving),
                     origins=scan.others.get("origins"),
+                    probabilities=scan.others.get("probabilities"),
                 )
                 first, last = self.options.window
                 while len(self._scans) > last - first + 2:

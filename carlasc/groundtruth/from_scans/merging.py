@@ -19,6 +19,7 @@ from carlasc.core.scans import runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
 from carlasc.motion.tracks import MovingActors
+from carlasc.storage import layout
 
 STATIC = 0  # region of the voxels that belong to no actor
 _DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
@@ -127,6 +128,7 @@ class PreparedScan:
         reach_m: distance of the farthest point, metres.
         seconds: time of the scan.
         moving: (M,) indices of the points that move by their flow or their class, on a track or not.
+        sure: (N,) float32, probability of each label, as a network gave it; None: 1.
         rays: the rays to the points, by where they began: at one place, unless there are several sensors, or the vehicle moved.
     """
 
@@ -138,6 +140,7 @@ class PreparedScan:
     seconds: float
     moving: NDArray[np.int64]
     rays: tuple[RaysFromPlace, ...]
+    sure: NDArray[np.float32] | None = None
 
     @classmethod
     def of(
@@ -150,6 +153,7 @@ class PreparedScan:
         seconds: float = 0.0,
         moving: NDArray[np.int64] | None = None,
         origins: NDArray[np.float32] | None = None,
+        probabilities: NDArray[np.uint16] | None = None,
     ) -> PreparedScan:
         """Prepare the voting points of a scan.
 
@@ -161,11 +165,16 @@ class PreparedScan:
             seconds: time of the scan.
             moving: (M,) indices of the points that move; None: none does.
             origins: (N, 3) where the ray to each point began, metres; None: all at the sensor. Points with one origin are next to each other.
+            probabilities: (N, 6) the field of the scan; None: labels are sure.
         """
         reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
         moving = np.empty(0, np.int64) if moving is None else moving
+        sure = None
+        if probabilities is not None:  # labels that it does not name first were found by carlasc
+            likely = probabilities[:, 1] / np.float32(layout.CERTAIN)
+            sure = np.where(probabilities[:, 0] == labels, likely, np.float32(1)).astype(np.float32)
         rays = tuple(RaysFromPlace.of(points, part, origin) for part, origin in runs_of_origins(origins, len(points)))
-        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, rays)
+        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, rays, sure)
 
     def observations(
         self,
@@ -192,6 +201,7 @@ class PreparedScan:
                 pose if len(self.rays) == 1 and not rays.sensor_T_place[:3, 3].any() else pose @ rays.sensor_T_place,
                 None if hits is None else hits[rays.part],
                 free_region=free_region,
+                sure=None if self.sure is None else self.sure[rays.part],
             )
 
 

@@ -24,9 +24,12 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
+_ALL_SURE = np.empty(0, np.float32)
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
-OCCUPIED_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("votes", np.int64), ("voters", np.int32)])
+OCCUPIED_DTYPE = np.dtype(
+    [("voxel", np.int32), ("label", np.uint16), ("votes", np.int64), ("voters", np.int32), ("sure", np.float32)]
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class Observation:
         hits: (N,) bool, points that vote for their class; of the other points only the rays vote. None: all points.
         hit_region: region of the grid in which the points vote; None for the whole grid.
         free_region: region of the grid in which the rays vote; None for the whole grid.
+        sure: (N,) float32, probability of the class of each point; None: 1.
 
     Raises:
         FormatError: points and labels differ in length, have another shape or type, or the transform is not rigid.
@@ -52,6 +56,7 @@ class Observation:
     hits: NDArray[np.bool_] | None = None
     hit_region: int | None = None
     free_region: int | None = None
+    sure: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -183,6 +188,7 @@ class Ballot:
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
             labels,
             labels if observation.hits is None else np.where(observation.hits, labels, np.uint16(0)),
+            _ALL_SURE if observation.sure is None else np.require(observation.sure, np.float32, ["C", "A", "W"]),
             as_pose(observation.grid_T_sensor),
             self._cells,
             self.free_step_m,
@@ -245,7 +251,7 @@ class Votes:
         classes: class table of the labels.
         free: (X, Y, Z) unsigned integer, votes for free space.
         occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0) and `voters`
-            (int32), the number of observations that they are of; one row per voxel and class, sorted by voxel, then by label.
+            (int32), the number of observations that they are of, and `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted by voxel, then by label.
     """
 
     spec: GridSpec

@@ -53,7 +53,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     """Return the class that each voxel has by the votes of all scans.
 
     Args:
-        votes: (M,) structured, as `Votes.occupied`: `voxel`, `label`, `votes` and `voters`, sorted by voxel, then by label.
+        votes: (M,) structured, as `Votes.occupied`: `voxel`, `label`, `votes`, `voters` and `sure`, sorted by voxel, then by label.
         spec: the grid.
         classes: class table of the labels.
     """
@@ -68,7 +68,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     rows[voxels] = np.arange(len(voxels))
     # The points of one scan are wrong together, so each scan counts as one vote, of which each class has its share.
     scans = np.maximum.reduceat(votes["voters"], begins[:-1]) / np.add.reduceat(votes["votes"], begins[:-1])
-    weight = votes["votes"] * np.repeat(scans, np.diff(begins))
+    weight = votes["sure"] * np.repeat(scans, np.diff(begins))
     size = np.array(spec.size)
 
     confusion, frequency = np.zeros((len(present), len(present))), np.zeros(len(present))

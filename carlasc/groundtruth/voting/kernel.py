@@ -50,11 +50,12 @@ CANDIDATE_DTYPE = np.dtype(
         ("next", np.int32),
         ("voter", np.int32),
         ("voters", np.int32),
+        ("sure", np.float32),
         ("label", np.uint16),
     ],
     align=True,
 )
-"""A class that a voxel may have: its votes, the observation that voted for it last, how many did, and the voxel's next candidate."""
+"""A class that a voxel may have: its votes, the observation that voted for it last, how many did, how sure they are in sum, and the next candidate."""
 
 
 class Tally(NamedTuple):
@@ -95,6 +96,7 @@ def count_view(voxel: int, voter: int, tally: Tally) -> None:
 def vote_occupied(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
+    sure: NDArray[np.float32],
     rays: RayBlock,
     hits: NDArray[np.int32],
     pose: Pose,
@@ -111,12 +113,12 @@ def vote_occupied(
         if voxel == DOUBTFUL or rays.state[i] == UNSURE:
             _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
         if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
-            vote_for(voxel, labels[i], voter, tally)
+            vote_for(voxel, labels[i], sure[i] if len(sure) else np.float32(1), voter, tally)
             count_view(voxel, voter, tally)
 
 
 @inlined
-def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
+def vote_for(voxel: int, label: int, sure: np.float32, voter: int, tally: Tally) -> None:
     """Add a vote for a class to a voxel."""
     candidates = tally.candidates
     entry = tally.heads[voxel]
@@ -126,6 +128,7 @@ def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
         entry = tally.used[0]
         tally.used[0] += 1
         candidates[entry].votes = candidates[entry].voters = 0
+        candidates[entry].sure = 0
         candidates[entry].voxel = voxel
         candidates[entry].next = tally.heads[voxel]
         candidates[entry].voter = NONE
@@ -133,6 +136,7 @@ def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> None:
         tally.heads[voxel] = entry
     is_new = candidates[entry].voter != voter
     candidates[entry].voters += is_new
+    candidates[entry].sure += sure
     candidates[entry].votes += is_new or not tally.once
     candidates[entry].voter = voter
 
@@ -237,6 +241,7 @@ def vote(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
     hit_labels: NDArray[np.uint16],
+    sure: NDArray[np.float32],
     pose: Pose,
     cells: Cells,
     free_step_m: float,
@@ -251,6 +256,7 @@ def vote(
         points: (3 N,) float32, metres, x, y, z of each point in the sensor's frame.
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
         hit_labels: (N,) uint16, the classes that the points vote for; 0 where only the ray votes.
+        sure: (N,) float32, probability of these classes; empty if all are 1.
         pose: grid_T_sensor.
         cells: the cells of the grid.
         free_step_m: distance between two free samples, metres.
@@ -266,7 +272,7 @@ def vote(
         clip(corner, block, free_step_m, view, rays)
         place_points(rays, view, hits)
         own = hit_labels[begin : begin + BLOCK]
-        vote_occupied(corner, own, rays, hits, pose, cells, voter, hit_region, tally)
+        vote_occupied(corner, own, sure[begin : begin + BLOCK], rays, hits, pose, cells, voter, hit_region, tally)
         if free_region != NOT_AT_ALL:
             vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
     if tally.once:
@@ -285,7 +291,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
     Args:
         heads: (V,) index of the first candidate of each voxel, or NONE.
         candidates: (C,) CANDIDATE_DTYPE.
-        rows: (C,) output, `voxel`, `label`, `votes`, `voters`.
+        rows: (C,) output, `voxel`, `label`, `votes`, `voters`, `sure`.
     """
     end = 0
     for head in heads:
@@ -299,6 +305,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
             rows[row].label = candidates[entry].label
             rows[row].votes = candidates[entry].votes
             rows[row].voters = candidates[entry].voters
+            rows[row].sure = candidates[entry].sure
             end += 1
             entry = candidates[entry].next
 
