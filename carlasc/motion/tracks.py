@@ -23,16 +23,18 @@ _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its l
 _STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
 LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
 BODY_MARGIN_M = 0.1  # by which the box of an actor is larger than its body
+_SURE = 0.8  # actors with less confidence are doubtful
 FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
 _FORMATS = {
     "members": ArrayFormat(("<i4",), (None,)),
     "frames": ArrayFormat(("<i8",), (None, 3)),
     "poses": ArrayFormat(("<f8",), (None, 4, 4)),
     "velocities": ArrayFormat(("<f8",), (None, 3)),
-    "bounds": ArrayFormat(("<f8",), (None, 18)),
+    "bounds": ArrayFormat(("<f8",), (None, 19)),
     "table": ArrayFormat(("<i8",), (None, 7)),
     "moving": ArrayFormat(("<i4",), (None,)),
     "moving_frames": ArrayFormat(("<i8",), (None, 2)),
+    "own": ArrayFormat(("<f8",), (None, 6)),
 }
 
 
@@ -51,6 +53,7 @@ class Track:
         upper: (3,) metres, upper corner.
         extent: what was seen of the body.
         rigid: whether it keeps its shape, as vehicles do.
+        confidence: that it is real, from 0 to 1; 1 if the data say so.
     """
 
     label: int
@@ -63,6 +66,7 @@ class Track:
     upper: NDArray[np.float64]
     extent: Extent
     rigid: bool = True
+    confidence: float = 1.0
 
     def pose(self, frame: int) -> Transform | None:
         """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
@@ -102,6 +106,7 @@ def make_track(
     *,
     deformable: Collection[int] = (),
     rigid: bool | None = None,
+    confidence: float = 1.0,
 ) -> Track:
     """Return the track of linked segments: their path, the poses along it, and the box around all points.
 
@@ -110,6 +115,7 @@ def make_track(
         times: seconds by frame.
         deformable: classes whose actors change their shape.
         rigid: whether this one keeps its shape; None: unless it is of one of these classes.
+        confidence: that the actor is real.
     """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
@@ -129,8 +135,8 @@ def make_track(
     poses = np.stack([rotation_z(angle) for angle in np.interp(at, seconds, headings)])
     poses[:, :3, 3] = path
     members = {segment.frame: segment.members.astype(np.int32) for segment in chain}
-    lower, upper = extent.lower - BODY_MARGIN_M, extent.upper + BODY_MARGIN_M
-    return Track(label, chain[0].instance, members, int(frames[0]), poses, speed, lower, upper, extent, keeps_shape)
+    body = (extent.lower - BODY_MARGIN_M, extent.upper + BODY_MARGIN_M, extent, keeps_shape)
+    return Track(label, chain[0].instance, members, int(frames[0]), poses, speed, *body, confidence)
 
 
 def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
@@ -211,26 +217,42 @@ class MovingActors:
         tracks: the actors that move, by number.
         moving: (M,) indices of the points of a scan that move and belong to no track, by frame.
         summary: what was found of every actor, standing ones too, as plain values.
+        own: (6,) lower and upper corners, metres, sensor frame, of the places of points that move with the sensor: the recording vehicle.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
     moving: Mapping[int, NDArray[np.integer]] = field(default_factory=dict)
     summary: tuple[Mapping[str, Any], ...] = ()
+    own: tuple[NDArray[np.float64], ...] = ()
 
     @classmethod
-    def of(cls, tracks: list[Track], moving: Mapping[int, NDArray[np.integer]] | None = None) -> Self:
+    def of(
+        cls,
+        tracks: list[Track],
+        moving: Mapping[int, NDArray[np.integer]] | None = None,
+        own: Sequence[NDArray[np.float64]] = (),
+    ) -> Self:
         """Return the actors of tracks: those that move are kept whole, of the others only a summary."""
         return cls(
             {number: track for number, track in enumerate(tracks) if track.moves},
             moving or {},
             tuple(_summarize(track) for track in tracks),
+            tuple(own),
         )
 
     def between(self, first: int, last: int) -> MovingActors:
         """Return what concerns the frames from `first` to `last`: small enough to be sent to a worker with every frame."""
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
         tracks = {number: track for number, track in near.items() if track.members or len(track.world_T_actor)}
-        return MovingActors(tracks, {frame: own for frame, own in self.moving.items() if first <= frame <= last})
+        moving = {frame: members for frame, members in self.moving.items() if first <= frame <= last}
+        return MovingActors(tracks, moving, own=self.own)
+
+    def is_own(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""
+        found = np.zeros(len(points), np.bool_)
+        for corners in self.own:
+            found |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
+        return found
 
     def to_bytes(self, key: str) -> bytes:
         """Return the content of a file for these actors. `key` says what they were made from."""
@@ -250,9 +272,8 @@ class MovingActors:
             poses.append(track.world_T_actor)
             velocities.append(track.velocity)
             extent = track.extent
-            bounds.append(
-                np.concatenate([track.lower, track.upper, extent.lower, extent.upper, extent.faces, extent.seen_from])
-            )
+            corners = [track.lower, track.upper, extent.lower, extent.upper]
+            bounds.append(np.concatenate([*corners, extent.faces, extent.seen_from, [track.confidence]]))
             for frame, own in track.members.items():
                 members.append(own)
                 frames.append((number, frame, len(own)))
@@ -260,11 +281,12 @@ class MovingActors:
             "table": np.array(table, np.int64).reshape(-1, 7),
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
             "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
-            "bounds": np.array(bounds, np.float64).reshape(-1, 18),
+            "bounds": np.array(bounds, np.float64).reshape(-1, 19),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
             "moving": np.concatenate([np.empty(0, np.int32), *self.moving.values()]).astype(np.int32),
             "moving_frames": np.array([(f, len(own)) for f, own in self.moving.items()], np.int64).reshape(-1, 2),
+            "own": np.array(self.own, np.float64).reshape(-1, 6),
         }
         about = json.dumps({"key": key, "summary": self.summary})
         buffer = io.BytesIO()
@@ -286,7 +308,12 @@ class MovingActors:
             ends = np.cumsum(arrays["moving_frames"][:, 1])[:-1]
             parts = np.split(arrays["moving"], ends)
             moving = {int(frame): own for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)}
-            return cls(tracks, moving, tuple(about["summary"])), str(about["key"])
+            return cls(tracks, moving, tuple(about["summary"]), tuple(arrays["own"])), str(about["key"])
+
+
+def is_doubtful(confidence: float) -> bool:
+    """Return whether an actor with a confidence may be none."""
+    return confidence < _SURE
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
@@ -311,6 +338,7 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
             bounds[3:6],
             Extent(bounds[6:9], bounds[9:12], (rear, front, low, high), points, (float(bounds[16]), float(bounds[17]))),
             bool(rigid),
+            float(bounds[18]),
         )
         row += length
     return tracks
@@ -326,6 +354,7 @@ def _summarize(track: Track) -> dict[str, Any]:
         "scans": len(track.members),
         "points": sum(len(own) for own in track.members.values()),
         "moves": track.moves,
+        "confidence": round(track.confidence, 3),
         "speed_m_s": round(float(np.median(speed)), 3),
         "size_m": [round(float(value), 3) for value in track.size],
         "seen_m": [round(float(value), 3) for value in track.extent.size],
