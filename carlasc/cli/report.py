@@ -76,7 +76,7 @@ def _print_actors(actors: tuple[ActorTrack, ...], *, everything: bool) -> None:
     from carlasc.cli.tables import print_table
 
     shown = actors if everything else actors[:_SHOWN]
-    header = ["Actor", "Instance", "Frames", "Sightings", "Points", "m/s", "Size m", "Residual m", "Standing m"]
+    header = ["Actor", "Instance", "Frames", "Sightings", "Points", "m/s", "Size m", "Residual m", "Standing m", "Sure"]
     rows = [
         [
             actor.label,
@@ -88,6 +88,7 @@ def _print_actors(actors: tuple[ActorTrack, ...], *, everything: bool) -> None:
             " x ".join(f"{side:.1f}" for side in actor.size_m),
             "" if actor.residual_m is None else f"{actor.residual_m:.2f}",
             "" if actor.residual_standing_m is None else f"{actor.residual_standing_m:.2f}",
+            f"{actor.confidence:.0%}",
         ]
         for actor in shown
     ]

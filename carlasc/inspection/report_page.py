@@ -71,7 +71,8 @@ def _count(actors: Sequence[ActorTrack]) -> str:
     kinds = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(sorted(labels)))
     residuals = sorted(actor.residual_m for actor in actors if actor.residual_m is not None)
     middle = f"; the median residual is {residuals[len(residuals) // 2]:.2f} m" if residuals else ""
-    return f"{len(actors)} that move ({kinds}){middle}"
+    doubtful = sum(actor.is_doubtful for actor in actors)
+    return f"{len(actors)} that move ({kinds}){f', {doubtful} of them doubtful' if doubtful else ''}{middle}"
 
 
 def _poses(facts: PoseFacts) -> str:
@@ -199,6 +200,7 @@ def _actor_table(actors: Sequence[ActorTrack]) -> str:
         "size, m",
         "residual, m",
         "standing, m",
+        "sure",
     ]
     rows = [
         [
@@ -212,6 +214,7 @@ def _actor_table(actors: Sequence[ActorTrack]) -> str:
             " x ".join(f"{side:.1f}" for side in actor.size_m),
             _metres(actor.residual_m),
             _metres(actor.residual_standing_m),
+            f"{actor.confidence:.0%}",
         ]
         for actor in actors
     ]

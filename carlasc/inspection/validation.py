@@ -92,6 +92,7 @@ class Freshness:
         yield from self._damaged
         for grid, report in self.reports.items():
             yield from self._settings(grid, report)
+            yield from self._actors(grid, report)
             frames = self._compared.get(grid, 0)
             for (own, field), changed in self._changed.items():
                 if own == grid:
@@ -113,6 +114,20 @@ class Freshness:
             finding = self._finding(grid, "a report of all frames", f"{len(missing)} frames that it does not cover")
             yield replace(finding, severity="note")
 
+    def _actors(self, grid: str, report: Report) -> Iterator[Finding]:
+        """Yield how many actors were found that the data do not name: a warning if many of them are doubtful."""
+        found = [actor for actor in report.actors or () if actor.confidence < 1]
+        doubtful = sum(actor.is_doubtful for actor in found)
+        if found:
+            many = doubtful > max(_DOUBTFUL_ACTORS * len(found), 2)
+            where = f"{self.sequence.location}/{grid}"
+            what = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
+            expected, advice = (
+                "actors that surely move",
+                "look at the actors in the report, or give labels, boxes or flow",
+            )
+            yield Finding("warning" if many else "note", "actors", self.sequence.path, where, expected, what, advice)
+
     def _finding(self, grid: str, expected: str, found: str) -> Finding:
         where = f"{self.sequence.location}/{grid}"
         return Finding("warning", "report", self.sequence.path, where, expected, found, _ADVICE)
@@ -120,6 +135,7 @@ class Freshness:
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
 _POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error
+_DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
 _DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
 _COARSE_M = 0.75  # in coarser voxels several classes meet, and most of each is free: a small share is no mistake
 _NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning

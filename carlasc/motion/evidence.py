@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest i
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and the others are as it is
+_BAND_M = 0.3  # what stands this much below or above a cluster, in its cells or beside them, is around it
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points is one object, which moved with all its points
 _SAME_PLACE_M = 0.2  # rays that began within this distance of each other are looked up together
 _PERIOD_S = 0.1  # between scans whose times do not rise
@@ -80,7 +81,9 @@ class FreeSpaceEvidence:
         clusters: (M,) int64 indices of the points of each thing that moved.
         points: (M, 3) float64 of the same points, metres, world.
         labels: class of most points of each cluster; 0 without labels.
-        origin: (3,) metres, world: the sensor that saw them.
+        freed: number of points of each cluster at places that were free at other times.
+        around: number of points that stand around each cluster, at its height: many, if it is a piece of what stands.
+        world_T_sensor: (4, 4) pose of the scan.
     """
 
     frame: int
@@ -89,7 +92,9 @@ class FreeSpaceEvidence:
     clusters: tuple[NDArray[np.int64], ...]
     points: tuple[NDArray[np.float64], ...]
     labels: tuple[int, ...]
-    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    freed: tuple[int, ...]
+    around: tuple[int, ...]
+    world_T_sensor: Transform
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most so many `points` for each cluster; `clusters` stay complete."""
@@ -167,11 +172,14 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     if scan.labels is not None and movable:
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
-    clusters = [candidates[own] for own in _clusters(world, kind, moved, left, static)]
+    groups = _clusters(world, kind, moved, left, static)
+    freed = tuple(int((moved | left)[group].sum()) for group in groups)
+    clusters = [candidates[group] for group in groups]
     points = [transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64)) for members in clusters]
     classes = [0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax()) for own in clusters]
-    about = scan.frame, own.seconds, len(scan.points)
-    return FreeSpaceEvidence(*about, tuple(clusters), tuple(points), tuple(classes), scan.world_T_sensor[:3, 3])
+    around = _count_around(world, groups, static)
+    found = (tuple(clusters), tuple(points), tuple(classes), freed, around)
+    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *found, scan.world_T_sensor)
 
 
 def _places(scan: Sighting) -> list[tuple[slice, NDArray[np.float32]]]:
@@ -278,6 +286,27 @@ def _clusters(
             members = np.union1d(core, members[~static[members]])
         groups.append(np.sort(members))
     return groups
+
+
+def _count_around(
+    world: NDArray[np.float64], groups: list[NDArray[np.int64]], static: NDArray[np.bool_]
+) -> tuple[int, ...]:
+    """Return how many static points, of (N, 3) points in metres, are around each group: in its cells or those beside them, at its height."""
+    cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
+    key = (cell[:, 0] << 21) | cell[:, 1]
+    standing = np.flatnonzero(static)
+    standing = standing[np.argsort(key[standing], kind="stable")]
+    keys, heights = key[standing], world[standing, 2]
+    steps = np.array([(row << 21) + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
+    counts = []
+    for group in groups:
+        cells = np.unique(np.unique(key[group])[:, None] + steps)
+        begin, end = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
+        lower, upper = world[group, 2].min() - _BAND_M, world[group, 2].max() + _BAND_M
+        near = np.concatenate([heights[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
+        # those that are in the group themselves are at places that were occupied at other times, which counts as well
+        counts.append(int(((near >= lower) & (near <= upper)).sum()))
+    return tuple(counts)
 
 
 @cached

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import thin
+from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
-from carlasc.motion.paths import estimate_path, headings_of, is_standing
+from carlasc.motion.paths import estimate_path, headings_of, is_standing, overlay
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
@@ -23,6 +23,16 @@ _STRAIGHT = 0.35  # extent of a path over its length; noise goes to and fro
 _MAX_JUMP_M_S = 4.0  # median deviation of the sightings' steps from the path's; more is no one thing
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _PERSON_M = (1.5, 2.3)  # what is narrower and lower than this changes its shape as it moves
+_SLIDE_M = 0.5  # by which sightings are slid along their path, to see whether they overlay as well then
+_SIGHTINGS, _MANY_SIGHTINGS = 10, 30  # more than the latter do not raise the confidence
+_WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5)  # of one, and of the terms of `_confidence`
+_LEAST_CONFIDENCE = 0.5  # of a mover
+_OWN_REACH_M, _OWN_HALF_M = (
+    3.5,
+    1.3,
+)  # the recording vehicle is within this of its sensor, and of the line that it drives along
+_OWN_STAYS_M, _OWN_WAY_M = 0.2, 1.0  # its points stay where they are in the sensor's frame, while it drives so far
+_OWN_MARGIN_M = 0.1  # around its points
 _SAMPLES = 300  # points of a sighting that its path is estimated from
 
 
@@ -33,10 +43,12 @@ class Mover:
     Attributes:
         segments: its points in each scan, in order of frames, with its estimated velocity and its number as `instance`.
         rigid: whether it keeps its shape, as vehicles do.
+        confidence: that it is real, from 0 to 1: see `_confidence`.
     """
 
     segments: tuple[Segment, ...]
     rigid: bool
+    confidence: float
 
 
 def follow_movers(
@@ -46,6 +58,7 @@ def follow_movers(
     deformable: Collection[int] = (),
     first_instance: int = 1,
     default_label: int = 0,
+    own: list[NDArray[np.float64]] | None = None,
 ) -> Iterator[Mover]:
     """Follow what moved from scan to scan, and yield each mover that earned a track when it was seen for the last time.
 
@@ -55,23 +68,35 @@ def follow_movers(
         deformable: classes of objects that change their shape as they move. Without labels, the size tells.
         first_instance: number of the first mover; others follow.
         default_label: class of movers without labels.
+        own: filled with the (6,) lower and upper corners of parts of the recording vehicle, which are no movers, metres, sensor frame.
     """
+    own = [] if own is None else own
     alive: list[_MoverChain] = []
     number = first_instance
     for found in evidence:
         moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
         ended = [chain for chain in alive if found.seconds - chain.last.seconds > _MAX_GAP_S]
-        for mover in _earned(ended, deformable, number, default_label):
+        for mover in _earned(ended, deformable, number, default_label, own):
             yield mover
             number += 1
         alive = [chain for chain in alive if found.seconds - chain.last.seconds <= _MAX_GAP_S]
         _link(found, alive, deformable)
-    yield from _earned(alive, deformable, number, default_label)
+    yield from _earned(alive, deformable, number, default_label, own)
 
 
-def _earned(chains: list[_MoverChain], deformable: Collection[int], number: int, default_label: int) -> Iterator[Mover]:
-    """Yield the movers of the chains that earn a track, numbered from `number`."""
+def _earned(
+    chains: list[_MoverChain],
+    deformable: Collection[int],
+    number: int,
+    default_label: int,
+    own: list[NDArray[np.float64]],
+) -> Iterator[Mover]:
+    """Yield the movers of the chains that earn a track, numbered from `number`; parts of the recording vehicle are added to `own`."""
     for chain in chains:
+        part = chain.own_vehicle()
+        if part is not None:
+            own.append(part)
+            continue
         mover = chain.mover(deformable, number, default_label)
         if mover is not None:
             yield mover
@@ -86,13 +111,17 @@ class _Link:
     segment: Segment
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    freed: int  # points at places that were free at other times
+    around: int  # points that stand around it
+    world_T_sensor: Transform
 
     @classmethod
     def of(cls, evidence: FreeSpaceEvidence, index: int) -> _Link:
         points = evidence.points[index]
-        label, members = evidence.labels[index], evidence.clusters[index]
-        segment = Segment(evidence.frame, label, members, points, None, origin=evidence.origin)
-        return cls(evidence.seconds, segment, points.min(axis=0), points.max(axis=0))
+        pose, freed, around = evidence.world_T_sensor, evidence.freed[index], evidence.around[index]
+        members, label = evidence.clusters[index], evidence.labels[index]
+        segment = Segment(evidence.frame, label, members, points, None, origin=pose[:3, 3])
+        return cls(evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose)
 
     @property
     def middle(self) -> NDArray[np.float64]:
@@ -111,7 +140,8 @@ class _Link:
             points=np.concatenate([self.segment.points, other.segment.points]),
         )
         lower, upper = np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper)
-        return _Link(self.seconds, segment, lower, upper)
+        freed, around = self.freed + other.freed, self.around + other.around
+        return replace(self, segment=segment, lower=lower, upper=upper, freed=freed, around=around)
 
 
 class _MoverChain:
@@ -190,11 +220,59 @@ class _MoverChain:
         steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(seconds)
         if np.median(steps) > _MAX_JUMP_M_S or is_standing(samples, positions, headings_of(velocities), seconds):
             return None
+        confidence = self._confidence(samples, positions, headings_of(velocities), seconds)
+        if confidence < _LEAST_CONFIDENCE:
+            return None
         found = [
             replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return Mover(tuple(found), rigid)
+        return Mover(tuple(found), rigid, confidence)
+
+    def _confidence(
+        self,
+        samples: list[NDArray[np.float64]],
+        positions: NDArray[np.float64],
+        headings: NDArray[np.float64],
+        seconds: NDArray[np.float64],
+    ) -> float:
+        """Return how sure it is that the thing is real, from 0 to 1; the arguments are those of `overlay`.
+
+        The terms: the share of its points that were at places seen free; the share that stands around it, at its height, of all points there;
+        the share by which its sightings overlay better than slid along its path; and the logarithm of their number. A piece of a rail, a
+        fence or a hedge has neighbours that stand, and overlays as well after any slide. The result is the logistic function of the sum.
+        """
+        _, best, *slid = overlay(samples, positions, headings, seconds, (0.0, -_SLIDE_M, _SLIDE_M))
+        points, freed, around = (
+            sum(counts)
+            for counts in zip(
+                *((len(link.segment.members), link.freed, link.around) for link in self.links), strict=True
+            )
+        )
+        gain = 1.0 - best / max(min(slid), 1e-3)
+        support = float(np.log(min(len(self.links), _MANY_SIGHTINGS) / _SIGHTINGS))
+        terms = (1.0, freed / points, around / (points + around), gain, support)
+        return 1.0 / (1.0 + float(np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))))
+
+    def own_vehicle(self) -> NDArray[np.float64] | None:
+        """Return (6,) lower and upper corner of the place in the sensor's frame, metres, if the thing is a part of the recording vehicle."""
+        places = np.stack([link.world_T_sensor[:3, 3] for link in self.links])
+        if len(places) < _MIN_SIGHTINGS or np.ptp(places, axis=0).max() < _OWN_WAY_M:
+            return None
+        local = [transform_points(invert(link.world_T_sensor), link.segment.points) for link in self.links]
+        corners = np.stack([np.concatenate([points.min(axis=0), points.max(axis=0)]) for points in local])
+        ahead = np.gradient(places, axis=0)[:, :2]
+        across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.maximum(np.hypot(*ahead.T), 1e-6)[:, None]
+        for link, place, direction in zip(self.links, places, across, strict=True):
+            offset = link.segment.points[:, :2] - place[:2]
+            if (np.abs((offset * direction).sum(axis=1)) > _OWN_HALF_M).any() or np.hypot(
+                *offset.T
+            ).max() > _OWN_REACH_M:
+                return None
+        middles = (corners[:, :3] + corners[:, 3:]) / 2
+        if np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() > _OWN_STAYS_M:
+            return None
+        return np.concatenate([corners[:, :3].min(axis=0) - _OWN_MARGIN_M, corners[:, 3:].max(axis=0) + _OWN_MARGIN_M])
 
 
 def _is_small(size: NDArray[np.float64]) -> bool:

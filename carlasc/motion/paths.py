@@ -83,26 +83,41 @@ def is_standing(
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
 ) -> bool:
-    """Return whether sightings overlap as well without any motion as with the estimated motion.
+    """Return whether sightings overlap as well without any motion as with the estimated motion; the arguments are those of `overlay`."""
+    still, moved = overlay(sightings, positions, headings, seconds)
+    # With a wrong path the sightings overlap badly too, so those of a standing actor must also be close to each other.
+    return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STANDING_M))
+
+
+def overlay(
+    sightings: Sequence[NDArray[np.float64]],
+    positions: NDArray[np.float64],
+    headings: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    slides_m: Sequence[float] = (0.0,),
+) -> tuple[float, ...]:
+    """Return how well the sightings of an actor overlay, about a second apart: the mean distance to the nearest point of another, in metres.
 
     Args:
         sightings: (M, 3) points of the actor at each time, metres, world.
         positions: (F, 3) estimated positions of the actor, metres, world.
         headings: (F,) estimated headings, radians.
         seconds: (F,) times, increasing.
+        slides_m: how far the sightings are slid along the heading, beside the estimated motion.
+
+    Returns:
+        The distance without any motion, and that with the estimated motion and each slide. All are NaN for a single sighting.
     """
     thinned = [thin(points, _POINTS) for points in sightings]
     body = [multiply(points - positions[i], rotation_z(headings[i])[:3, :3]) for i, points in enumerate(thinned)]
-    still, moved = [], []
+    found = []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
-            still.append(_mean_distance(thinned[i], thinned[j]))
-            moved.append(_mean_distance(body[i], body[j]))
-    if not still:
-        return True
-    # With a wrong path the sightings overlap badly too, so those of a standing actor must also be close to each other.
-    return float(np.mean(still)) < min(float(np.mean(moved)) + _DOUBT_M, _STANDING_M)
+            slid = [_mean_distance(body[i] + np.array([slide, 0.0, 0.0]), body[j]) for slide in slides_m]
+            found.append([_mean_distance(thinned[i], thinned[j]), *slid])
+    columns = zip(*found, strict=True) if found else [[np.nan]] * (1 + len(slides_m))
+    return tuple(float(np.mean(column)) for column in columns)
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:

@@ -22,17 +22,19 @@ from carlasc.storage.files import parse_json
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last segment
 _STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
 LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
+_SURE = 0.8  # actors with less confidence are doubtful
 FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
 _FORMATS = {
     "members": ArrayFormat(("<i4",), (None,)),
     "frames": ArrayFormat(("<i8",), (None, 3)),
     "poses": ArrayFormat(("<f8",), (None, 4, 4)),
     "velocities": ArrayFormat(("<f8",), (None, 3)),
-    "bounds": ArrayFormat(("<f8",), (None, 18)),
+    "bounds": ArrayFormat(("<f8",), (None, 19)),
     "table": ArrayFormat(("<i8",), (None, 8)),
     "surfaces": ArrayFormat(("<f4",), (None, 3)),
     "moving": ArrayFormat(("<i4",), (None,)),
     "moving_frames": ArrayFormat(("<i8",), (None, 2)),
+    "own": ArrayFormat(("<f8",), (None, 6)),
 }
 
 
@@ -52,6 +54,7 @@ class Track:
         extent: what was seen of the body.
         rigid: whether it keeps its shape, as vehicles do.
         surface: (P, 3) float32, points of its surface, metres, actor frame: of one that was seen well; of every vehicle once bodies are complete.
+        confidence: that it is real, from 0 to 1; 1 if the data say so.
     """
 
     label: int
@@ -65,6 +68,7 @@ class Track:
     extent: Extent
     rigid: bool = True
     surface: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    confidence: float = 1.0
 
     def pose(self, frame: int) -> Transform | None:
         """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
@@ -104,6 +108,7 @@ def make_track(
     *,
     deformable: Collection[int] = (),
     rigid: bool | None = None,
+    confidence: float = 1.0,
 ) -> Track:
     """Return the track of linked segments: their path, the poses along it, and the box around all points.
 
@@ -112,6 +117,7 @@ def make_track(
         times: seconds by frame.
         deformable: classes whose actors change their shape.
         rigid: whether this one keeps its shape; None: unless it is of one of these classes.
+        confidence: that the actor is real.
     """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
@@ -133,9 +139,8 @@ def make_track(
     members = {segment.frame: segment.members.astype(np.int32) for segment in chain}
     lower, upper = extent.lower - BODY_MARGIN_M, extent.upper + BODY_MARGIN_M
     surface = surface_of(body if keeps_shape and extent.exemplary else body[:0])
-    return Track(
-        label, chain[0].instance, members, int(frames[0]), poses, speed, lower, upper, extent, keeps_shape, surface
-    )
+    whole = (lower, upper, extent, keeps_shape, surface, confidence)
+    return Track(label, chain[0].instance, members, int(frames[0]), poses, speed, *whole)
 
 
 def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
@@ -224,26 +229,42 @@ class MovingActors:
         tracks: the actors that move, by number.
         moving: (M,) indices of the points of a scan that move and belong to no track, by frame.
         summary: what was found of every actor, standing ones too, as plain values.
+        own: (6,) lower and upper corners, metres, sensor frame, of the places of points that move with the sensor: the recording vehicle.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
     moving: Mapping[int, NDArray[np.integer]] = field(default_factory=dict)
     summary: tuple[Mapping[str, Any], ...] = ()
+    own: tuple[NDArray[np.float64], ...] = ()
 
     @classmethod
-    def of(cls, tracks: list[Track], moving: Mapping[int, NDArray[np.integer]] | None = None) -> Self:
+    def of(
+        cls,
+        tracks: list[Track],
+        moving: Mapping[int, NDArray[np.integer]] | None = None,
+        own: Sequence[NDArray[np.float64]] = (),
+    ) -> Self:
         """Return the actors of tracks: those that move are kept whole, of the others only a summary."""
         return cls(
             {number: track for number, track in enumerate(tracks) if track.moves},
             moving or {},
             tuple(_summarize(track) for track in tracks),
+            tuple(own),
         )
 
     def between(self, first: int, last: int) -> MovingActors:
         """Return what concerns the frames from `first` to `last`: small enough to be sent to a worker with every frame."""
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
         tracks = {number: track for number, track in near.items() if track.members or len(track.world_T_actor)}
-        return MovingActors(tracks, {frame: own for frame, own in self.moving.items() if first <= frame <= last})
+        moving = {frame: members for frame, members in self.moving.items() if first <= frame <= last}
+        return MovingActors(tracks, moving, own=self.own)
+
+    def is_own(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""
+        found = np.zeros(len(points), np.bool_)
+        for corners in self.own:
+            found |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
+        return found
 
     def to_bytes(self, key: str) -> bytes:
         """Return the content of a file for these actors. `key` says what they were made from."""
@@ -265,9 +286,8 @@ class MovingActors:
             velocities.append(track.velocity)
             surfaces.append(track.surface)
             extent = track.extent
-            bounds.append(
-                np.concatenate([track.lower, track.upper, extent.lower, extent.upper, extent.faces, extent.seen_from])
-            )
+            corners = [track.lower, track.upper, extent.lower, extent.upper]
+            bounds.append(np.concatenate([*corners, extent.faces, extent.seen_from, [track.confidence]]))
             for frame, own in track.members.items():
                 members.append(own)
                 frames.append((number, frame, len(own)))
@@ -276,11 +296,12 @@ class MovingActors:
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
             "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
             "surfaces": np.concatenate([np.empty((0, 3), np.float32), *surfaces]),
-            "bounds": np.array(bounds, np.float64).reshape(-1, 18),
+            "bounds": np.array(bounds, np.float64).reshape(-1, 19),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
             "moving": np.concatenate([np.empty(0, np.int32), *self.moving.values()]).astype(np.int32),
             "moving_frames": np.array([(f, len(own)) for f, own in self.moving.items()], np.int64).reshape(-1, 2),
+            "own": np.array(self.own, np.float64).reshape(-1, 6),
         }
         about = json.dumps({"key": key, "summary": self.summary})
         buffer = io.BytesIO()
@@ -302,7 +323,12 @@ class MovingActors:
             ends = np.cumsum(arrays["moving_frames"][:, 1])[:-1]
             parts = np.split(arrays["moving"], ends)
             moving = {int(frame): own for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)}
-            return cls(tracks, moving, tuple(about["summary"])), str(about["key"])
+            return cls(tracks, moving, tuple(about["summary"]), tuple(arrays["own"])), str(about["key"])
+
+
+def is_doubtful(confidence: float) -> bool:
+    """Return whether an actor with a confidence may be none."""
+    return confidence < _SURE
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
@@ -328,6 +354,7 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
             Extent(bounds[6:9], bounds[9:12], (rear, front, low, high), points, (float(bounds[16]), float(bounds[17]))),
             bool(rigid),
             arrays["surfaces"][point : point + size],
+            float(bounds[18]),
         )
         row, point = row + length, point + size
     return tracks
@@ -343,6 +370,7 @@ def _summarize(track: Track) -> dict[str, Any]:
         "scans": len(track.members),
         "points": sum(len(own) for own in track.members.values()),
         "moves": track.moves,
+        "confidence": round(track.confidence, 3),
         "speed_m_s": round(float(np.median(speed)), 3),
         "size_m": [round(float(value), 3) for value in track.size],
         "seen_m": [round(float(value), 3) for value in track.extent.size],

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from railed import RailedDrive
 from street import StreetDrive
 
 import carlasc
@@ -66,6 +67,7 @@ def _town_without_parked_cars(seed: int, lidar: Lidar) -> TownDrive:
 KINDS = {
     "town": Kind(_town_without_parked_cars, 91, tuple(range(30, 61, 5)), 3, 40),
     "street": Kind(StreetDrive, 91, (30, 45, 60), 3, 40),
+    "railed": Kind(RailedDrive, 91, (30, 45, 60), 3, 40),
     "parked": Kind(_town, 101, tuple(int(f) for f in np.linspace(0, 100, 10)), 10, 60, movers_only=False),
 }
 

@@ -155,8 +155,8 @@ def _queue(
     return movers
 
 
-def build_street(rng: np.random.Generator) -> Street:
-    """Build what stands along a random street."""
+def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.0)) -> Street:
+    """Build what stands along a random street, with houses on one side (y < 0: -1) or both."""
     plan = TownPlan(rng, PlantCatalogue(rng))
     _lay_strip(plan, ROAD, (-HALF_ROAD_M, 0.0), (HALF_ROAD_M, 0.0))
     for y in (-3.5, 0.0, 3.5):
@@ -168,7 +168,8 @@ def build_street(rng: np.random.Generator) -> Street:
         _lay_strip(plan, SIDEWALK, (kerb, -0.05), (kerb, KERB_M))
         _lay_strip(plan, SIDEWALK, (kerb, KERB_M), (inner, KERB_M))
         _lay_strip(plan, TERRAIN if rng.random() < 0.5 else GROUND, (inner, KERB_M), (side * LAND_M, KERB_M))
-        _build_houses(plan, side)
+        if side in houses:
+            _build_houses(plan, side)
         _add_furniture(plan, side)
     return Street(plan.builder.build(), tuple(plan.buildings))
 

@@ -245,6 +245,8 @@ class Merger:
             scan, own = self.scan_of(other), other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
             hits = None if everything else self.static(other)
+            if everything and self.actors.own:  # the recording vehicle is no part of the scene
+                hits = ~self.actors.is_own(scan.points)
             yield from scan.observations(
                 grid_T_world, hits, labels=self.labels(other), free_region=None if own else STATIC
             )
@@ -314,6 +316,7 @@ class Merger:
             scan = self.scan_of(frame)
             static = np.ones(len(scan.points), np.bool_)
             static[scan.moving] = False
+            static[self.actors.is_own(scan.points)] = False
             static[self.actors.moving.get(frame, [])] = False
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False

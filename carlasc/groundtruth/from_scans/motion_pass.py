@@ -81,9 +81,9 @@ class _MakeTrack:
     times: dict[int, float]
     deformable: frozenset[int]
 
-    def __call__(self, actor: tuple[Chain, bool | None]) -> Track:
-        chain, rigid = actor
-        return make_track(chain, self.times, deformable=self.deformable, rigid=rigid)
+    def __call__(self, actor: tuple[Chain, bool | None, float]) -> Track:
+        chain, rigid, confidence = actor
+        return make_track(chain, self.times, deformable=self.deformable, rigid=rigid, confidence=confidence)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class _MotionPass:
                     self._count(1)
             if begin + _BATCH >= len(frames):
                 ended += linker.finish()
-            tracks += self._estimate([(linked, None) for linked in ended])
+            tracks += self._estimate([(linked, None, 1.0) for linked in ended])
         return tracks
 
     def boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
@@ -138,8 +138,10 @@ class _MotionPass:
                 self._count(1)
         return with_surfaces([_with_members(track, segments.get(track.instance, [])) for track in boxes])
 
-    def movers(self, boxes: tuple[Track, ...]) -> tuple[list[Track], dict[int, NDArray[np.integer]]]:
-        """Return the tracks of what moved although no field shows it, and the moved points of each frame that belong to none."""
+    def movers(
+        self, boxes: tuple[Track, ...]
+    ) -> tuple[list[Track], dict[int, NDArray[np.integer]], list[NDArray[np.float64]]]:
+        """Return the tracks of what moved although no field shows it, and what else `MovingActors` has: `moving` and `own`."""
         frames = list(self.feed.times)
         blocks = [tuple(frames[begin : begin + _BLOCK]) for begin in range(0, len(frames), _BLOCK)]
 
@@ -152,17 +154,18 @@ class _MotionPass:
         classes = self.feed.classes
         label = 0 if self.feed.has_labels else classes.geometry_id
         moved: dict[int, NDArray[np.int64]] = {}
+        own: list[NDArray[np.float64]] = []
         movers = follow_movers(
-            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_MOVER, default_label=label
+            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_MOVER, default_label=label, own=own
         )
         tracks: list[Track] = []
         while batch := list(islice(movers, _MOVERS)):
             # their paths are estimated again: velocities alone would drift
-            chains = [([replace(s, velocity=None) for s in mover.segments], mover.rigid) for mover in batch]
+            chains = [([replace(s, velocity=None) for s in m.segments], m.rigid, m.confidence) for m in batch]
             tracks += self._estimate(chains)
-        return tracks, _untracked(moved, tracks)
+        return tracks, _untracked(moved, tracks), own
 
-    def _estimate(self, actors: Sequence[tuple[Chain, bool | None]]) -> list[Track]:
+    def _estimate(self, actors: Sequence[tuple[Chain, bool | None, float]]) -> list[Track]:
         with self._each(_MakeTrack(self.feed.times, self.feed.classes.deformable), actors) as tracks:
             return list(tracks)
 
@@ -187,10 +190,11 @@ def find_actors(
     moving_boxes = tuple(track for track in boxes if track.moves)
     tracks = by.boxed(boxes, moving_boxes) if boxes else by.linked()
     moving: dict[int, NDArray[np.integer]] = {}
+    own: list[NDArray[np.float64]] = []
     if "evidence" in feed.motion:
-        movers, moving = by.movers(moving_boxes)
+        movers, moving, own = by.movers(moving_boxes)
         tracks += movers
-    return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving)
+    return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, own)
 
 
 def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict[int, NDArray[np.integer]]:

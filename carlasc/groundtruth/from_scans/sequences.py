@@ -38,7 +38,7 @@ from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors
+from carlasc.motion.tracks import FIRST_MOVER, MovingActors, is_doubtful
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
@@ -223,10 +223,15 @@ class ScanSequence(StoredSequence):
         found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
         left_out = sum(len(points) for points in self.actors.moving.values())
         if "evidence" in self.feed.motion and (found or left_out):
-            shown = [f"{found} actors that move"] if found else []
+            doubtful = sum(is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"])
+            shown = [f"{found} actors that move ({doubtful} of them doubtful)"] if found else []
             shown += [f"{left_out} {'more ' if found else ''}points that moved"] if left_out else []
             out = ": these points were left out of other frames" if left_out else ""
             notes.append(f"{where}: free space shows {' and '.join(shown)}, although nothing else says so{out}")
+        if self.actors.own:
+            notes.append(
+                f"{where}: points near the sensor move with it: they are on the recording vehicle, and were left out"
+            )
         wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
         if wrong:
             notes.append(

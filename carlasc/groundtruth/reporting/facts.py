@@ -17,6 +17,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.motion.refinement import RefinedPoses
+from carlasc.motion.tracks import is_doubtful
 from carlasc.storage import layout
 
 _MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured
@@ -76,6 +77,7 @@ class ActorTrack:
         residual_m: how well neighbouring sightings overlay once the motion is undone: mean distance from a point of one to the nearest
             point of the one before or after, metres; None if none were compared. It is at least the distance between neighbouring points.
         residual_standing_m: the same for an actor that is taken to stand still; a motion that is true makes `residual_m` smaller.
+        confidence: that it is real, from 0 to 1; 1 if the data say so.
     """
 
     label: str
@@ -90,6 +92,12 @@ class ActorTrack:
     faces: int
     residual_m: float | None
     residual_standing_m: float | None
+    confidence: float = 1.0
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it may be no actor."""
+        return is_doubtful(self.confidence)
 
     @classmethod
     def of(cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable) -> ActorTrack:
@@ -110,6 +118,7 @@ class ActorTrack:
             faces=summary["faces"],
             residual_m=round(sum(r.moving_m for r in residuals) / count, 4) if count else None,
             residual_standing_m=round(sum(r.standing_m for r in residuals) / count, 4) if count else None,
+            confidence=summary["confidence"],
         )
 
 
