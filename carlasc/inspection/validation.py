@@ -31,6 +31,8 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
+_DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
+_ACTORS_ADVICE = "look at the actors in the report, or give labels, boxes or flow"
 _ADVICE = "make the report again with `carlasc report --remake --save`, or the grid with `carlasc regrid --overwrite`"
 
 
@@ -103,10 +105,9 @@ class Freshness:
         if report.settings != self.sequence.params(grid):
             yield self._finding(grid, "the settings in its report", "another params.json")
         for name, digest in report.documents.items():
-            if name == layout.params_file(grid):
-                continue
             exists = name in self.sequence.documents()
-            if not exists or not digest.matches(self.sequence.read_document(name)):
+            same = exists and digest.matches(self.sequence.read_document(name))
+            if name != layout.params_file(grid) and not same:
                 found = f"a {name} that changed since" if exists else f"no {name}"
                 yield self._finding(grid, f"the {name} that its report was made from", found)
         missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
@@ -120,22 +121,18 @@ class Freshness:
         doubtful = sum(actor.is_doubtful for actor in found)
         if found:
             many = doubtful > max(_DOUBTFUL_ACTORS * len(found), 2)
-            where = f"{self.sequence.location}/{grid}"
-            what = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
-            expected, advice = (
-                "actors that surely move",
-                "look at the actors in the report, or give labels, boxes or flow",
-            )
-            yield Finding("warning" if many else "note", "actors", self.sequence.path, where, expected, what, advice)
+            said = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
+            made = replace(self._finding(grid, "actors that surely move", said), check="actors", advice=_ACTORS_ADVICE)
+            yield made if many else replace(made, severity="note")
 
     def _finding(self, grid: str, expected: str, found: str) -> Finding:
-        where = f"{self.sequence.location}/{grid}"
-        return Finding("warning", "report", self.sequence.path, where, expected, found, _ADVICE)
+        return Finding(
+            "warning", "report", self.sequence.path, f"{self.sequence.location}/{grid}", expected, found, _ADVICE
+        )
 
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
 _POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error
-_DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
 _DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
 _COARSE_M = 0.75  # in coarser voxels several classes meet, and most of each is free: a small share is no mistake
 _NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
-from carlasc.motion.paths import estimate_path, headings_of, is_standing, overlay
+from carlasc.motion.paths import estimate_path, headings_of, is_standing, middles_of, overlay
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
@@ -25,13 +25,14 @@ _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _PERSON_M = (1.5, 2.3)  # what is narrower and lower than this changes its shape as it moves
 _SLIDE_M = 0.5  # by which sightings are slid along their path, to see whether they overlay as well then
 _SIGHTINGS, _MANY_SIGHTINGS = 10, 30  # more than the latter do not raise the confidence
-_WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5)  # of one, and of the terms of `_confidence`
+_WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of one, and of the terms of `_confidence`
 _LEAST_CONFIDENCE = 0.5  # of a mover
+_STAYS_M, _SENSOR_WAY_M = 0.5, 1.0  # what moves with the sensor stays there in its frame, while it drives so far
+_LINE_SLOPE = 0.004  # a quarter of a degree: points of one scan line are within it
 _OWN_REACH_M, _OWN_HALF_M = (
     3.5,
     1.3,
 )  # the recording vehicle is within this of its sensor, and of the line that it drives along
-_OWN_STAYS_M, _OWN_WAY_M = 0.2, 1.0  # its points stay where they are in the sensor's frame, while it drives so far
 _OWN_MARGIN_M = 0.1  # around its points
 _SAMPLES = 300  # points of a sighting that its path is estimated from
 
@@ -239,8 +240,9 @@ class _MoverChain:
         """Return how sure it is that the thing is real, from 0 to 1; the arguments are those of `overlay`.
 
         The terms: the share of its points that were at places seen free; the share that stands around it, at its height, of all points there;
-        the share by which its sightings overlay better than slid along its path; and the logarithm of their number. A piece of a rail, a
-        fence or a hedge has neighbours that stand, and overlays as well after any slide. The result is the logistic function of the sum.
+        the share by which its sightings overlay better than slid along its path; the logarithm of their number; and whether it is a scan
+        line. A piece of a rail, a fence or a hedge has neighbours that stand, and overlays as well after any slide. The result is the
+        logistic function of the sum.
         """
         _, best, *slid = overlay(samples, positions, headings, seconds, (0.0, -_SLIDE_M, _SLIDE_M))
         points, freed, around = (
@@ -251,28 +253,38 @@ class _MoverChain:
         )
         gain = 1.0 - best / max(min(slid), 1e-3)
         support = float(np.log(min(len(self.links), _MANY_SIGHTINGS) / _SIGHTINGS))
-        terms = (1.0, freed / points, around / (points + around), gain, support)
+        terms = (1.0, freed / points, around / (points + around), gain, support, float(self._is_scan_line()))
         return 1.0 / (1.0 + float(np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))))
+
+    def _in_sensor(self) -> list[NDArray[np.float64]] | None:
+        """Return (M, 3) points of each sighting, metres, sensor frame, if they stay there while the sensor moves; None if they do not."""
+        way = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
+        local = [transform_points(invert(link.world_T_sensor), link.segment.points) for link in self.links]
+        middles = middles_of(local)
+        stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
+        return local if stays and way > _SENSOR_WAY_M and len(local) >= _MIN_SIGHTINGS else None
 
     def own_vehicle(self) -> NDArray[np.float64] | None:
         """Return (6,) lower and upper corner of the place in the sensor's frame, metres, if the thing is a part of the recording vehicle."""
-        places = np.stack([link.world_T_sensor[:3, 3] for link in self.links])
-        if len(places) < _MIN_SIGHTINGS or np.ptp(places, axis=0).max() < _OWN_WAY_M:
+        local = self._in_sensor()
+        if local is None:
             return None
-        local = [transform_points(invert(link.world_T_sensor), link.segment.points) for link in self.links]
-        corners = np.stack([np.concatenate([points.min(axis=0), points.max(axis=0)]) for points in local])
-        ahead = np.gradient(places, axis=0)[:, :2]
-        across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.maximum(np.hypot(*ahead.T), 1e-6)[:, None]
-        for link, place, direction in zip(self.links, places, across, strict=True):
-            offset = link.segment.points[:, :2] - place[:2]
-            if (np.abs((offset * direction).sum(axis=1)) > _OWN_HALF_M).any() or np.hypot(
-                *offset.T
-            ).max() > _OWN_REACH_M:
+        way = np.gradient(np.stack([link.world_T_sensor[:2, 3] for link in self.links]), axis=0)
+        for link, step in zip(self.links, way, strict=True):
+            x, y = (link.segment.points - link.world_T_sensor[:3, 3])[:, :2].T
+            across = np.abs(x * step[1] - y * step[0]) / max(float(np.hypot(*step)), 1e-6)
+            if across.max() > _OWN_HALF_M or np.hypot(x, y).max() > _OWN_REACH_M:
                 return None
-        middles = (corners[:, :3] + corners[:, 3:]) / 2
-        if np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() > _OWN_STAYS_M:
-            return None
-        return np.concatenate([corners[:, :3].min(axis=0) - _OWN_MARGIN_M, corners[:, 3:].max(axis=0) + _OWN_MARGIN_M])
+        points = np.concatenate(local)
+        return np.concatenate([points.min(axis=0) - _OWN_MARGIN_M, points.max(axis=0) + _OWN_MARGIN_M])
+
+    def _is_scan_line(self) -> bool:
+        """Return whether it is what one scan line hits, and moves with the sensor, as the place does where a line meets a rail."""
+        local = self._in_sensor()
+        if local is None:
+            return False
+        x, y, z = np.concatenate(local).T
+        return bool(np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE)
 
 
 def _is_small(size: NDArray[np.float64]) -> bool:

@@ -38,9 +38,8 @@ _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; i
 _DEVIATIONS = 2.0  # the first reach is at least so many standard deviations of the prediction
 _POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and the number of points with independent errors
 _VARIANCE_M2 = _POINT_M**2
-_PREDICTED = np.array(
-    [0.2, 0.2, 0.01, 0.02]
-)  # error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians
+# Error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians.
+_PREDICTED = np.array([0.2, 0.2, 0.01, 0.02])
 _UNKNOWN = 5.0  # factor of this error while the motion is not known yet
 _ROBUST = 0.3  # fraction of the reach; pairs farther from their plane get less weight
 _SLOW_M_S, _END_POINTS = 1.0, 20  # the ends of slower actors, and of sightings with fewer points, are not compared
@@ -84,8 +83,7 @@ def is_standing(
     seconds: NDArray[np.float64],
 ) -> bool:
     """Return whether sightings overlap as well without any motion as with the estimated motion; the arguments are those of `overlay`."""
-    still, moved = overlay(sightings, positions, headings, seconds)
-    # With a wrong path the sightings overlap badly too, so those of a standing actor must also be close to each other.
+    still, moved = overlay(sightings, positions, headings, seconds)  # with a wrong path, they overlap badly too
     return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STANDING_M))
 
 
@@ -116,8 +114,7 @@ def overlay(
         if j != i:
             slid = [_mean_distance(body[i] + np.array([slide, 0.0, 0.0]), body[j]) for slide in slides_m]
             found.append([_mean_distance(thinned[i], thinned[j]), *slid])
-    columns = zip(*found, strict=True) if found else [[np.nan]] * (1 + len(slides_m))
-    return tuple(float(np.mean(column)) for column in columns)
+    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(slides_m))
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:

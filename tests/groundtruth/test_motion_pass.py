@@ -63,7 +63,7 @@ class TestKept:
         assert list(ACTORS.tracks) == [0, 2]
         assert [summary["moves"] for summary in ACTORS.summary] == [True, False, True]
         assert ACTORS.summary[0] | {"size_m": None} == {
-            "label": 10, "instance": 7, "first": 3, "last": 12, "scans": 10, "points": 45, "moves": True,
+            "label": 10, "instance": 7, "first": 3, "last": 12, "scans": 10, "points": 45, "moves": True, "confidence": 1.0,
             "speed_m_s": 8.0, "size_m": None, "seen_m": [3.5, 1.3, 0.9], "faces": 2,
         }  # fmt: skip
 

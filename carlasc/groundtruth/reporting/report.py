@@ -282,7 +282,7 @@ class Report:
                 settings=from_plain(values["settings"], Mapping[str, Any], "settings"),
                 coverage=from_plain(values["coverage"], Coverage, "coverage"),
                 convergence=from_plain(values["convergence"], Convergence | None, "convergence"),
-                actors=from_plain(_with_confidence(values["actors"]), tuple[ActorTrack, ...] | None, "actors"),
+                actors=from_plain(values["actors"], tuple[ActorTrack, ...] | None, "actors"),
                 poses=from_plain(values["poses"], PoseFacts | None, "poses"),
                 inferred_share=from_plain(values["inferred_share"], float | None, "inferred_share"),
                 holdout=from_plain(values["holdout"], _HeldOut | None, "holdout"),
@@ -356,13 +356,6 @@ def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
     """Return half-open ranges of consecutive frame numbers."""
     runs = [[frame for _, frame in run] for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0])]
     return [(run[0], run[-1] + 1) for run in runs]
-
-
-def _with_confidence(actors: Any) -> Any:
-    """Return the actors of a report; earlier versions wrote no confidence."""
-    if not isinstance(actors, list):
-        return actors
-    return [{"confidence": 1.0, **actor} if isinstance(actor, dict) else actor for actor in actors]
 
 
 def _frames(spans: Any) -> tuple[int, ...]:
