@@ -120,10 +120,9 @@ class Freshness:
         found = [actor for actor in report.actors or () if actor.confidence < 1]
         doubtful = sum(actor.is_doubtful for actor in found)
         if found:
-            many = doubtful > max(_DOUBTFUL_ACTORS * len(found), 2)
             said = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
             made = replace(self._finding(grid, "actors that surely move", said), check="actors", advice=_ACTORS_ADVICE)
-            yield made if many else replace(made, severity="note")
+            yield made if doubtful > max(_DOUBTFUL_ACTORS * len(found), 2) else replace(made, severity="note")
 
     def _finding(self, grid: str, expected: str, found: str) -> Finding:
         return Finding(
@@ -204,8 +203,8 @@ class _CheckedFrames:
 
 
 def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
-    found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
-    frames = tuple(found.tolist())
+    listed = [sequence.frames(name) for name in _fields(sequence)]
+    frames = tuple(np.unique(np.concatenate([np.empty(0, np.int64), *listed])).tolist())
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
     # opening a local file is cheap; a frame of a packed store has to be decoded, and cannot have a wrong size
     return _CheckedFrames(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
@@ -369,10 +368,8 @@ def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDi
 
 def _largest_edge(spec: GridSpec) -> float:
     """Return the length of a voxel's longest edge in metres; of a cylindrical one, at half the radius of the grid."""
-    edges = spec.voxel_size.copy()
-    if spec.coordinates == "cylindrical":
-        edges[1] *= (spec.lower[0] + spec.upper[0]) / 2
-    return float(edges.max())
+    radius = (spec.lower[0] + spec.upper[0]) / 2 if spec.coordinates == "cylindrical" else 1.0
+    return float((spec.voxel_size * (1.0, radius, 1.0)).max())
 
 
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
