@@ -1,8 +1,15 @@
 """Movers are followed over time, and only what overlays better along a path than standing earns a track."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from helpers.references.whole_drives import find_movers, link_segments
-from helpers.scenes.moving_scenes import CAR, PERSON, WALLS, car, film, person
+from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, film, person
+
+from carlasc.captures.settings import Lidar
+from carlasc.motion.evidence import find_evidence
+from carlasc.motion.movers import follow_movers
 
 
 def movers(scene, frames=40, **options):
@@ -67,3 +74,52 @@ def test_moved_points_are_told_for_every_frame():
 def test_nothing_moves_without_scans_or_with_one():
     assert movers(lambda _: [*WALLS], 0).tracked == ()
     assert movers(lambda t: [*WALLS, car(8.0 * t, 6.0)], 1).tracked == ()
+
+
+COARSE = Lidar(channels=16, points=16 * 1800, noise_m=0.0)
+LEAVES = np.random.default_rng(3).uniform((-0.1, 0.1, 0.2, 0.9), (0.1, 0.3, 0.5, 1.3), (113, 4)).tolist()
+STANDING = {
+    "fence": (8.0, [box(x, 6.0, (0.1, 0.1, 1.2), WALL) for x in np.arange(-15.0, 30.0, 0.5)]),
+    "rail": (4.0, [box(x, 4.0, (4.0, 0.1, 0.3), WALL) for x in np.arange(-15.0, 30.0, 4.5)]),
+    "hedge": (4.0, [box(-15.0 + 0.4 * i, 6.0 + y, size, WALL) for i, (y, *size) in enumerate(LEAVES)]),
+}
+"""What repeats: the speed of the sensor, m/s, at which most of it seems to move, and the boxes."""
+
+
+@pytest.mark.parametrize("name", STANDING)
+def test_what_repeats_along_the_street_is_no_mover(name):
+    speed, boxes = STANDING[name]
+    filmed = film(lambda _: [*WALLS, *boxes], 24, ego_m_s=speed, noise_m=0.02, noise_deg=0.1, lidar=COARSE)
+    assert find_movers(sighting for sighting, _ in filmed).tracked == ()
+
+
+@pytest.mark.parametrize(
+    ("size", "speed", "y"), [((4.4, 1.8, 1.5), 8.0, 3.5), ((1.7, 0.5, 1.6), 5.0, 5.0), ((0.5, 0.5, 1.7), 1.4, -4.0)]
+)
+def test_movers_are_found_beside_what_repeats_and_are_sure(size, speed, y):
+    def scene(seconds):
+        return [*WALLS, *STANDING["rail"][1], box(-6.0 + speed * seconds, y - 1.0, size, CAR)]
+
+    filmed = film(scene, 30, ego_m_s=4.0, noise_m=0.02, noise_deg=0.1)
+    found = find_movers(sighting for sighting, _ in filmed).tracked
+    assert [round(float(np.median([s.velocity[0] for s in m.segments])) / speed, 0) for m in found] == [1.0]
+    assert all(mover.confidence > 0.8 for mover in found)
+
+
+def test_points_on_the_recording_vehicle_are_found_and_are_no_mover():
+    rack = np.random.default_rng(1).uniform((-2.4, 0.2, -0.6), (-2.1, 0.5, -0.4), (25, 3)).astype(np.float32)
+    filmed = [
+        replace(sighting, points=np.concatenate([sighting.points, rack]))
+        for sighting, _ in film(lambda _: WALLS, 24, ego_m_s=6.0, lidar=COARSE)
+    ]
+    own = []
+    assert list(follow_movers(find_evidence(filmed), {}, own=own)) == []
+    (corners,) = own
+    assert (rack > corners[:3]).all() and (rack < corners[3:]).all() and np.ptp(corners.reshape(2, 3), axis=0).max() < 1
+
+
+def test_a_car_beside_the_sensor_that_keeps_its_speed_is_not_the_recording_vehicle():
+    own = []
+    filmed = film(lambda t: [*WALLS, car(6.0 * t + 1.0, 3.0)], 24, ego_m_s=6.0)
+    (mover,) = follow_movers(find_evidence(sighting for sighting, _ in filmed), {}, own=own)
+    assert mover.confidence > 0.8 and own == []

@@ -35,14 +35,24 @@ def cast(world_T_sensor, boxes, lidar=LIDAR):
     with np.errstate(divide="ignore", invalid="ignore"):
         nearest = np.where(rays[:, 2] < 0, -origin[2] / rays[:, 2], np.inf)
         labels = np.full(len(rays), GROUND)
+        azimuth = np.arctan2(rays[:, 1], rays[:, 0])
         for lower, upper, label in boxes:
-            one, other = (lower - origin) / rays, (upper - origin) / rays
+            near = rays_towards(azimuth, lower - origin, upper - origin)
+            one, other = (lower - origin) / rays[near], (upper - origin) / rays[near]
             enter, leave = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
-            seen = (enter <= leave) & (enter > 0) & (enter < nearest)
-            nearest, labels = np.where(seen, enter, nearest), np.where(seen, label, labels)
+            seen = (enter <= leave) & (enter > 0) & (enter < nearest[near])
+            nearest[near[seen]], labels[near[seen]] = enter[seen], label
     found = nearest < lidar.range_m
     points = lidar.directions[found] * nearest[found, None]
     return points.astype(np.float32), labels[found].astype(np.uint32)
+
+
+def rays_towards(azimuth, lower, upper):
+    """Return the indices of the rays, of which some may hit a box whose corners are given from their origin: others cannot."""
+    corners = np.arctan2([lower[1], lower[1], upper[1], upper[1]], [lower[0], upper[0], lower[0], upper[0]])
+    if lower[0] < 0 and lower[1] <= 0 <= upper[1]:  # behind, where angles jump, or around the sensor
+        return np.arange(len(azimuth))
+    return np.flatnonzero((azimuth > corners.min() - 1e-6) & (azimuth < corners.max() + 1e-6))
 
 
 def film(scene, frames=40, *, period_s=0.1, ego_m_s=0.0, noise_m=0.0, noise_deg=0.0, labels=False, lidar=LIDAR):
