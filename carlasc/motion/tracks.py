@@ -370,7 +370,7 @@ def _summarize(track: Track) -> dict[str, Any]:
         "scans": len(track.members),
         "points": sum(len(own) for own in track.members.values()),
         "moves": track.moves,
-        "confidence": round(track.confidence, 3),
+        "confidence": int(1000 * track.confidence) / 1000,  # never 1 for an actor that the data do not name
         "speed_m_s": round(float(np.median(speed)), 3),
         "size_m": [round(float(value), 3) for value in track.size],
         "seen_m": [round(float(value), 3) for value in track.extent.size],

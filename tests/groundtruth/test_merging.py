@@ -125,6 +125,15 @@ def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
     assert Merger(unmarked.__getitem__, untracked, CARLA, "align").static(3).tolist() == [True, True, False]
 
 
+def test_points_on_the_recording_vehicle_are_left_out_of_every_frame():
+    merging = merger(tracks=[])
+    merging.actors = MovingActors(own=(np.array([2.0, 7.0, -2.0, 4.0, 9.0, -1.0]),))
+    now = instant(15)
+    for other in (3, 15):
+        (seen,) = merging.observations(now, [other], {})
+        assert seen.hits.tolist() == [False, other == 15, True]
+
+
 def test_a_track_that_never_moves_is_part_of_the_static_scene():
     still = track()
     still.velocity[:] = 0

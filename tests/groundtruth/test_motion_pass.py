@@ -17,21 +17,20 @@ from carlasc.storage import layout
 FRAMES = 12
 
 
-def track(first=3, frames=10, speed=8.0, label=10, instance=7, rigid=True):
+def track(first=3, frames=10, speed=8.0, label=10, instance=7, rigid=True, confidence=1.0):
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = 0.1 * speed * np.arange(frames)
     half = np.array([2.0, 0.9, 0.7])
     members = {first + i: np.arange(i, dtype=np.int32) for i in range(frames)}
     extent = Extent(-half, half - 0.5, (True, False, True, False), 300, (-9.0, 4.0))
-    return Track(
-        label, instance, members, first, poses, np.tile([speed, 0.0, 0.0], (frames, 1)), -half, half, extent, rigid
-    )
+    velocity = np.tile([speed, 0.0, 0.0], (frames, 1))
+    return Track(label, instance, members, first, poses, velocity, -half, half, extent, rigid, confidence)
 
 
 def assert_equal(one, other):
     assert list(one.tracks) == list(other.tracks)
     for a, b in zip(one.tracks.values(), other.tracks.values(), strict=True):
-        for name in ("label", "instance", "first", "rigid"):
+        for name in ("label", "instance", "first", "rigid", "confidence"):
             assert getattr(a, name) == getattr(b, name)
         for name in ("world_T_actor", "velocity", "lower", "upper"):
             assert np.array_equal(getattr(a, name), getattr(b, name))
@@ -45,12 +44,14 @@ def assert_equal(one, other):
         assert all(np.array_equal(a.members[frame], b.members[frame]) for frame in a.members)
     assert list(one.moving) == list(other.moving)
     assert all(np.array_equal(one.moving[frame], other.moving[frame]) for frame in one.moving)
+    assert np.array_equal(one.own, other.own)
     assert [dict(summary) for summary in one.summary] == [dict(summary) for summary in other.summary]
 
 
 ACTORS = MovingActors.of(
-    [track(), track(speed=0.0), track(first=0, frames=4, label=4, instance=1 << 33, rigid=False)],
+    [track(), track(speed=0.0), track(first=0, frames=4, label=4, instance=1 << 33, rigid=False, confidence=0.9999)],
     {2: np.array([5, 9]), 4: np.array([], np.int64), 8: np.array([1])},
+    [np.array([-3.0, 0.0, -1.0, -2.0, 1.0, 0.0])],
 )
 
 
@@ -65,7 +66,9 @@ class TestKept:
         assert ACTORS.summary[0] | {"size_m": None} == {
             "label": 10, "instance": 7, "first": 3, "last": 12, "scans": 10, "points": 45, "moves": True, "confidence": 1.0,
             "speed_m_s": 8.0, "size_m": None, "seen_m": [3.5, 1.3, 0.9], "faces": 2,
+            "confidence": 1.0,
         }  # fmt: skip
+        assert ACTORS.summary[2]["confidence"] == 0.999  # 1 is for what the data say
 
     @pytest.mark.parametrize(
         "actors", [ACTORS, MovingActors(), MovingActors.of([], {3: np.array([2])}), MovingActors.of([track()])]
@@ -96,6 +99,7 @@ class TestKept:
             assert np.array_equal(near.tracks[0].pose(frame), ACTORS.tracks[0].pose(frame))
         assert near.tracks[0].pose(4) is near.tracks[0].pose(9) is None
         assert sorted(near.moving) == [8]
+        assert near.is_own(np.array([[-2.5, 0.5, -0.5], [-2.5, 0.5, 0.5]])).tolist() == [True, False]
         assert not ACTORS.between(30, 40).tracks and not ACTORS.between(30, 40).moving
 
 

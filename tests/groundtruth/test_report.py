@@ -259,14 +259,15 @@ def test_a_true_motion_overlays_sightings_better_than_standing():
 
 
 def test_residuals_are_means_over_the_sightings_of_each_actor_that_moves():
-    about = {"label": 10, "instance": 0, "scans": 3, "points": 50, "speed_m_s": 5.0, "faces": 2}
-    about |= {"first": 1, "last": 3, "size_m": [4.0, 2.0, 1.5], "seen_m": [3.0, 1.0, 1.5], "confidence": 0.9}
+    about = {"label": 10, "instance": 0, "scans": 3, "points": 50, "speed_m_s": 5.0, "faces": 2, "confidence": 0.7}
+    about |= {"first": 1, "last": 3, "size_m": [4.0, 2.0, 1.5], "seen_m": [3.0, 1.0, 1.5]}
     summaries = [about | {"moves": False}, about | {"moves": True}, about | {"moves": True, "first": 0, "label": 4}]
     frames = [{1: Residual(1.0, 4.0, 10), 0: Residual(9.0, 9.0, 1)}, {1: Residual(5.0, 6.0, 20)}]
     person, car = actors_of(summaries, frames, CARLA)
     assert (person.label, person.residual_m, person.residual_standing_m) == ("Pedestrian", None, None)
     assert (car.label, car.residual_m, car.residual_standing_m) == ("Vehicle", 0.2, round(1 / 3, 4))
     assert (car.size_m, car.seen_m, car.faces, car.sightings) == ((4.0, 2.0, 1.5), (3.0, 1.0, 1.5), 2, 3)
+    assert car.confidence == 0.7 and car.is_doubtful
 
 
 def test_changes_count_only_voxels_known_in_both():

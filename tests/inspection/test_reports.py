@@ -15,6 +15,7 @@ from carlasc import GridSpec, Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.groundtruth import FromScans, regrid
 from carlasc.inspection import report, validate, write_report_page
+from carlasc.inspection.report_page import describe
 from carlasc.inspection.reports import ReportResult
 from carlasc.inspection.validation import Freshness
 from carlasc.storage import FolderSink, layout
@@ -175,6 +176,38 @@ def test_a_damaged_report_is_a_warning_of_validate(copied):
     next(copied.rglob(layout.REPORT)).write_text("no json")
     ((severity, _),) = changes(copied)
     assert severity == "warning"
+
+
+@pytest.mark.parametrize(
+    ("confidences", "severity", "said"),
+    [
+        ([1.0], None, ""),
+        ([0.9, 0.7, 0.95, 1.0], "note", "3 actors"),
+        ([0.6] * 3 + [0.9], "warning", "3 of them doubtful"),
+    ],
+)
+def test_actors_that_free_space_shows_are_counted_and_many_doubtful_ones_are_a_warning(
+    copied, confidences, severity, said
+):
+    path = next(copied.rglob(layout.REPORT))
+    values = json.loads(path.read_text())
+    (actor,) = values["actors"]
+    values["actors"] = [actor | {"confidence": confidence} for confidence in confidences]
+    path.write_text(json.dumps(values))
+    found = [finding for finding in validate(copied, every=1).findings if finding.check == "actors"]
+    assert [finding.severity for finding in found] == ([severity] if severity else [])
+    assert all(said in finding.found for finding in found)
+    doubtful = sum(confidence < 0.8 for confidence in confidences)
+    rows = dict(describe(report(copied).reports[NAME]))
+    assert (f"{doubtful} of them doubtful" in rows["actors"]) == (doubtful > 0)
+
+
+def test_a_report_of_an_earlier_version_has_actors_without_a_confidence(copied):
+    path = next(copied.rglob(layout.REPORT))
+    values = json.loads(path.read_text())
+    del values["actors"][0]["confidence"]
+    path.write_text(json.dumps(values))
+    assert [actor.confidence for actor in report(copied).reports[NAME].actors] == [1.0]
 
 
 def test_a_frame_of_no_report_is_not_compared(made):
