@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,9 +18,12 @@ from numpy.typing import NDArray
 from carlasc.core.cells import Triple
 from carlasc.core.compiling import cached
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.inspection.findings import Finding
+from carlasc.groundtruth.reporting.facts import ActorTrack
+from carlasc.inspection.findings import Finding, Severity
+from carlasc.motion.tracks import is_doubtful
 from carlasc.storage.protocol import Sequence
 
+_DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
 KNOWN, RIGHT, OCCUPIED = 0, 1, 2
 """Columns of what `Voxels.count` returns."""
 
@@ -261,3 +265,14 @@ def _mistake(column: int, spec: GridSpec) -> str:
         f"one cell towards {'+' if s > 0 else '-'}{name}" for s, name in zip(shift, names, strict=True) if s
     )
     return f"a grid shifted by {steps}"
+
+
+def check_actors(sequence: Sequence, grid: str, actors: Series[ActorTrack]) -> Iterator[Finding]:
+    """Yield how many actors of a grid's report the data do not name: a warning if many of them are doubtful."""
+    found = [actor for actor in actors if actor.confidence < 1]
+    if found:
+        doubtful = sum(is_doubtful(actor.confidence) for actor in found)
+        severity: Severity = "warning" if doubtful > max(_DOUBTFUL_ACTORS * len(found), 2) else "note"
+        what = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
+        expected, advice = "actors that surely move", "look at the actors in the report, or give labels, boxes or flow"
+        yield Finding(severity, "actors", sequence.path, f"{sequence.location}/{grid}", expected, what, advice)

@@ -13,6 +13,7 @@ from carlasc.groundtruth.reporting.facts import ActorTrack, PoseFacts
 from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
 from carlasc.inspection.reports import ReportResult
 from carlasc.inspection.texts import fill
+from carlasc.motion.tracks import is_doubtful
 from carlasc.storage.files import write_output
 from carlasc.storage.resuming import RECORD
 
@@ -71,7 +72,7 @@ def _count(actors: Sequence[ActorTrack]) -> str:
     kinds = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(sorted(labels)))
     residuals = sorted(actor.residual_m for actor in actors if actor.residual_m is not None)
     middle = f"; the median residual is {residuals[len(residuals) // 2]:.2f} m" if residuals else ""
-    doubtful = sum(actor.is_doubtful for actor in actors)
+    doubtful = sum(is_doubtful(actor.confidence) for actor in actors)
     return f"{len(actors)} that move ({kinds}){f', {doubtful} of them doubtful' if doubtful else ''}{middle}"
 
 

@@ -18,7 +18,7 @@ from carlasc.groundtruth.heights import ground_of
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.facts import digest_of
 from carlasc.groundtruth.reporting.report import Report, short
-from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow
+from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
@@ -31,8 +31,6 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
-_DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
-_ACTORS_ADVICE = "look at the actors in the report, or give labels, boxes or flow"
 _ADVICE = "make the report again with `carlasc report --remake --save`, or the grid with `carlasc regrid --overwrite`"
 
 
@@ -94,7 +92,7 @@ class Freshness:
         yield from self._damaged
         for grid, report in self.reports.items():
             yield from self._settings(grid, report)
-            yield from self._actors(grid, report)
+            yield from check_actors(self.sequence, grid, report.actors or ())
             frames = self._compared.get(grid, 0)
             for (own, field), changed in self._changed.items():
                 if own == grid:
@@ -105,9 +103,10 @@ class Freshness:
         if report.settings != self.sequence.params(grid):
             yield self._finding(grid, "the settings in its report", "another params.json")
         for name, digest in report.documents.items():
+            if name == layout.params_file(grid):
+                continue
             exists = name in self.sequence.documents()
-            same = exists and digest.matches(self.sequence.read_document(name))
-            if name != layout.params_file(grid) and not same:
+            if not exists or not digest.matches(self.sequence.read_document(name)):
                 found = f"a {name} that changed since" if exists else f"no {name}"
                 yield self._finding(grid, f"the {name} that its report was made from", found)
         missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
@@ -115,19 +114,9 @@ class Freshness:
             finding = self._finding(grid, "a report of all frames", f"{len(missing)} frames that it does not cover")
             yield replace(finding, severity="note")
 
-    def _actors(self, grid: str, report: Report) -> Iterator[Finding]:
-        """Yield how many actors were found that the data do not name: a warning if many of them are doubtful."""
-        found = [actor for actor in report.actors or () if actor.confidence < 1]
-        doubtful = sum(actor.is_doubtful for actor in found)
-        if found:
-            said = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
-            made = replace(self._finding(grid, "actors that surely move", said), check="actors", advice=_ACTORS_ADVICE)
-            yield made if doubtful > max(_DOUBTFUL_ACTORS * len(found), 2) else replace(made, severity="note")
-
     def _finding(self, grid: str, expected: str, found: str) -> Finding:
-        return Finding(
-            "warning", "report", self.sequence.path, f"{self.sequence.location}/{grid}", expected, found, _ADVICE
-        )
+        where = f"{self.sequence.location}/{grid}"
+        return Finding("warning", "report", self.sequence.path, where, expected, found, _ADVICE)
 
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
@@ -203,8 +192,8 @@ class _CheckedFrames:
 
 
 def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
-    listed = [sequence.frames(name) for name in _fields(sequence)]
-    frames = tuple(np.unique(np.concatenate([np.empty(0, np.int64), *listed])).tolist())
+    found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
+    frames = tuple(found.tolist())
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
     # opening a local file is cheap; a frame of a packed store has to be decoded, and cannot have a wrong size
     return _CheckedFrames(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
@@ -368,8 +357,10 @@ def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDi
 
 def _largest_edge(spec: GridSpec) -> float:
     """Return the length of a voxel's longest edge in metres; of a cylindrical one, at half the radius of the grid."""
-    radius = (spec.lower[0] + spec.upper[0]) / 2 if spec.coordinates == "cylindrical" else 1.0
-    return float((spec.voxel_size * (1.0, radius, 1.0)).max())
+    edges = spec.voxel_size.copy()
+    if spec.coordinates == "cylindrical":
+        edges[1] *= (spec.lower[0] + spec.upper[0]) / 2
+    return float(edges.max())
 
 
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:

@@ -29,11 +29,8 @@ _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of one, and of the terms of `_co
 _LEAST_CONFIDENCE = 0.5  # of a mover
 _STAYS_M, _SENSOR_WAY_M = 0.5, 1.0  # what moves with the sensor stays there in its frame, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: points of one scan line are within it
-_OWN_REACH_M, _OWN_HALF_M = (
-    3.5,
-    1.3,
-)  # the recording vehicle is within this of its sensor, and of the line that it drives along
-_OWN_MARGIN_M = 0.1  # around its points
+_OWN_HALF_M, _OWN_REACH_M = 1.3, 3.5  # half the width of the recording vehicle, and how far from the sensor it reaches
+_OWN_MARGIN_M = 0.2  # around most of its points
 _SAMPLES = 300  # points of a sighting that its path is estimated from
 
 
@@ -245,12 +242,8 @@ class _MoverChain:
         logistic function of the sum.
         """
         _, best, *slid = overlay(samples, positions, headings, seconds, (0.0, -_SLIDE_M, _SLIDE_M))
-        points, freed, around = (
-            sum(counts)
-            for counts in zip(
-                *((len(link.segment.members), link.freed, link.around) for link in self.links), strict=True
-            )
-        )
+        counts = np.array([(len(link.segment.members), link.freed, link.around) for link in self.links])
+        points, freed, around = counts.sum(axis=0).tolist()
         gain = 1.0 - best / max(min(slid), 1e-3)
         support = float(np.log(min(len(self.links), _MANY_SIGHTINGS) / _SIGHTINGS))
         terms = (1.0, freed / points, around / (points + around), gain, support, float(self._is_scan_line()))
@@ -271,12 +264,12 @@ class _MoverChain:
             return None
         way = np.gradient(np.stack([link.world_T_sensor[:2, 3] for link in self.links]), axis=0)
         for link, step in zip(self.links, way, strict=True):
-            x, y = (link.segment.points - link.world_T_sensor[:3, 3])[:, :2].T
+            x, y, _ = (link.segment.points - link.world_T_sensor[:3, 3]).T
             across = np.abs(x * step[1] - y * step[0]) / max(float(np.hypot(*step)), 1e-6)
             if across.max() > _OWN_HALF_M or np.hypot(x, y).max() > _OWN_REACH_M:
                 return None
-        points = np.concatenate(local)
-        return np.concatenate([points.min(axis=0) - _OWN_MARGIN_M, points.max(axis=0) + _OWN_MARGIN_M])
+        low, high = np.quantile(np.concatenate(local), (0.05, 0.95), axis=0)
+        return np.concatenate([low - _OWN_MARGIN_M, high + _OWN_MARGIN_M])
 
     def _is_scan_line(self) -> bool:
         """Return whether it is what one scan line hits, and moves with the sensor, as the place does where a line meets a rail."""

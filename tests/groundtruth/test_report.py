@@ -267,7 +267,7 @@ def test_residuals_are_means_over_the_sightings_of_each_actor_that_moves():
     assert (person.label, person.residual_m, person.residual_standing_m) == ("Pedestrian", None, None)
     assert (car.label, car.residual_m, car.residual_standing_m) == ("Vehicle", 0.2, round(1 / 3, 4))
     assert (car.size_m, car.seen_m, car.faces, car.sightings) == ((4.0, 2.0, 1.5), (3.0, 1.0, 1.5), 2, 3)
-    assert car.confidence == 0.7 and car.is_doubtful
+    assert car.confidence == 0.7
 
 
 def test_changes_count_only_voxels_known_in_both():

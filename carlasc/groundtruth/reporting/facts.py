@@ -17,7 +17,6 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.motion.refinement import RefinedPoses
-from carlasc.motion.tracks import is_doubtful
 from carlasc.storage import layout
 
 _MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured
@@ -93,11 +92,6 @@ class ActorTrack:
     residual_m: float | None
     residual_standing_m: float | None
     confidence: float = 1.0
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether it may be no actor."""
-        return is_doubtful(self.confidence)
 
     @classmethod
     def of(cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable) -> ActorTrack:
