@@ -66,7 +66,6 @@ class TestKept:
         assert ACTORS.summary[0] | {"size_m": None} == {
             "label": 10, "instance": 7, "first": 3, "last": 12, "scans": 10, "points": 45, "moves": True, "confidence": 1.0,
             "speed_m_s": 8.0, "size_m": None, "seen_m": [3.5, 1.3, 0.9], "faces": 2,
-            "confidence": 1.0,
         }  # fmt: skip
         assert ACTORS.summary[2]["confidence"] == 0.999  # 1 is for what the data say
 
