@@ -24,7 +24,9 @@ def track(first=3, frames=10, speed=8.0, label=10, instance=7, rigid=True, confi
     members = {first + i: np.arange(i, dtype=np.int32) for i in range(frames)}
     extent = Extent(-half, half - 0.5, (True, False, True, False), 300, (-9.0, 4.0))
     velocity = np.tile([speed, 0.0, 0.0], (frames, 1))
-    return Track(label, instance, members, first, poses, velocity, -half, half, extent, rigid, confidence)
+    surface = np.arange(3 * frames, dtype=np.float32).reshape(-1, 3)
+    whole = (-half, half, extent, rigid, surface, confidence)
+    return Track(label, instance, members, first, poses, velocity, *whole)
 
 
 def assert_equal(one, other):
@@ -32,7 +34,7 @@ def assert_equal(one, other):
     for a, b in zip(one.tracks.values(), other.tracks.values(), strict=True):
         for name in ("label", "instance", "first", "rigid", "confidence"):
             assert getattr(a, name) == getattr(b, name)
-        for name in ("world_T_actor", "velocity", "lower", "upper"):
+        for name in ("world_T_actor", "velocity", "lower", "upper", "surface"):
             assert np.array_equal(getattr(a, name), getattr(b, name))
         assert (a.extent.faces, a.extent.points, a.extent.seen_from) == (
             b.extent.faces,
