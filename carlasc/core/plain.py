@@ -16,7 +16,7 @@ def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
     Args:
         value: the value.
         kind: int, float, str, bool, None, Any, a union of types, `tuple[...]`, `Mapping[str, ...]`, a dataclass or a TypedDict. Keys
-            that a dataclass lacks are left out, and may be missing if it has a default for them.
+            that a dataclass lacks are left out.
         name: what it is called in errors.
 
     Raises:
@@ -63,7 +63,7 @@ def _as_record(value: Any, kind: Any, name: str) -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{type(value).__name__} in {name}")
     hints = typing.get_type_hints(kind)
-    if missing := [key for key in hints if key not in value and not hasattr(kind, key)]:  # defaults are attributes
+    if missing := [key for key in hints if key not in value]:
         raise ValueError(f"no {missing[0]} in {name}")
-    checked = {key: from_plain(value[key], hint, f"{name}.{key}") for key, hint in hints.items() if key in value}
+    checked = {key: from_plain(value[key], hint, f"{name}.{key}") for key, hint in hints.items()}
     return {**value, **checked} if typing.is_typeddict(kind) else kind(**checked)

@@ -202,14 +202,6 @@ def test_actors_that_free_space_shows_are_counted_and_many_doubtful_ones_are_a_w
     assert (f"{doubtful} of them doubtful" in rows["actors"]) == (doubtful > 0)
 
 
-def test_a_report_of_an_earlier_version_has_actors_without_a_confidence(copied):
-    path = next(copied.rglob(layout.REPORT))
-    values = json.loads(path.read_text())
-    del values["actors"][0]["confidence"]
-    path.write_text(json.dumps(values))
-    assert [actor.confidence for actor in report(copied).reports[NAME].actors] == [1.0]
-
-
 def test_a_frame_of_no_report_is_not_compared(made):
     (sequence,) = carlasc.open(made).sequences().values()
     freshness = Freshness(sequence)

@@ -320,10 +320,8 @@ class _FrameSteps:
         found = spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, points))
         returned, returns = np.unique(found[found >= 0], return_counts=True)
         is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
-        lost, is_single = (
-            returned[is_lost],
-            (returns[is_lost] == 1) & ~_have_neighbours(returned[is_lost], returned, spec),
-        )
+        lost = returned[is_lost]
+        is_single = (returns[is_lost] == 1) & ~_have_neighbours(lost, returned, spec)
         rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]

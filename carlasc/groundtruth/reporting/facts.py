@@ -91,7 +91,7 @@ class ActorTrack:
     faces: int
     residual_m: float | None
     residual_standing_m: float | None
-    confidence: float = 1.0
+    confidence: float
 
     @classmethod
     def of(cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable) -> ActorTrack:

@@ -9,7 +9,7 @@ keeps the class with most votes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,26 @@ _PRIOR = 6.0  # weight of the likeliest class in the shares of a voxel, in votes
 _HEARD = 5.0  # votes after which more of them make no class likelier: a voxel may hold two things
 _FEW = 2.5  # fewer votes are of one thing
 _SHARES = 5  # steps in which shares are found
+
+
+class _Cast(NamedTuple):
+    """The votes that were cast, by voxel.
+
+    Attributes:
+        voxels: (N,) int32 flat indices.
+        begins: (N + 1,) int64 first row of each voxel in the next two.
+        own: (M,) int64 the class of each row, as an index.
+        weight: (M,) float64 its votes.
+        rows: (V,) int32 index of each voxel of the grid in `voxels`; -1 without votes.
+        size: (3,) int64 of the grid.
+    """
+
+    voxels: NDArray[np.int32]
+    begins: NDArray[np.int64]
+    own: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    rows: NDArray[np.int32]
+    size: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -69,10 +89,10 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     # The points of one scan are wrong together, so each scan counts as one vote, of which each class has its share.
     scans = np.maximum.reduceat(votes["voters"], begins[:-1]) / np.add.reduceat(votes["votes"], begins[:-1])
     weight = votes["sure"] * np.repeat(scans, np.diff(begins))
-    size = np.array(spec.size)
+    cast = _Cast(voxels, begins, own, weight, rows, np.array(spec.size))
 
     confusion, frequency = np.zeros((len(present), len(present))), np.zeros(len(present))
-    _compare(voxels, begins, own, weight, rows, size, confusion, frequency)
+    _compare(cast, confusion, frequency)
     compared = float(confusion.sum())
     wrong = max(1 - float(np.trace(confusion)) / compared, _LEAST_WRONG) if compared else _LEAST_WRONG
     usual = np.full_like(confusion, wrong / max(len(present) - 1, 1))
@@ -85,7 +105,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     plain = (np.diff(begins) == 1) & (weight[first] >= _needed(confusion, frequency)[own[first]])
     place = np.where(plain, -1, np.cumsum(~plain) - 1)
     shares = np.empty((np.count_nonzero(~plain), len(present)), np.float32)
-    _ask(voxels, begins, own, weight, rows, size, confusion, frequency, place, shares)
+    _ask(cast, confusion, frequency, place, shares)
     labels[voxels] = present[own[first]]
     labels[voxels[~plain]] = present[shares.argmax(axis=1)]
 
@@ -109,28 +129,25 @@ def _needed(confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> N
 
 
 @jit
-def _neighbour(voxel: int, x: int, y: int, z: int, rows: NDArray[np.int32], size: NDArray[np.int64]) -> int:
-    """Return the row of the voxel that is x, y and z voxels away; -1 if it is outside of the grid or has no votes."""
+def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
+    """Return the index of the voxel that is x, y and z voxels away from voxel i; -1 if it is outside of the grid or has no votes."""
+    voxel, size = cast.voxels[i], cast.size
     a = voxel // (size[1] * size[2]) + x
     b = voxel // size[2] % size[1] + y
     c = voxel % size[2] + z
     if a < 0 or b < 0 or c < 0 or a >= size[0] or b >= size[1] or c >= size[2]:
         return -1
-    return int(rows[(a * size[1] + b) * size[2] + c])
+    return int(cast.rows[(a * size[1] + b) * size[2] + c])
 
 
 @cached
 def _compare(
-    voxels: NDArray[np.int32],
-    begins: NDArray[np.int64],
-    own: NDArray[np.int64],
-    weight: NDArray[np.float64],
-    rows: NDArray[np.int32],
-    size: NDArray[np.int64],
+    cast: _Cast,
     confusion: NDArray[np.float64],
     frequency: NDArray[np.float64],
 ) -> None:
     """Count the votes of voxels amid others of their class: `confusion[a, b]` of those for b in voxels of a. `frequency` counts all voxels."""
+    voxels, begins, own, weight = cast.voxels, cast.begins, cast.own, cast.weight
     most = np.empty(len(voxels), np.int64)
     for i in range(len(voxels)):
         best = begins[i]
@@ -145,7 +162,7 @@ def _compare(
         for x in range(-1, 2):
             for y in range(-1, 2):
                 for z in range(-1, 2):
-                    other = _neighbour(voxels[i], x, y, z, rows, size)
+                    other = _neighbour(cast, i, x, y, z)
                     if other >= 0:  # itself among them
                         around += 1 if most[other] == most[i] else -27
         if total >= _JUDGES and around >= 3:
@@ -155,12 +172,7 @@ def _compare(
 
 @cached
 def _ask(
-    voxels: NDArray[np.int32],
-    begins: NDArray[np.int64],
-    own: NDArray[np.int64],
-    weight: NDArray[np.float64],
-    rows: NDArray[np.int32],
-    size: NDArray[np.int64],
+    cast: _Cast,
     confusion: NDArray[np.float64],
     frequency: NDArray[np.float64],
     place: NDArray[np.int64],
@@ -169,12 +181,7 @@ def _ask(
     """Find the shares of classes: the likeliest class of each voxel, from its neighbours too where it is in doubt, then what explains the votes.
 
     Args:
-        voxels: (N,) flat indices.
-        begins: (N + 1,) first row of each voxel in the next two.
-        own: (M,) the class of each row, as an index.
-        weight: (M,) its votes.
-        rows: (V,) index of each voxel in `voxels`, -1 without votes.
-        size: (3,) of the grid.
+        cast: the votes.
         confusion: (K, K) probability that something of the first class is called the second one.
         frequency: (K,) share of each class.
         place: (N,) row of each voxel in `shares`; -1 if it is plainly of the class of its only row.
@@ -184,9 +191,9 @@ def _ask(
     # Many votes for two classes are of two things in the voxel: each explains the points of the other as badly as the other way round.
     many = (few + few.T) / 2
     doubtful, asked = np.empty(len(shares), np.int64), 0
-    for i in range(len(voxels)):
+    for i in range(len(cast.voxels)):
         if place[i] >= 0:
-            _weigh(i, begins, own, weight, few, many, frequency, shares[place[i]])
+            _weigh(cast, i, few, many, frequency, shares[place[i]])
             if shares[place[i]].max() < _SURE:
                 doubtful[asked] = i
                 asked += 1
@@ -194,28 +201,27 @@ def _ask(
     for _ in range(_ROUNDS):
         for k in range(asked):
             i = doubtful[k]
-            _hear(voxels[i], begins, own, weight, rows, size, frequency, place, shares, prior)
-            _weigh(i, begins, own, weight, few, many, prior, changed[k])
+            _hear(cast, i, frequency, place, shares, prior)
+            _weigh(cast, i, few, many, prior, changed[k])
         for k in range(asked):
             shares[place[doubtful[k]]] = changed[k]
     likeliest, left = np.empty(kinds), np.empty(kinds)
-    for i in range(len(voxels)):
+    for i in range(len(cast.voxels)):
         if place[i] >= 0:
-            _explain(i, begins, own, weight, confusion, shares[place[i]], likeliest, left)
+            _explain(cast, i, confusion, shares[place[i]], likeliest, left)
 
 
 @jit
 def _weigh(
+    cast: _Cast,
     i: int,
-    begins: NDArray[np.int64],
-    own: NDArray[np.int64],
-    weight: NDArray[np.float64],
     few: NDArray[np.float64],
     many: NDArray[np.float64],
     prior: NDArray[np.float64],
     out: NDArray[np.float32],
 ) -> None:
     """Write the probability of each class by the votes of a voxel and what is likely before."""
+    begins, own, weight = cast.begins, cast.own, cast.weight
     scores = np.log(prior + _UNHEARD)
     total = weight[begins[i] : begins[i + 1]].sum()
     for row in range(begins[i], begins[i + 1]):
@@ -232,24 +238,21 @@ def _weigh(
 
 @jit
 def _hear(
-    voxel: int,
-    begins: NDArray[np.int64],
-    own: NDArray[np.int64],
-    weight: NDArray[np.float64],
-    rows: NDArray[np.int32],
-    size: NDArray[np.int64],
+    cast: _Cast,
+    i: int,
     frequency: NDArray[np.float64],
     place: NDArray[np.int64],
     shares: NDArray[np.float32],
     prior: NDArray[np.float64],
 ) -> None:
     """Write how likely each class is by the neighbours of a voxel: near ones, and those that many scans hit, count more."""
+    begins, own, weight = cast.begins, cast.own, cast.weight
     total = 0.1
     prior[:] = 0.1 * frequency
     for x in range(-_REACH[0], _REACH[0] + 1):
         for y in range(-_REACH[1], _REACH[1] + 1):
             for z in range(-_REACH[2], _REACH[2] + 1):
-                other = -1 if x == y == z == 0 else _neighbour(voxel, x, y, z, rows, size)
+                other = -1 if x == y == z == 0 else _neighbour(cast, i, x, y, z)
                 if other >= 0:
                     votes = weight[begins[other] : begins[other + 1]].sum()
                     part = votes / (votes + 2) / (1 + x * x + y * y + 2 * z * z)
@@ -263,16 +266,15 @@ def _hear(
 
 @jit
 def _explain(
+    cast: _Cast,
     i: int,
-    begins: NDArray[np.int64],
-    own: NDArray[np.int64],
-    weight: NDArray[np.float64],
     confusion: NDArray[np.float64],
     shares: NDArray[np.float32],
     likeliest: NDArray[np.float64],
     left: NDArray[np.float64],
 ) -> None:
     """Replace the probabilities of a voxel's class by the shares of classes in it that explain its votes: a voxel may hold two things."""
+    begins, own, weight = cast.begins, cast.own, cast.weight
     total = weight[begins[i] : begins[i + 1]].sum()
     likeliest[:] = shares
     shares *= np.float32(0.5)
