@@ -39,7 +39,7 @@ _RETURNED_PROBABILITY = 0.6  # that a voxel is occupied in which this scan has a
 # it, and alone.
 _OUTLIER_PER_M, _SINGLE_PER_M = 0.02, 0.05
 # Probabilities above which a voxel of a body is not free, and below which it is not occupied.
-_DOUBTFUL, _UNSURE = 0.1, 0.6
+_DOUBTFUL, _UNSURE = 0.05, 0.75
 _NO_VOXELS = np.empty(0, np.int64)
 
 
