@@ -10,14 +10,14 @@ from .evidence import Sighting as Sighting
 from .evidence import find_evidence as find_evidence
 from .ground import ground_height as ground_height
 from .ground import ground_points as ground_points
+from .linking import Chain as Chain
+from .linking import Linker as Linker
 from .movers import follow_movers as follow_movers
 from .options import MotionOptions as MotionOptions
 from .options import MotionSource as MotionSource
 from .options import PoseOptions as PoseOptions
 from .options import PoseSource as PoseSource
 from .options import RefineMode as RefineMode
-from .segments import Chain as Chain
-from .segments import Linker as Linker
 from .segments import Segment as Segment
 from .segments import Standing as Standing
 from .segments import is_fast as is_fast

@@ -218,6 +218,8 @@ class BagRecording(Recording):
             return stamps, self._tree.lookup(world, self._vehicle, stamps)
         if required or wanted:
             raise self._no_path(self._lidars[0].frame, wanted or _WORLDS[0], 'estimate poses with `poses="kiss-icp"`')
+        if self._tree.moves:
+            self._notes.append(f"{self.location}: transforms do not say how {self._vehicle} moves, only {self._tree}")
         return None
 
     def _no_path(self, frame: str, target: str, advice: str) -> MissingDataError:

@@ -46,6 +46,16 @@ def sequence_name(name: str) -> str:
     return f"{name}_recording" if name in _OF_THE_LAYOUT else name
 
 
+Version = tuple[int, int]
+"""What tells a file from one that was written in its place: nanoseconds of its last change, and bytes."""
+
+
+def version_of(path: str | os.PathLike[str]) -> Version:
+    """Return the version of a file: part of the key under which a process keeps what it read of it."""
+    status = Path(path).stat()
+    return status.st_mtime_ns, status.st_size
+
+
 def read_bytes(path: str | os.PathLike[str], expected: str = "a file", advice: str = COPY) -> bytes:
     """Return a whole file.
 

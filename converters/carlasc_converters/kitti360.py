@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.geometry import Transform, check_rigid, invert
 from carlasc.errors import FormatError, MissingDataError
-from carlasc_converters.files import read_text
+from carlasc_converters.files import Version, read_text, version_of
 from carlasc_converters.kitti360_classes import KITTI360, KITTI360_TO_CARLA
 from carlasc_converters.kitti360_labels import MAX_DISTANCE_M, label_points, window_at, windows_of
 from carlasc_converters.kitti_files import (
@@ -171,14 +171,14 @@ class Kitti360Frame(FrameHandle):
 
     def _in_world(self, points: NDArray[np.float32], seconds: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return (N, 3) points in the frame of the world, each by the pose at its time."""
-        times, trajectory = _motion(self.files)
+        times, trajectory = _motion(self.files, version_of(self.files.poses))
         ticks, tick_of = np.unique(np.round(seconds / _TICK_S), return_inverse=True)
         poses = trajectory.at(times[self.number] + ticks * _TICK_S)[tick_of]
         return np.einsum("nij,nj->ni", poses[:, :3, :3], points[:, :3]) + poses[:, :3, 3]
 
 
 @lru_cache(maxsize=2)  # drives per process
-def _motion(files: Kitti360Files) -> tuple[NDArray[np.float64], Trajectory]:
+def _motion(files: Kitti360Files, version: Version) -> tuple[NDArray[np.float64], Trajectory]:
     """Return the times of a drive's frames, and its poses."""
     times = FrameTimes.read(files.scans / "timestamps.txt", frames_of(files.scans / "data", ".bin")).seconds
     return times, read_trajectory(files, times)

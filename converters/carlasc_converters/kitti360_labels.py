@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.scans import check_finite
 from carlasc.errors import import_extra
+from carlasc_converters.files import Version, version_of
 from carlasc_converters.ply import PlyVertices
 
 MAX_DISTANCE_M = 0.2  # a point farther than this from every labelled one stays unlabelled
@@ -102,7 +103,8 @@ def label_points(
     labels, instances = np.zeros(len(world), np.uint16), np.zeros(len(world), np.uint32)
     nearest = np.full(len(world), np.inf)
     moving = _moving(str(folder / "dynamic" / window), frame) if (folder / "dynamic" / window).is_file() else None
-    for cloud in (_standing(str(folder / "static" / window)), moving):
+    static = str(folder / "static" / window)
+    for cloud in (_standing(static, version_of(static)), moving):
         if cloud is not None:
             distances, indices = cloud.nearest(world)
             nearer = distances < nearest
@@ -112,12 +114,12 @@ def label_points(
 
 
 @lru_cache(maxsize=1)  # one window per process: frames are read in their order
-def _standing(path: str) -> Labelled:
+def _standing(path: str, version: Version) -> Labelled:
     return Labelled.of(PlyVertices.open(path, _COLUMNS).read(), path)
 
 
 @lru_cache(maxsize=1)
-def _by_time(path: str) -> tuple[NDArray[np.void], NDArray[np.integer]]:
+def _by_time(path: str, version: Version) -> tuple[NDArray[np.void], NDArray[np.integer]]:
     """Return the vertices of a dynamic file by increasing time stamp, and their time stamps."""
     rows = np.array(PlyVertices.open(path, (*_COLUMNS, "timestamp")).read())
     rows = rows[np.argsort(rows["timestamp"], kind="stable")]
@@ -125,6 +127,6 @@ def _by_time(path: str) -> tuple[NDArray[np.void], NDArray[np.integer]]:
 
 
 def _moving(path: str, frame: int) -> Labelled:
-    rows, stamps = _by_time(path)
+    rows, stamps = _by_time(path, version_of(path))
     first, last = np.searchsorted(stamps, [frame, frame + 1])
     return Labelled.of(rows[first:last], path)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 from carlasc_converters.bag_index import Channel, FileIndex, decompressed, ros_type
+from carlasc_converters.files import Version, version_of
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _END = 3, 4, 5, 6, 7, 15
@@ -71,7 +72,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
             kind, length = unpack("<BQ", file.read(_HEAD))
             data = file.read(length)
     else:
-        content = _read_chunk(path, chunk)
+        content = _read_chunk(path, chunk, version_of(path))
         kind, length = unpack_from("<BQ", content, offset) if offset + _HEAD <= len(content) else (0, 0)
         data = content[offset + _HEAD : offset + _HEAD + length]
     if kind != _MESSAGE or len(data) != length:
@@ -119,7 +120,7 @@ class _McapRecords:
             return
         found: dict[int, list[tuple[int, int]]] = {}
         try:
-            data = _read_chunk(self.index.path, chunk)
+            data = _read_chunk(self.index.path, chunk, version_of(self.index.path))
         except FormatError:
             if not (whole and entries):
                 raise
@@ -149,7 +150,7 @@ class _McapRecords:
 
 
 @lru_cache(maxsize=2)
-def _read_chunk(path: str, at: int) -> bytes:
+def _read_chunk(path: str, at: int, version: Version) -> bytes:
     """Return the content of a chunk; the last two are kept, because frames come in their order."""
     try:
         with Path(path).open("rb") as file:

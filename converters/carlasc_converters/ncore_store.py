@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage.arrays import check_size
-from carlasc_converters.files import COPY, opening, read_bytes
+from carlasc_converters.files import COPY, Version, opening, read_bytes, version_of
 
 SUFFIXES = (".zarr.itar", ".zarr")
 _METADATA = ".zmetadata.cbor.xz"
@@ -143,12 +143,12 @@ def open_store(path: str) -> NcoreStore:
     """Return a store; one process reads its index and metadata once, and again if it was written again."""
     file = Path(path)
     with opening(path, "a store of NCore"):
-        status = (file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file).stat()
-    return _open(path, status.st_mtime_ns, status.st_size)
+        version = version_of(file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file)
+    return _open(path, version)
 
 
 @lru_cache(maxsize=8)
-def _open(path: str, modified_ns: int, size: int) -> NcoreStore:
+def _open(path: str, version: Version) -> NcoreStore:
     return NcoreStore(path)
 
 

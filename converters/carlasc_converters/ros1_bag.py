@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 from carlasc_converters.bag_index import Channel, FileIndex, decompressed, ros_type
+from carlasc_converters.files import Version, version_of
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _HEADER, _INDEX, _CHUNK, _CONNECTION = 2, 3, 4, 5, 7
@@ -67,7 +68,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     Raises:
         FormatError: the file does not hold one there.
     """
-    data = _read_chunk(path, chunk)
+    data = _read_chunk(path, chunk, version_of(path))
     try:
         kind, _, begin, end = next(record for record in _records(data, offset) if record[0] != _CONNECTION)
     except (KeyError, StopIteration, struct.error) as error:
@@ -96,7 +97,7 @@ def _add_chunk(index: FileIndex, chunk: int, entries: list[tuple[int, NDArray[np
 def _scan_chunk(index: FileIndex, chunk: int) -> None:
     """Add the messages of a chunk from its content."""
     times, offsets = dict[int, list[int]](), dict[int, list[int]]()
-    data, at = _read_chunk(index.path, chunk), 0
+    data, at = _read_chunk(index.path, chunk, version_of(index.path)), 0
     for kind, fields, begin, end in _records(data, 0):
         number = _number(fields, b"conn")
         if kind == _CONNECTION:
@@ -116,7 +117,7 @@ def _learn(index: FileIndex, fields: _Fields, data: bytes) -> None:
 
 
 @lru_cache(maxsize=2)
-def _read_chunk(path: str, at: int) -> bytes:
+def _read_chunk(path: str, at: int, version: Version) -> bytes:
     """Return the content of a chunk; the last two are kept, because frames come in their order."""
     with Path(path).open("rb") as file:
         fields, begin, end = _record_at(file, at)

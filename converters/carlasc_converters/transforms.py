@@ -107,6 +107,11 @@ class FrameTree:
         line = line[: line.index(ancestor) + 1]
         return [self._tracks[child][parent] for child, parent in pairwise(line)]
 
+    @property
+    def moves(self) -> bool:
+        """Whether any frame moves in another one."""
+        return any(track.moves for parents in self._tracks.values() for track in parents.values())
+
     def connected(self, one: str, other: str) -> bool:
         """Return whether there is a path between two frames."""
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]

@@ -285,3 +285,26 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, kind):
         shutil.rmtree(bag.parent)
     assert peaks[1] < 500, peaks
     assert peaks[1] - peaks[0] < 60, peaks
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_bag_that_was_written_again_is_read_again(tmp_path, kind):
+    for poses in ("odometry", "pose"):
+        bag = write(tmp_path, kind, poses=poses)
+        (recording,) = Bag(bag).sequences()
+        assert [len(frame.read()[0].points) > 0 for frame in recording.frames] == [True] * DRIVE.frames
+        for path in sorted(bag.rglob("*"), reverse=True) if bag.is_dir() else [bag]:
+            path.unlink()
+        if bag.is_dir():
+            bag.rmdir()
+
+
+def test_transforms_that_move_something_else_are_noted(tmp_path):
+    def messages(store):
+        found = drive_messages(store, DRIVE, "tf")
+        return [message for message in found if message[0] != "/tf_static"]
+
+    recording = recording_of(tmp_path, "mcap", messages)
+    assert recording.poses() is None
+    (note,) = recording.notes()
+    assert note.endswith(f"transforms do not say how lidar moves, only {WORLD} > {BASE}")

@@ -25,15 +25,16 @@ def drive_at(height_m):
 
 
 def converted(height_m, tmp_path, follow_ground=True):
+    (tmp_path / "drive").mkdir()
     result = convert(
         drive_at(height_m),
-        tmp_path,
-        tmp_path.parent / f"{tmp_path.name}_out",
+        tmp_path / "drive",
+        tmp_path / "out",
         layout=LayoutOptions(axes="right"),
         grids=GridOptions(observe=ALONE, follow_ground=follow_ground),
         run=Run(workers=1),
     )
-    (sequence,) = carlasc.open(tmp_path.parent / f"{tmp_path.name}_out").sequences().values()
+    (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     (name,) = sequence.grids
     return sequence, name, [note for note in result.notes if "below the grid" in note or "grids reach" in note]
 
@@ -66,6 +67,7 @@ def test_all_recordings_of_a_run_get_the_same_grid(tmp_path):
             return found
 
     (tmp_path / "in").mkdir()
+    (tmp_path / "drive").mkdir()
     result = convert(
         Two,
         tmp_path / "in",

@@ -25,17 +25,18 @@ def test_what_an_interrupted_run_made_from_boxes_does_not_change_what_is_added_l
     def run():
         convert(
             Overlapping,
-            tmp_path,
-            tmp_path.parent / "out",
+            tmp_path / "drive",
+            tmp_path / "out",
             poses=PoseOptions(force=True),
             grids=None,
             run=Run(workers=1),
         )
-        return next(iter(carlasc.open(tmp_path.parent / "out").sequences().values()))
+        return next(iter(carlasc.open(tmp_path / "out").sequences().values()))
 
+    (tmp_path / "drive").mkdir()
     sequence = run()
     whole = {name: [sequence.read(name, frame) for frame in range(8)] for name in ("labels", "instances", "flow")}
-    for path in (tmp_path.parent / "out").rglob("predictions/*"):
+    for path in (tmp_path / "out").rglob("predictions/*"):
         path.unlink()  # flow is written last
     again = run()
     for name, arrays in whole.items():

@@ -94,7 +94,15 @@ class TestStandingPoints:
 
 
 def test_ground_points_are_in_no_actor_whatever_their_number():
-    numbered = scan((0, 0, CAR, 8.0), (0.3, 0, 7, 0.0), instances=[3, 3])
+    numbered = scan((0, 0, CAR, 8.0), (0.3, 0, 7, 8.0), instances=[3, 3])
     (whole,) = segment_by_instances(0, numbered, np.eye(4))
     (segment,) = segment_by_instances(0, numbered, np.eye(4), ground={7})
     assert (len(whole.members), segment.members.tolist()) == (40, list(range(20)))
+
+
+def test_a_number_in_two_places_or_of_two_velocities_has_a_segment_for_each():
+    for other, parts in (((1.9, 0, CAR, 8.0), 1), ((2.5, 0, CAR, 8.0), 2), ((0.5, 0, CAR, 3.0), 2)):
+        seen = scan((0, 0, CAR, 8.0), other, instances=[3, 3])
+        segments = segment_by_instances(0, seen, np.eye(4))
+        assert [segment.instance for segment in segments] == [3] * parts
+        assert np.sort(np.concatenate([segment.members for segment in segments])).tolist() == list(range(40))

@@ -46,7 +46,7 @@ from carlasc.storage.sinks import SequenceWriter
 TRACKS, POSES = "tracks", "poses"
 """What the files that keep actors and refined poses are called, in the folder of what is derived."""
 
-_VERSIONS = {TRACKS: 2, POSES: 1}  # of the methods: they change only when the same input gives another result
+_VERSIONS = {TRACKS: 3, POSES: 1}  # of the methods: they change only when the same input gives another result
 _NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece

@@ -1,0 +1,205 @@
+"""The segments of one actor, linked from scan to scan into chains.
+
+Scans are added to a `Linker` one after the other, and a chain ends when its actor was not seen for a while: memory does not grow with the
+length of a drive.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.motion.segments import LINKED_M_S, Segment, Standing
+
+_MAX_GAP_S = 1.55  # an actor may be hidden for this time
+_NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
+_BACKWARDS_S = 12.0  # an actor that starts is looked for in the scans of this time before
+_FARTHEST_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
+_GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
+_OTHER_CLASS = 1.0  # cost of a class that is not that of the sighting before: its label may be wrong
+_NUMBERED_GATE_M = 6.0  # the same for a numbered actor, of which another part may be seen
+_OTHER_NUMBER = 2.0  # cost of another number
+_SOON_S = 1.0  # after more than this, a numbered actor may be anywhere
+_HISTORY_S = 0.3  # a velocity is estimated over at least this time, if the scans have no flow
+_STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
+
+Chain = list[Segment]
+
+
+class Linker:
+    """Links segments, scan by scan.
+
+    Numbered actors are linked by their numbers, where they can be, others by prediction: a segment continues the chain whose predicted
+    position is nearest to it, one of its class rather than another, also after the actor was hidden for some time.
+    """
+
+    def __init__(self) -> None:
+        self._chains: list[Chain] = []
+        self._numbered: list[Chain] = []
+        self._seconds: dict[int, float] = {}  # of the frames of live chains
+        self._standing: deque[tuple[float, Standing]] = deque()
+
+    def add(
+        self, frame: int, seconds: float, segments: Sequence[Segment], standing: Standing | None = None
+    ) -> list[Chain]:
+        """Add the segments of the next scan, and return the chains that ended.
+
+        Args:
+            frame: frame number.
+            seconds: time of the scan.
+            segments: the actors of the scan.
+            standing: its standing points, in which an actor that stops, for example at a crossing, is found until it continues.
+        """
+        self._seconds[frame] = seconds
+        ended = self._end(seconds)
+        self._link_numbers([s for s in segments if s.instance], seconds)
+        alive = list(self._chains)
+        for segment, chain in self._match([s for s in segments if not s.instance], alive):
+            if chain is None:
+                self._chains.append([*self._before(segment), segment])
+            else:
+                chain.append(segment)
+        if standing is not None:
+            for chain in alive:  # a slow actor that was not found may have stopped
+                if chain[-1].frame < frame and _is_slow(chain[-1]):
+                    rest = standing.segment_at(chain[-1])
+                    if rest is not None:
+                        chain.append(rest)
+            self._standing.append((seconds, standing))
+            while self._standing[0][0] < seconds - _BACKWARDS_S:
+                self._standing.popleft()
+        return ended
+
+    def finish(self) -> list[Chain]:
+        """Return the chains that have not ended."""
+        rest = [*self._numbered, *self._chains]
+        self._numbered, self._chains = [], []
+        return rest
+
+    def _end(self, seconds: float) -> list[Chain]:
+        """Remove and return the chains whose actors were not seen for too long."""
+        since = {frame: seconds - then for frame, then in self._seconds.items()}
+        over = [chain for chain in self._chains if since[chain[-1].frame] > _MAX_GAP_S]
+        over += [chain for chain in self._numbered if since[chain[-1].frame] > _NUMBERED_GAP_S]
+        self._chains = [chain for chain in self._chains if since[chain[-1].frame] <= _MAX_GAP_S]
+        self._numbered = [chain for chain in self._numbered if since[chain[-1].frame] <= _NUMBERED_GAP_S]
+        kept_s = _NUMBERED_GAP_S + _MAX_GAP_S
+        self._seconds = {frame: then for frame, then in self._seconds.items() if seconds - then <= kept_s}
+        return over
+
+    def _link_numbers(self, segments: list[Segment], seconds: float) -> None:
+        """Continue the chains of numbered actors: with their numbers where they can be, otherwise with what is where they should be."""
+        if not segments:
+            return
+        linked: dict[int, int] = {}
+        for i, j, is_other in self._candidates(segments, seconds) if self._numbered else ():
+            if i not in linked and not (is_other and j in linked.values()):
+                linked[i] = j
+        for j, chain in enumerate(self._numbered):
+            parts = [segments[i] for i, continued in linked.items() if continued == j]
+            if parts:
+                chain.append(_together(parts))
+        self._numbered += [[segment] for i, segment in enumerate(segments) if i not in linked]
+
+    def _candidates(self, segments: list[Segment], seconds: float) -> list[tuple[int, int, bool]]:
+        """Return which segment may continue which chain of a numbered actor, and whether it has another number; the best come first."""
+        elapsed = np.array([seconds - self._seconds[chain[-1].frame] for chain in self._numbered])
+        nothing = np.full(3, np.nan)
+        velocity = np.stack([self._velocity(chain) for chain in self._numbered])
+        velocity[elapsed > _SOON_S] = np.nan
+        is_lost = np.isnan(velocity[:, 0])
+        way = np.where(is_lost, 0.0, velocity.T * elapsed).T
+        gap = _gaps(segments, [chain[-1] for chain in self._numbered], way)
+        flow = np.stack([nothing if segment.velocity is None else segment.velocity for segment in segments])
+        change = np.nan_to_num(np.linalg.norm(flow[:, None] - velocity, axis=2))
+        numbers = np.array([segment.instance for segment in segments])
+        is_other = numbers[:, None] != np.array([chain[0].instance for chain in self._numbered])
+        far = _NUMBERED_GATE_M + np.where(elapsed > _SOON_S, np.inf, np.where(is_lost, _MAX_SPEED_M_S * elapsed, 0.0))
+        possible = gap < np.where(is_other, np.where(is_lost, 0.0, _GATE_M), far)
+        cost = gap + change + is_other * _OTHER_NUMBER
+        found = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
+        return [(i, j, bool(is_other[i, j])) for _, i, j in found]
+
+    def _velocity(self, chain: Chain) -> NDArray[np.float64]:
+        """Return how fast an actor moved when it was seen last, (3,) m/s; NaN if that is not known."""
+        last = chain[-1]
+        if last.velocity is not None:
+            return last.velocity
+        now = self._seconds[last.frame]
+        for before in reversed(chain[:-1]):
+            elapsed = now - self._seconds.get(before.frame, now)
+            if elapsed >= _HISTORY_S:
+                velocity: NDArray[np.float64] = (last.center - before.center) / elapsed
+                return velocity
+        return np.full(3, np.nan)
+
+    def _before(self, segment: Segment) -> Chain:
+        """Return segments from the scans in which the actor of a new chain was standing where the chain starts."""
+        found: Chain = []
+        for _, standing in reversed(self._standing):
+            rest = standing.segment_at(segment) if _is_slow(segment) else None
+            if rest is None:
+                break
+            segment = rest
+            found.append(rest)
+        return found[::-1]
+
+    def _match(self, found: list[Segment], alive: list[Chain]) -> list[tuple[Segment, Chain | None]]:
+        """Pair the segments of one scan with the chains that they continue: nearest prediction first, each chain once."""
+        if not found or not alive:
+            return [(segment, None) for segment in found]
+        candidates = []
+        ends = np.stack([chain[-1].center for chain in alive])
+        elapsed = np.array([self._seconds[found[0].frame] - self._seconds[chain[-1].frame] for chain in alive])
+        for i, segment in enumerate(found):
+            near = np.linalg.norm(ends - segment.center, axis=1) < _FARTHEST_M + _MAX_SPEED_M_S * elapsed
+            for j in np.flatnonzero(near).tolist():
+                cost = _cost(alive[j][-1], segment, float(elapsed[j]))
+                if cost is not None:
+                    candidates.append((cost, i, j))
+        taken: dict[int, int] = {}
+        for _, i, j in sorted(candidates):
+            if i not in taken and j not in taken.values():
+                taken[i] = j
+        return [(segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)]
+
+
+def _length(vector: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(vector, axis=0))  # by its axis: the same sum on every processor
+
+
+def _is_slow(segment: Segment) -> bool:
+    return segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
+
+
+def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
+    """Return how much a segment differs from the prediction of its predecessor; None if it cannot be the same actor."""
+    if last.velocity is None or segment.velocity is None:
+        return None
+    change = _length(segment.velocity - last.velocity)
+    way = (last.velocity + segment.velocity) / 2 * elapsed_s
+    # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
+    distance = float(_gaps([segment], [last], way)[0, 0])
+    if distance > _GATE_M or change > LINKED_M_S:
+        return None
+    offset = _length(last.points.mean(axis=0) + way - segment.center)
+    return distance + change + 0.1 * offset + (last.label != segment.label) * _OTHER_CLASS
+
+
+def _gaps(segments: list[Segment], ends: list[Segment], ways: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (S, C) the distances in metres between the bounding boxes of segments and of others that moved by (C, 3) ways; 0 if they overlap."""
+    lower, upper = (np.stack([bound(s.points, axis=0) for s in segments])[:, None] for bound in (np.min, np.max))
+    lowest, highest = (np.stack([bound(s.points, axis=0) for s in ends]) + ways for bound in (np.min, np.max))
+    gaps = np.maximum(np.maximum(lowest - upper, lower - highest), 0.0)
+    distances: NDArray[np.float64] = np.linalg.norm(gaps, axis=2)
+    return distances
+
+
+def _together(parts: list[Segment]) -> Segment:
+    """Return the segment of all points of several segments of one actor in one scan; the first one says what it is."""
+    members = np.concatenate([part.members for part in parts])
+    return replace(parts[0], members=members, points=np.concatenate([part.points for part in parts]))
