@@ -11,7 +11,7 @@ from entered import cases, count_case
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
 # Of the package, that one frame of `regrid` from scans enters: see tests/tools/entered.py. 42 before scans agreed on classes (consensus.py), and the
-# regions of bodies had a file of their own.
+# regions of bodies and the linking of segments had files of their own.
 MOST_FILES, DEEPEST = 45, 16
 
 

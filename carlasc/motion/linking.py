@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,14 @@ _NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
 _BACKWARDS_S = 12.0  # an actor that starts is looked for in the scans of this time before
 _FARTHEST_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
 _GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
-_OTHER_CLASS = 1.0  # cost of a class that is not that of the sighting before: its label may be wrong
 _NUMBERED_GATE_M = 6.0  # the same for a numbered actor, of which another part may be seen
+_OTHER_CLASS = 1.0  # cost of a class that is not that of the sighting before: its label may be wrong
 _OTHER_NUMBER = 2.0  # cost of another number
 _SOON_S = 1.0  # after more than this, a numbered actor may be anywhere
 _HISTORY_S = 0.3  # a velocity is estimated over at least this time, if the scans have no flow
 _STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
+
+_UNKNOWN = np.full(3, np.nan)  # a velocity
 
 Chain = list[Segment]
 
@@ -40,7 +43,7 @@ class Linker:
     def __init__(self) -> None:
         self._chains: list[Chain] = []
         self._numbered: list[Chain] = []
-        self._seconds: dict[int, float] = {}  # of the frames of live chains
+        self._seconds: dict[int, float] = {}  # of the frames that live chains may have
         self._standing: deque[tuple[float, Standing]] = deque()
 
     def add(
@@ -93,10 +96,8 @@ class Linker:
 
     def _link_numbers(self, segments: list[Segment], seconds: float) -> None:
         """Continue the chains of numbered actors: with their numbers where they can be, otherwise with what is where they should be."""
-        if not segments:
-            return
         linked: dict[int, int] = {}
-        for i, j, is_other in self._candidates(segments, seconds) if self._numbered else ():
+        for i, j, is_other in self._candidates(segments, seconds) if segments and self._numbered else ():
             if i not in linked and not (is_other and j in linked.values()):
                 linked[i] = j
         for j, chain in enumerate(self._numbered):
@@ -108,14 +109,12 @@ class Linker:
     def _candidates(self, segments: list[Segment], seconds: float) -> list[tuple[int, int, bool]]:
         """Return which segment may continue which chain of a numbered actor, and whether it has another number; the best come first."""
         elapsed = np.array([seconds - self._seconds[chain[-1].frame] for chain in self._numbered])
-        nothing = np.full(3, np.nan)
         velocity = np.stack([self._velocity(chain) for chain in self._numbered])
         velocity[elapsed > _SOON_S] = np.nan
         is_lost = np.isnan(velocity[:, 0])
         way = np.where(is_lost, 0.0, velocity.T * elapsed).T
         gap = _gaps(segments, [chain[-1] for chain in self._numbered], way)
-        flow = np.stack([nothing if segment.velocity is None else segment.velocity for segment in segments])
-        change = np.nan_to_num(np.linalg.norm(flow[:, None] - velocity, axis=2))
+        change = np.nan_to_num(_lengths(_velocities(segments)[:, None] - velocity))
         numbers = np.array([segment.instance for segment in segments])
         is_other = numbers[:, None] != np.array([chain[0].instance for chain in self._numbered])
         far = _NUMBERED_GATE_M + np.where(elapsed > _SOON_S, np.inf, np.where(is_lost, _MAX_SPEED_M_S * elapsed, 0.0))
@@ -130,12 +129,12 @@ class Linker:
         if last.velocity is not None:
             return last.velocity
         now = self._seconds[last.frame]
-        for before in reversed(chain[:-1]):
+        for before in islice(reversed(chain), 1, None):
             elapsed = now - self._seconds.get(before.frame, now)
             if elapsed >= _HISTORY_S:
                 velocity: NDArray[np.float64] = (last.center - before.center) / elapsed
                 return velocity
-        return np.full(3, np.nan)
+        return _UNKNOWN
 
     def _before(self, segment: Segment) -> Chain:
         """Return segments from the scans in which the actor of a new chain was standing where the chain starts."""
@@ -152,51 +151,55 @@ class Linker:
         """Pair the segments of one scan with the chains that they continue: nearest prediction first, each chain once."""
         if not found or not alive:
             return [(segment, None) for segment in found]
-        candidates = []
-        ends = np.stack([chain[-1].center for chain in alive])
-        elapsed = np.array([self._seconds[found[0].frame] - self._seconds[chain[-1].frame] for chain in alive])
-        for i, segment in enumerate(found):
-            near = np.linalg.norm(ends - segment.center, axis=1) < _FARTHEST_M + _MAX_SPEED_M_S * elapsed
-            for j in np.flatnonzero(near).tolist():
-                cost = _cost(alive[j][-1], segment, float(elapsed[j]))
-                if cost is not None:
-                    candidates.append((cost, i, j))
-        taken: dict[int, int] = {}
-        for _, i, j in sorted(candidates):
-            if i not in taken and j not in taken.values():
-                taken[i] = j
+        last = [chain[-1] for chain in alive]
+        elapsed = np.array([self._seconds[found[0].frame] - self._seconds[end.frame] for end in last])
+        centers, velocity, before = (
+            np.stack([s.center for s in found])[:, None],
+            _velocities(found)[:, None],
+            _velocities(last),
+        )
+        way = (before + velocity) / 2 * elapsed[:, None]
+        # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
+        gap, change = _gaps(found, last, way), _lengths(velocity - before)
+        offset = _lengths(np.stack([end.points.mean(axis=0) for end in last]) + way - centers)
+        is_other = np.array([s.label for s in found])[:, None] != np.array([end.label for end in last])
+        reach = _FARTHEST_M + _MAX_SPEED_M_S * elapsed
+        possible = (gap <= _GATE_M) & (change <= LINKED_M_S)
+        possible &= _lengths(np.stack([end.center for end in last]) - centers) < reach
+        cost = gap + change + 0.1 * offset + is_other * _OTHER_CLASS
+        candidates = [(float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist()]
+        taken = best_pairs(candidates)
         return [(segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)]
 
 
-def _length(vector: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(vector, axis=0))  # by its axis: the same sum on every processor
+def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
+    """Return the second number of each first one that is paired: the cheapest (cost, first, second) come first, and each number has one partner."""
+    taken: dict[int, int] = {}
+    for _, i, j in sorted(costs):
+        if i not in taken and j not in taken.values():
+            taken[i] = j
+    return taken
+
+
+def _velocities(segments: list[Segment]) -> NDArray[np.float64]:
+    """Return (S, 3) the velocities of segments, m/s; NaN where the scan has no flow."""
+    return np.stack([_UNKNOWN if segment.velocity is None else segment.velocity for segment in segments])
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)  # by its axis: the same sum on every processor
+    return lengths
 
 
 def _is_slow(segment: Segment) -> bool:
     return segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
 
 
-def _cost(last: Segment, segment: Segment, elapsed_s: float) -> float | None:
-    """Return how much a segment differs from the prediction of its predecessor; None if it cannot be the same actor."""
-    if last.velocity is None or segment.velocity is None:
-        return None
-    change = _length(segment.velocity - last.velocity)
-    way = (last.velocity + segment.velocity) / 2 * elapsed_s
-    # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
-    distance = float(_gaps([segment], [last], way)[0, 0])
-    if distance > _GATE_M or change > LINKED_M_S:
-        return None
-    offset = _length(last.points.mean(axis=0) + way - segment.center)
-    return distance + change + 0.1 * offset + (last.label != segment.label) * _OTHER_CLASS
-
-
 def _gaps(segments: list[Segment], ends: list[Segment], ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (S, C) the distances in metres between the bounding boxes of segments and of others that moved by (C, 3) ways; 0 if they overlap."""
+    """Return (S, C) the distances in metres between the bounding boxes of segments and of others, which move by (C, 3) or (S, C, 3); 0 if they overlap."""
     lower, upper = (np.stack([bound(s.points, axis=0) for s in segments])[:, None] for bound in (np.min, np.max))
     lowest, highest = (np.stack([bound(s.points, axis=0) for s in ends]) + ways for bound in (np.min, np.max))
-    gaps = np.maximum(np.maximum(lowest - upper, lower - highest), 0.0)
-    distances: NDArray[np.float64] = np.linalg.norm(gaps, axis=2)
-    return distances
+    return _lengths(np.maximum(np.maximum(lowest - upper, lower - highest), 0.0))
 
 
 def _together(parts: list[Segment]) -> Segment:

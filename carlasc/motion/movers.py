@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
+from carlasc.motion.linking import best_pairs
 from carlasc.motion.paths import estimate_path, headings_of, is_standing, middles_of, overlay
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
@@ -320,10 +321,7 @@ def _link(evidence: FreeSpaceEvidence, alive: list[_MoverChain], deformable: Col
             cost = alive[j].cost(link)
             if cost is not None:
                 costs.append((cost, i, j))
-    taken: dict[int, int] = {}
-    for _, i, j in sorted(costs):
-        if i not in taken and j not in taken.values():
-            taken[i] = j
+    taken = best_pairs(costs)
     extra = {
         i: j
         for i in range(len(links))

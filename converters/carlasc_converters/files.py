@@ -50,9 +50,15 @@ Version = tuple[int, int]
 """What tells a file from one that was written in its place: nanoseconds of its last change, and bytes."""
 
 
-def version_of(path: str | os.PathLike[str]) -> Version:
-    """Return the version of a file: part of the key under which a process keeps what it read of it."""
-    status = Path(path).stat()
+def version_of(path: str | os.PathLike[str], expected: str = "a file") -> Version:
+    """Return the version of a file: part of the key under which a process keeps what it read of it.
+
+    Raises:
+        MissingDataError: it does not exist.
+        FormatError: it cannot be looked at.
+    """
+    with opening(path, expected):
+        status = Path(path).stat()
     return status.st_mtime_ns, status.st_size
 
 

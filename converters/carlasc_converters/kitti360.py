@@ -171,7 +171,7 @@ class Kitti360Frame(FrameHandle):
 
     def _in_world(self, points: NDArray[np.float32], seconds: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return (N, 3) points in the frame of the world, each by the pose at its time."""
-        times, trajectory = _motion(self.files, version_of(self.files.poses))
+        times, trajectory = _motion(self.files, version_of(self.files.poses, "poses"))
         ticks, tick_of = np.unique(np.round(seconds / _TICK_S), return_inverse=True)
         poses = trajectory.at(times[self.number] + ticks * _TICK_S)[tick_of]
         return np.einsum("nij,nj->ni", poses[:, :3, :3], points[:, :3]) + poses[:, :3, 3]

@@ -104,7 +104,7 @@ def label_points(
     nearest = np.full(len(world), np.inf)
     moving = _moving(str(folder / "dynamic" / window), frame) if (folder / "dynamic" / window).is_file() else None
     static = str(folder / "static" / window)
-    for cloud in (_standing(static, version_of(static)), moving):
+    for cloud in (_standing(static, version_of(static, "labelled points")), moving):
         if cloud is not None:
             distances, indices = cloud.nearest(world)
             nearer = distances < nearest

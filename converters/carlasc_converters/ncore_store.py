@@ -142,9 +142,8 @@ class NcoreStore:
 def open_store(path: str) -> NcoreStore:
     """Return a store; one process reads its index and metadata once, and again if it was written again."""
     file = Path(path)
-    with opening(path, "a store of NCore"):
-        version = version_of(file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file)
-    return _open(path, version)
+    changed = file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file
+    return _open(path, version_of(changed, "a store of NCore"))
 
 
 @lru_cache(maxsize=8)

@@ -67,7 +67,6 @@ def test_all_recordings_of_a_run_get_the_same_grid(tmp_path):
             return found
 
     (tmp_path / "in").mkdir()
-    (tmp_path / "drive").mkdir()
     result = convert(
         Two,
         tmp_path / "in",

@@ -141,11 +141,7 @@ def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
 
 
 @cached
-def _compare(
-    cast: _Cast,
-    confusion: NDArray[np.float64],
-    frequency: NDArray[np.float64],
-) -> None:
+def _compare(cast: _Cast, confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> None:
     """Count the votes of voxels amid others of their class: `confusion[a, b]` of those for b in voxels of a. `frequency` counts all voxels."""
     voxels, begins, own, weight = cast.voxels, cast.begins, cast.own, cast.weight
     most = np.empty(len(voxels), np.int64)
