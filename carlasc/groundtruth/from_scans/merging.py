@@ -18,12 +18,15 @@ from carlasc.core.geometry import Transform, invert, transform_points, translati
 from carlasc.core.scans import runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
-from carlasc.motion.tracks import MovingActors
+from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
 
 STATIC = 0  # region of the voxels that belong to no actor
 _DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
 _RECENT_S = 0.25  # what scans saw within this time before and after a frame is so at the frame
+_AROUND_M = np.array(
+    [0.3, 0.3, 0.1]
+)  # what is so near to an actor's body may be a part of it that its path puts elsewhere
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -311,15 +314,21 @@ class Merger:
                 yield Observation(points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE)
 
     def static(self, frame: int) -> NDArray[np.bool_]:
-        """Return (N,) bool: the points of a scan that do not belong to anything that moves."""
+        """Return (N,) bool: the points of a scan that do not belong to anything that moves.
+
+        Ground aside, what is in or at the body of an actor is not static either: a field or free space need not show all points of an actor.
+        """
         if frame not in self._static:
             scan = self.scan_of(frame)
             static = np.ones(len(scan.points), np.bool_)
             static[scan.moving] = False
             static[self.actors.is_own(scan.points)] = False
             static[self.actors.moving.get(frame, [])] = False
+            standing_on = np.isin(scan.labels, sorted(self.classes.ground))
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
+                near = _points_near(track, scan)
+                static[near[~standing_on[near]]] = False
             self._static[frame] = static
         return self._static[frame]
 
@@ -349,3 +358,17 @@ class Merger:
                     labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
                     found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
         return self._carried.setdefault((number, other), tuple(found))
+
+
+def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:
+    """Return the indices of the points of a scan that are in the body of an actor, or within `_AROUND_M` of it."""
+    pose, found = track.pose(scan.frame), [np.empty(0, np.int64)]
+    if pose is None:
+        return found[0]
+    lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
+    for rays in scan.rays:
+        actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
+        crossing = rays.through(actor_T_place, lower, upper)
+        body = transform_points(actor_T_place, rays.points[crossing])
+        found.append(rays.part.start + crossing[((body >= lower) & (body <= upper)).all(axis=1)])
+    return np.concatenate(found)
