@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
-from carlasc.motion.paths import estimate_path, headings_of, is_standing
+from carlasc.motion.paths import estimate_path, is_standing
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 
@@ -101,8 +101,9 @@ class _VelocityEstimate:
         """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
         poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
         sightings = [transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)]
-        positions, velocities = estimate_path(sightings, seconds, rigid=chain.label not in self.classes.deformable)
-        if not self.classes.moving and is_standing(sightings, positions, headings_of(velocities), seconds):
+        rigid = chain.label not in self.classes.deformable
+        positions, velocities, headings = estimate_path(sightings, seconds, rigid=rigid)
+        if not self.classes.moving and is_standing(sightings, positions, headings, seconds):
             velocities = np.zeros_like(velocities)
         own = multiply(invert(poses)[:, :3, :3], velocities[:, :, None])[:, :, 0]
         return [(x, y, z) for x, y, z in own.tolist()]

@@ -12,8 +12,8 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
-from carlasc.motion.paths import resample, smooth
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.smoothing import resample, smooth
 from carlasc.motion.solving import nearest_rotation
 from carlasc.motion.tracks import Track
 
@@ -51,7 +51,11 @@ class _ObjectBoxes:
 
 
 def tracks_from_boxes(
-    boxes: Mapping[int, Boxes], poses: Mapping[int, Transform], times: Mapping[int, float]
+    boxes: Mapping[int, Boxes],
+    poses: Mapping[int, Transform],
+    times: Mapping[int, float],
+    *,
+    deformable: Collection[int] = (),
 ) -> list[Track]:
     """Return the tracks of annotated boxes.
 
@@ -63,6 +67,7 @@ def tracks_from_boxes(
         boxes: the boxes of each annotated frame, sensor frame.
         poses: (4, 4) world_T_sensor of at least these frames.
         times: seconds of all frames of the sequence, increasing.
+        deformable: classes whose objects change their shape.
 
     Returns:
         The tracks in order of their numbers, without members: `segment_by_boxes` finds those of a scan. An object whose boxes jump
@@ -76,7 +81,7 @@ def tracks_from_boxes(
     known = np.array(sorted(times), np.int64)
     seconds = np.array([times[frame] for frame in known.tolist()])
     return [
-        _make_track(track, part, known, seconds)
+        _make_track(track, part, known, seconds, deformable)
         for track in sorted(found)
         for part in _split_at_jumps(_sightings([(frame, world[frame], row) for frame, row in found[track]], times))
     ]
@@ -175,7 +180,11 @@ def _split_at_jumps(sightings: _ObjectBoxes) -> list[_ObjectBoxes]:
 
 
 def _make_track(
-    instance: int, sightings: _ObjectBoxes, known: NDArray[np.int64], known_seconds: NDArray[np.float64]
+    instance: int,
+    sightings: _ObjectBoxes,
+    known: NDArray[np.int64],
+    known_seconds: NDArray[np.float64],
+    deformable: Collection[int],
 ) -> Track:
     """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
     seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
@@ -201,9 +210,9 @@ def _make_track(
         path, speed = resample(at, seconds, path, speed)
         poses = np.stack([multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)])
         poses[:, :3, 3] = path
-    half = np.median(sightings.sizes, axis=0) / 2
+    half, label = np.median(sightings.sizes, axis=0) / 2, int(np.bincount(sightings.labels).argmax())
     return Track(
-        label=int(np.bincount(sightings.labels).argmax()),
+        label=label,
         instance=instance,
         members={},
         first=int(frames[0]),
@@ -212,6 +221,7 @@ def _make_track(
         lower=-half - BODY_MARGIN_M,
         upper=half + BODY_MARGIN_M,
         extent=Extent(-half, half, (True, True, True, True), 0),
+        rigid=label not in deformable,
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
 from carlasc.motion.linking import best_pairs
-from carlasc.motion.paths import estimate_path, headings_of, is_standing, middles_of, overlay
+from carlasc.motion.paths import estimate_path, is_standing, middles_of, overlay
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
@@ -208,7 +208,7 @@ class _MoverChain:
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
         samples = [thin(s.points, _SAMPLES) for s in segments]
-        positions, velocities = estimate_path(samples, seconds, rigid=rigid)
+        positions, velocities, headings = estimate_path(samples, seconds, rigid=rigid)
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
         if np.ptp(positions[:, :2], axis=0).max() < _MIN_WAY_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
             return None
@@ -217,9 +217,9 @@ class _MoverChain:
             return None
         middles = np.stack([link.middle for link in self.links])
         steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(seconds)
-        if np.median(steps) > _MAX_JUMP_M_S or is_standing(samples, positions, headings_of(velocities), seconds):
+        if np.median(steps) > _MAX_JUMP_M_S or is_standing(samples, positions, headings, seconds):
             return None
-        confidence = self._confidence(samples, positions, headings_of(velocities), seconds)
+        confidence = self._confidence(samples, positions, headings, seconds)
         if confidence < _LEAST_CONFIDENCE:
             return None
         found = [

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes, nearest_points
+from carlasc.motion.smoothing import resample, smooth, smooth_at
 from carlasc.motion.solving import least_squares
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
@@ -29,9 +30,13 @@ _PAIRS, _APART_S = 12, 1.0  # pairs of sightings that are compared, and their di
 _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
 _STANDING_M = 0.38  # sightings of a standing actor are closer to each other, although they show different sides of it
 _HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
+_TURN_S, _MIN_TURNS = (
+    1.0,
+    4,
+)  # half width of the window in which directions correct registered turns, and the fewest directions
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
-_REGISTERED = 300  # number of points of a sighting that are registered to the model
+REGISTERED = 300  # number of points of a sighting that are registered to the model
 _SIDE_M = 0.14  # standard deviation, across a side, of points of this side alone
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
@@ -49,8 +54,8 @@ _GAIN = 0.3  # weight of the last correction in the motion
 
 def estimate_path(
     sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], *, rigid: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Estimate the position and the velocity of an actor at each of its sightings.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Estimate the position, the velocity and the heading of an actor at each of its sightings.
 
     Rigid actors are registered, so that it does not matter which side of them is seen. For people, who change their shape as they walk, the
     centre of the points is followed. Sightings with too few points are interpolated. An actor that was seen once has velocity zero.
@@ -61,19 +66,19 @@ def estimate_path(
         rigid: whether the actor keeps its shape.
 
     Returns:
-        (F, 3) centre of the actor, metres, world, and its (F, 3) velocity, m/s, world.
+        (F, 3) centre of the actor, metres, world, its (F, 3) velocity, m/s, world, and its (F,) heading, radians, unwrapped.
     """
     counts = np.array([len(points) for points in sightings])
     enough = np.flatnonzero(counts >= max(1, min(MIN_POINTS, counts.max(initial=0))))
     chosen, at, weights = [sightings[i] for i in enough.tolist()], seconds[enough], np.minimum(counts[enough], 200.0)
     if len(enough) < 2:
         middle = np.mean(chosen[0], axis=0) if chosen else np.zeros(3)
-        return np.tile(middle, (len(seconds), 1)), np.zeros((len(seconds), 3))
+        return np.tile(middle, (len(seconds), 1)), np.zeros((len(seconds), 3)), np.zeros(len(seconds))
     best = best_sighting(chosen)
-    path = follow(chosen, at, best) if rigid else middles_of(chosen)
+    path, turns = follow(chosen, at, best) if rigid else (middles_of(chosen), np.zeros(len(chosen)))
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
-    velocities = _limit_acceleration(velocities, at, best)
-    return resample(seconds, at, positions, velocities)
+    positions, velocities = resample(seconds, at, positions, _limit_acceleration(velocities, at, best))
+    return positions, velocities, headings_of(velocities, np.interp(seconds, at, turns) if rigid else None, seconds)
 
 
 def is_standing(
@@ -137,90 +142,34 @@ def _limit_acceleration(
     return bounded
 
 
-def smooth(
-    values: NDArray[np.float64], seconds: NDArray[np.float64], weights: NDArray[np.float64], half_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a parabola around each time, robustly; a straight line if there are few values.
-
-    Args:
-        values: (F, D).
-        seconds: (F,) times, rising.
-        weights: (F,) of the values.
-        half_s: half width of the window of each fit, seconds. It grows until it holds four values.
-
-    Returns:
-        The (F, D) values of the fits, and their (F, D) derivatives per second.
-    """
-    smoothed, slopes = values.copy(), np.zeros_like(values)
-    for index in range(len(seconds)):
-        smoothed[index], slopes[index] = smooth_at(index, values, seconds, weights, half_s)
-    return smoothed, slopes
-
-
-def smooth_at(
-    index: int,
-    values: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    half_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `smooth` returns for the time of one index alone: (D,) and (D,)."""
-    distance = np.abs(seconds - seconds[index])
-    near = np.flatnonzero(distance <= half_s + 1e-9)
-    if len(near) < 4:
-        near = np.sort(np.argsort(distance, kind="stable")[:4])
-    offsets = seconds[near] - seconds[index]
-    degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
-    design, own = offsets[:, None] ** np.arange(degree + 1), values[near]
-    weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
-    for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
-        root = np.sqrt(weight)[:, None]
-        fit = least_squares(design * root, own * root)
-        error = np.linalg.norm(own - multiply(design, fit), axis=1)
-        weight = weight / (1 + (error / max(3 * _median(error), 0.02)) ** 2)
-    return fit[0], fit[1] if degree else np.zeros_like(fit[0])
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    """Return the median of (N,) values, N > 0; `np.median` takes five times as long for few values."""
-    ranked, half = np.sort(values), len(values) // 2
-    return float(ranked[half]) if len(values) % 2 else float((ranked[half - 1] + ranked[half]) / 2)
-
-
-def resample(
-    at: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    positions: NDArray[np.float64],
+def headings_of(
     velocities: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions and velocities at other times: linear between the known times, at constant velocity beyond.
+    turns: NDArray[np.float64] | None = None,
+    seconds: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow.
 
     Args:
-        at: (A,) the other times, seconds.
-        seconds: (F,) the known times, increasing.
-        positions: (F, 3) metres.
         velocities: (F, 3) m/s.
-
-    Returns:
-        (A, 3) positions and (A, 3) velocities.
+        turns: (F,) headings but for a constant, radians, as registration shows them: better than directions for a second or two,
+            because a vehicle that enters a bend does not move where it points.
+        seconds: (F,) times, rising; needed with turns.
     """
-    path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
-    speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
-    beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
-    return path + speed * beyond[:, None], speed
-
-
-def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow."""
     fast = np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
     if not len(fast):
         mean = velocities.mean(axis=0)
         return np.full(len(velocities), np.arctan2(mean[1], mean[0]))
     angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
-    return np.interp(np.arange(len(velocities)), fast, angles)
+    every = np.arange(len(velocities))
+    if turns is None or seconds is None or len(fast) < _MIN_TURNS:
+        return np.interp(every, fast, angles)
+    left = smooth((angles - turns[fast])[:, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][:, 0]
+    return turns + np.interp(every, fast, left)
 
 
-def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], best: int) -> NDArray[np.float64]:
+def follow(
+    sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], best: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Register the sightings of a rigid, upright actor, starting with the best sighting and going outwards.
 
     Args:
@@ -229,7 +178,7 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
         best: index of the sighting to start with: see `best_sighting`.
 
     Returns:
-        (F, 3) centre of the actor, metres, world.
+        (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best sighting.
     """
     counts = np.array([len(points) for points in sightings])
     middles = middles_of(sightings)
@@ -245,19 +194,19 @@ def follow(sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64
             elapsed = seconds[index] - seconds[previous]
             predicted = states[previous] + velocity * elapsed
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
-            points = thin(sightings[index], _REGISTERED)
+            points = thin(sightings[index], REGISTERED)
             shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
-            states[index] = _register(points, model, predicted, error, states[previous, :3], shifts)
+            states[index] = register(points, model, predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
                 motion = velocity  # the backward pass starts with this estimate
-            model.add(transform_points(invert(_pose(states[index])), points))
+            model.add(transform_points(invert(pose_of(states[index])), points))
             previous, seen = index, seen + 1
     middle = (np.quantile(model.points, 0.01, axis=0) + np.quantile(model.points, 0.99, axis=0)) / 2
-    return np.stack([transform_points(_pose(state), middle) for state in states])
+    return np.stack([transform_points(pose_of(state), middle) for state in states]), states[:, 3]
 
 
-def _register(
+def register(
     points: NDArray[np.float64],
     model: Planes,
     predicted: NDArray[np.float64],
@@ -284,7 +233,7 @@ def _register(
     first_reach = max(_FIRST_REACH_M, _DEVIATIONS * float(error[:2].max()))
     for iteration in range(_ITERATIONS):
         reach = first_reach * (_LAST_REACH_M / first_reach) ** (iteration / (_ITERATIONS - 1))
-        pose = _pose(state)
+        pose = pose_of(state)
         pairs, nearest = model.near(points, pose, reach**2)
         information, pull = expected, prior * (predicted - state)
         for row, direction, shift in ways:
@@ -373,7 +322,8 @@ def _between(low: float, high: float, share: float) -> float:
     return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
 
 
-def _pose(state: NDArray[np.float64]) -> Transform:
+def pose_of(state: NDArray[np.float64]) -> Transform:
+    """Return the (4, 4) pose of an upright actor in a state: x, y, z in metres, yaw in radians."""
     pose = rotation_z(float(state[3]))
     pose[:3, 3] = state[:3]
     return pose

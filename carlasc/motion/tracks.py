@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import estimate_path, headings_of, is_standing, resample
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.smoothing import resample
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
@@ -124,13 +125,12 @@ def make_track(
     keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
         sightings = [segment.points for segment in chain]
-        positions, velocities = estimate_path(sightings, seconds, rigid=keeps_shape)
-        if is_standing(sightings, positions, headings_of(velocities), seconds):
-            positions, velocities = np.zeros_like(positions), np.zeros_like(velocities)
+        positions, velocities, headings = estimate_path(sightings, seconds, rigid=keeps_shape)
+        if is_standing(sightings, positions, headings, seconds):
+            positions, velocities, headings = (np.zeros_like(values) for values in (positions, velocities, headings))
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
-        positions = _integrate(velocities, seconds, chain)
-    headings = headings_of(velocities)
+        positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     path, speed = resample(at, seconds, positions, velocities)

@@ -35,6 +35,7 @@ from carlasc.motion import (
 )
 from carlasc.motion.bodies import surface_of
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
+from carlasc.motion.registered_boxes import register_boxes
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
@@ -46,11 +47,11 @@ from carlasc.storage.sinks import SequenceWriter
 TRACKS, POSES = "tracks", "poses"
 """What the files that keep actors and refined poses are called, in the folder of what is derived."""
 
-_VERSIONS = {TRACKS: 3, POSES: 1}  # of the methods: they change only when the same input gives another result
+_VERSIONS = {TRACKS: 4, POSES: 1}  # of the methods: they change only when the same input gives another result
 _NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece
-_SHAPE_POINTS = 64  # points of a boxed object in a scan that show its shape
+_SHAPE_POINTS = 128  # points of a boxed object in a scan that show its shape and its motion
 _BLOCK = 100  # frames whose evidence is found in one piece
 
 Item = TypeVar("Item")
@@ -84,6 +85,17 @@ class _MakeTrack:
     def __call__(self, actor: tuple[Chain, bool | None, float]) -> Track:
         chain, rigid, confidence = actor
         return make_track(chain, self.times, deformable=self.deformable, rigid=rigid, confidence=confidence)
+
+
+@dataclass(frozen=True)
+class _FollowBox:
+    """Gives the track of a box the points that are in it, and lays them on each other, in a worker."""
+
+    times: dict[int, float]
+
+    def __call__(self, boxed: tuple[Track, list[Segment]]) -> Track:
+        track, segments = boxed
+        return _with_members(register_boxes(track, segments, self.times), segments)
 
 
 @dataclass(frozen=True)
@@ -136,7 +148,9 @@ class _MotionPass:
                     few = replace(segment, points=thin(segment.points, _SHAPE_POINTS))
                     segments.setdefault(segment.instance, []).append(few)
                 self._count(1)
-        return with_surfaces([_with_members(track, segments.get(track.instance, [])) for track in boxes])
+        follow = _FollowBox(self.feed.times)
+        with self._each(follow, [(track, segments.get(track.instance, [])) for track in boxes]) as tracks:
+            return with_surfaces(list(tracks))
 
     def movers(
         self, boxes: tuple[Track, ...]
@@ -236,7 +250,8 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
     boxes = {frame: found for frame in frames if (found := feed.sequence.boxes(frame)) is not None}
     for frame, found in boxes.items():
         feed.classes.check(found.labels, f"{feed.sequence.location}: boxes of frame {frame}")
-    return tracks_from_boxes(boxes, {frame: feed.pose(frame) for frame in boxes}, feed.times)
+    poses = {frame: feed.pose(frame) for frame in boxes}
+    return tracks_from_boxes(boxes, poses, feed.times, deformable=feed.classes.deformable)
 
 
 def read_or_find_actors(feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> MovingActors:

@@ -1,0 +1,66 @@
+"""Annotated boxes follow the points that are in them: a person draws each box some centimetres and a degree off, which blurs what is merged.
+
+The sightings of a moving object are laid on each other, as those of actors without boxes are, but each stays near the smoothed box of its
+scan. So objects that few rays hit stay where they were drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
+from carlasc.motion.paths import MIN_POINTS, REGISTERED, best_sighting, pose_of, register
+from carlasc.motion.planes import Planes
+from carlasc.motion.segments import Segment
+from carlasc.motion.smoothing import smooth
+from carlasc.motion.tracks import Track
+
+_DRAWN = np.array([0.05, 0.05, 0.03, 0.01])  # error of a smoothed box: x, y, z in metres, yaw in radians
+_SMOOTH_S = 0.5  # half width of the window in which corrections change smoothly
+_MIN_SIGHTINGS = 5  # with fewer, there is nothing to lay on each other
+
+
+def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int, float]) -> Track:
+    """Return the track of an object's boxes with poses under which its sightings fit each other.
+
+    The mean of all boxes stays where it is, in the object's frame. Objects that stand, and those that change their shape, stay as they are.
+
+    Args:
+        track: the track of the boxes.
+        segments: the points in its boxes, one segment for each scan, in order of frames.
+        times: seconds by frame.
+    """
+    seen = [s for s in segments if len(s.points) >= MIN_POINTS and track.pose(s.frame) is not None]
+    if not (track.moves and track.rigid) or len(seen) < _MIN_SIGHTINGS:
+        return track
+    rows, seconds = np.array([s.frame for s in seen]) - track.first, np.array([times[s.frame] for s in seen])
+    poses = track.world_T_actor
+    drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
+    change = _lay([s.points for s in seen], drawn) - drawn
+    axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
+    counts = np.minimum([len(s.points) for s in seen], REGISTERED).astype(np.float64)
+    own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
+    own, rates = smooth(own - np.average(own, axis=0, weights=counts), seconds, counts, _SMOOTH_S)
+    every = np.arange(len(poses))
+    x, y, z, yaw = (np.interp(every, rows, own[:, axis]) for axis in range(4))
+    moved = np.stack([rotation_z(angle) for angle in yaw])
+    moved[:, :3, 3] = np.column_stack([x, y, z])
+    inside = (every >= rows[0]) & (every <= rows[-1])
+    faster = np.column_stack([np.interp(every, rows, rates[:, axis]) * inside for axis in range(3)])
+    velocity = track.velocity + multiply(poses[:, :3, :3], faster[:, :, None])[:, :, 0]
+    return replace(track, world_T_actor=multiply(poses, moved), velocity=velocity)
+
+
+def _lay(sightings: Sequence[NDArray[np.float64]], drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (F, 4) states of an object (x, y, z, yaw) that lay its (M, 3) sightings on each other, near those of its boxes."""
+    states, best = drawn.copy(), best_sighting(sightings)
+    model = Planes(transform_points(invert(pose_of(drawn[best])), thin(sightings[best], REGISTERED)))
+    for index in [*range(best + 1, len(drawn)), *range(best - 1, -1, -1)]:
+        points = thin(sightings[index], REGISTERED)
+        states[index] = register(points, model, drawn[index], _DRAWN, drawn[index, :3], ())
+        model.add(transform_points(invert(pose_of(states[index])), points))
+    return states
