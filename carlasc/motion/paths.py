@@ -196,7 +196,7 @@ def follow(
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
             points = thin(sightings[index], REGISTERED)
             shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
-            states[index] = register(points, model, predicted, error, states[previous, :3], shifts)
+            states[index] = _register(points, model, predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
                 motion = velocity  # the backward pass starts with this estimate
@@ -206,7 +206,29 @@ def follow(
     return np.stack([transform_points(pose_of(state), middle) for state in states]), states[:, 3]
 
 
-def register(
+def lay_near(
+    sightings: Sequence[NDArray[np.float64]], states: NDArray[np.float64], error: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Register the sightings of a rigid, upright actor to each other, near the states that are known of it.
+
+    Args:
+        sightings: (M, 3) points of the actor at each time, metres, world.
+        states: (F, 4) x, y, z in metres, and yaw in radians, world.
+        error: (4,) their standard deviation.
+
+    Returns:
+        (F, 4) states under which the sightings fit each other.
+    """
+    laid, best = states.copy(), best_sighting(sightings)
+    model = Planes(transform_points(invert(pose_of(states[best])), thin(sightings[best], REGISTERED)))
+    for index in [*range(best + 1, len(states)), *range(best - 1, -1, -1)]:
+        points = thin(sightings[index], REGISTERED)
+        laid[index] = _register(points, model, states[index], error, states[index, :3], ())
+        model.add(transform_points(invert(pose_of(laid[index])), points))
+    return laid
+
+
+def _register(
     points: NDArray[np.float64],
     model: Planes,
     predicted: NDArray[np.float64],

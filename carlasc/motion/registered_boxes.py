@@ -10,11 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
-from carlasc.motion.paths import MIN_POINTS, REGISTERED, best_sighting, pose_of, register
-from carlasc.motion.planes import Planes
+from carlasc.core.geometry import multiply, rotation_z
+from carlasc.motion.paths import MIN_POINTS, REGISTERED, lay_near
 from carlasc.motion.segments import Segment
 from carlasc.motion.smoothing import smooth
 from carlasc.motion.tracks import Track
@@ -40,7 +38,7 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     rows, seconds = np.array([s.frame for s in seen]) - track.first, np.array([times[s.frame] for s in seen])
     poses = track.world_T_actor
     drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
-    change = _lay([s.points for s in seen], drawn) - drawn
+    change = lay_near([s.points for s in seen], drawn, _DRAWN) - drawn
     axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
     counts = np.minimum([len(s.points) for s in seen], REGISTERED).astype(np.float64)
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
@@ -53,14 +51,3 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     faster = np.column_stack([np.interp(every, rows, rates[:, axis]) * inside for axis in range(3)])
     velocity = track.velocity + multiply(poses[:, :3, :3], faster[:, :, None])[:, :, 0]
     return replace(track, world_T_actor=multiply(poses, moved), velocity=velocity)
-
-
-def _lay(sightings: Sequence[NDArray[np.float64]], drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (F, 4) states of an object (x, y, z, yaw) that lay its (M, 3) sightings on each other, near those of its boxes."""
-    states, best = drawn.copy(), best_sighting(sightings)
-    model = Planes(transform_points(invert(pose_of(drawn[best])), thin(sightings[best], REGISTERED)))
-    for index in [*range(best + 1, len(drawn)), *range(best - 1, -1, -1)]:
-        points = thin(sightings[index], REGISTERED)
-        states[index] = register(points, model, drawn[index], _DRAWN, drawn[index, :3], ())
-        model.add(transform_points(invert(pose_of(states[index])), points))
-    return states
