@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
 from typing import Any, TypeVar
 
 import numpy as np
@@ -38,8 +37,9 @@ def multiply(*matrices: NDArray[np.floating]) -> NDArray[np.float64]:
     """
     product = np.asarray(matrices[0], np.float64)
     for matrix in matrices[1:]:
-        terms = [product[..., :, k, None] * matrix[..., None, k, :] for k in range(matrix.shape[-2])]
-        product = reduce(np.add, terms)
+        left, product = product, product[..., :, 0, None] * matrix[..., None, 0, :]
+        for k in range(1, matrix.shape[-2]):
+            product = product + left[..., :, k, None] * matrix[..., None, k, :]
     return product
 
 

@@ -36,7 +36,7 @@ _TURN_S, _MIN_TURNS = (
 )  # half width of the window in which directions correct registered turns, and the fewest directions
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
-REGISTERED = 300  # number of points of a sighting that are registered to the model
+_REGISTERED = 300  # number of points of a sighting that are registered to the model
 _SIDE_M = 0.14  # standard deviation, across a side, of points of this side alone
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
@@ -186,7 +186,8 @@ def follow(
     states[best, :3] = middles[best]
     initial = smooth_at(best, middles, seconds, np.minimum(counts, 200.0), _INITIAL_S)[1]
     motion = np.append(initial, 0.0)  # of x, y, z and yaw per second
-    model = Planes(sightings[best] - middles[best])
+    model = Planes()
+    model.add(sightings[best] - middles[best])
     seen = 0
     for step, stop in ((1, len(counts)), (-1, -1)):
         velocity, previous = motion, best
@@ -194,38 +195,45 @@ def follow(
             elapsed = seconds[index] - seconds[previous]
             predicted = states[previous] + velocity * elapsed
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
-            points = thin(sightings[index], REGISTERED)
+            points = thin(sightings[index], _REGISTERED)
             shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
             states[index] = _register(points, model, predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
                 motion = velocity  # the backward pass starts with this estimate
-            model.add(transform_points(invert(pose_of(states[index])), points))
+            model.add(transform_points(invert(_pose(states[index])), points))
             previous, seen = index, seen + 1
     middle = (np.quantile(model.points, 0.01, axis=0) + np.quantile(model.points, 0.99, axis=0)) / 2
-    return np.stack([transform_points(pose_of(state), middle) for state in states]), states[:, 3]
+    return np.stack([transform_points(_pose(state), middle) for state in states]), states[:, 3]
 
 
 def lay_near(
-    sightings: Sequence[NDArray[np.float64]], states: NDArray[np.float64], error: NDArray[np.float64]
+    sightings: Sequence[NDArray[np.float64]],
+    seconds: NDArray[np.float64],
+    states: NDArray[np.float64],
+    error: NDArray[np.float64],
+    best: int,
 ) -> NDArray[np.float64]:
-    """Register the sightings of a rigid, upright actor to each other, near the states that are known of it.
+    """Correct the path of a rigid, upright actor so that its sightings fit each other. The corrections change smoothly.
 
     Args:
         sightings: (M, 3) points of the actor at each time, metres, world.
-        states: (F, 4) x, y, z in metres, and yaw in radians, world.
+        seconds: (F,) times, increasing.
+        states: (F, 4) x, y, z in metres, and yaw in radians, world, as they are known so far.
         error: (4,) their standard deviation.
+        best: index of the sighting to start with: see `best_sighting`.
 
     Returns:
-        (F, 4) states under which the sightings fit each other.
+        (F, 4) states near those.
     """
-    laid, best = states.copy(), best_sighting(sightings)
-    model = Planes(transform_points(invert(pose_of(states[best])), thin(sightings[best], REGISTERED)))
-    for index in [*range(best + 1, len(states)), *range(best - 1, -1, -1)]:
-        points = thin(sightings[index], REGISTERED)
-        laid[index] = _register(points, model, states[index], error, states[index, :3], ())
-        model.add(transform_points(invert(pose_of(laid[index])), points))
-    return laid
+    laid, model = states.copy(), Planes()
+    for index in [best, *range(best + 1, len(states)), *range(best - 1, -1, -1)]:
+        points = thin(sightings[index], _REGISTERED)
+        if index != best:
+            laid[index] = _register(points, model, states[index], error, states[index, :3], ())
+        model.add(transform_points(invert(_pose(laid[index])), points))
+    counts = np.array([min(len(points), _REGISTERED) for points in sightings], np.float64)
+    return states + smooth(laid - states, seconds, counts, _DRIVE_S)[0]
 
 
 def _register(
@@ -255,7 +263,7 @@ def _register(
     first_reach = max(_FIRST_REACH_M, _DEVIATIONS * float(error[:2].max()))
     for iteration in range(_ITERATIONS):
         reach = first_reach * (_LAST_REACH_M / first_reach) ** (iteration / (_ITERATIONS - 1))
-        pose = pose_of(state)
+        pose = _pose(state)
         pairs, nearest = model.near(points, pose, reach**2)
         information, pull = expected, prior * (predicted - state)
         for row, direction, shift in ways:
@@ -344,8 +352,7 @@ def _between(low: float, high: float, share: float) -> float:
     return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
 
 
-def pose_of(state: NDArray[np.float64]) -> Transform:
-    """Return the (4, 4) pose of an upright actor in a state: x, y, z in metres, yaw in radians."""
+def _pose(state: NDArray[np.float64]) -> Transform:
     pose = rotation_z(float(state[3]))
     pose[:3, 3] = state[:3]
     return pose

@@ -31,10 +31,9 @@ class Planes:
             point or of a line has length 0.
     """
 
-    def __init__(self, points: NDArray[np.float64]) -> None:
-        """Take the points of a sighting, (N, 3) metres, actor frame, N > 0."""
+    def __init__(self) -> None:
+        """Start without points: some have to be added before others are paired with them."""
         self.points, self.normals, self._sums = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, _SUMS))
-        self.add(points)
 
     def add(self, points: NDArray[np.float64]) -> None:
         """Add those of (N, 3) points, metres, actor frame, that are in cells without a point."""

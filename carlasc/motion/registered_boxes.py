@@ -12,13 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from carlasc.core.geometry import multiply, rotation_z
-from carlasc.motion.paths import MIN_POINTS, REGISTERED, lay_near
+from carlasc.motion.paths import MIN_POINTS, best_sighting, lay_near
 from carlasc.motion.segments import Segment
-from carlasc.motion.smoothing import smooth
 from carlasc.motion.tracks import Track
 
 _DRAWN = np.array([0.05, 0.05, 0.03, 0.01])  # error of a smoothed box: x, y, z in metres, yaw in radians
-_SMOOTH_S = 0.5  # half width of the window in which corrections change smoothly
+_MOST_POINTS = 200  # of a sighting: more do not raise its weight
 _MIN_SIGHTINGS = 5  # with fewer, there is nothing to lay on each other
 
 
@@ -38,11 +37,12 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     rows, seconds = np.array([s.frame for s in seen]) - track.first, np.array([times[s.frame] for s in seen])
     poses = track.world_T_actor
     drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
-    change = lay_near([s.points for s in seen], drawn, _DRAWN) - drawn
+    points = [segment.points for segment in seen]
+    change = lay_near(points, seconds, drawn, _DRAWN, best_sighting(points)) - drawn
     axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
-    counts = np.minimum([len(s.points) for s in seen], REGISTERED).astype(np.float64)
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
-    own, rates = smooth(own - np.average(own, axis=0, weights=counts), seconds, counts, _SMOOTH_S)
+    own -= np.average(own, axis=0, weights=np.minimum([len(some) for some in points], _MOST_POINTS))
+    rates = np.gradient(own, seconds, axis=0)
     every = np.arange(len(poses))
     x, y, z, yaw = (np.interp(every, rows, own[:, axis]) for axis in range(4))
     moved = np.stack([rotation_z(angle) for angle in yaw])

@@ -114,7 +114,7 @@ def test_long_sightings_are_estimated_in_pieces_and_every_frame_has_a_velocity(m
     monkeypatch.setattr(
         actors,
         "estimate_path",
-        lambda sightings, *_, **__: lengths.append(len(sightings)) or (None, np.zeros((len(sightings), 3))),
+        lambda points, *_, **__: lengths.append(len(points)) or (None, np.zeros((len(points), 3)), None),
     )
     velocities = estimate(range(900), {1: (MOVING_CAR, (10, 0, 0), (0, 0, 0), range(900))})
     assert sum(lengths) == len(velocities) == 900

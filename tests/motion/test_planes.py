@@ -10,6 +10,12 @@ from carlasc.motion.planes import Planes, covariances, extend_sums, nearest_poin
 CELL_M, MOST, RADIUS_M = 0.15, 1200, 0.5
 
 
+def planes_of(points):
+    model = Planes()
+    model.add(points)
+    return model
+
+
 def sighting(rng, count=300):
     """Two sides of a car, some of whose points are in cells that another sighting had."""
     points = rng.uniform(0, 1, (count, 3)) * (4.4, 1.8, 1.5)
@@ -62,20 +68,20 @@ def test_a_model_that_grows_is_the_model_of_all_points(size):
         points = sighting(rng) * size
         plain = plain_thin(np.concatenate([plain, points]))
         if model is None:
-            model = Planes(points)
+            model = planes_of(points)
         else:
             thinned |= len(plain) < len(model.points)
             model.add(points)
         assert np.array_equal(model.points, plain)
     assert thinned == (size > 1)
-    anew = Planes(model.points)
+    anew = planes_of(model.points)
     assert np.array_equal(model.points, anew.points)
     assert np.array_equal(model.normals, anew.normals)
 
 
 def test_points_in_cells_that_are_known_change_nothing():
     points = sighting(np.random.default_rng(3))
-    model = Planes(points)
+    model = planes_of(points)
     before = model.points, model.normals
     model.add(points[::-1])
     assert (model.points, model.normals) == before
@@ -83,10 +89,10 @@ def test_points_in_cells_that_are_known_change_nothing():
 
 def test_a_side_has_its_normal_and_a_line_or_a_point_none():
     rng = np.random.default_rng(4)
-    side = Planes(rng.uniform(0, 1, (200, 3)) * (2, 0, 1.5))
+    side = planes_of(rng.uniform(0, 1, (200, 3)) * (2, 0, 1.5))
     assert np.allclose(np.abs(side.normals), (0, 1, 0), atol=1e-6)
-    assert not Planes(np.linspace((0, 0, 0), (3, 0, 0), 50)).normals.any()
-    assert not Planes(np.ones((1, 3))).normals.any()
+    assert not planes_of(np.linspace((0, 0, 0), (3, 0, 0), 50)).normals.any()
+    assert not planes_of(np.ones((1, 3))).normals.any()
 
 
 def test_first_rows_of_cells_are_those_that_numpy_finds():
@@ -112,7 +118,7 @@ def test_pairs_are_those_of_all_distances(axis):
 
 def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
     rng = np.random.default_rng(6)
-    model, points = Planes(sighting(rng)), sighting(rng) + (30, -20, 1)
+    model, points = planes_of(sighting(rng)), sighting(rng) + (30, -20, 1)
     pose = translation((30.2, -20.1, 1)) @ rotation_z(0.1)
     squared = np.square(transform_points(invert(pose), points)[:, None] - model.points).sum(axis=2)
     rows, nearest = model.near(points, pose, 0.04)
@@ -122,7 +128,7 @@ def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
 
 
 def test_a_pose_that_is_not_finite_pairs_nothing():
-    model = Planes(sighting(np.random.default_rng(7)))
+    model = planes_of(sighting(np.random.default_rng(7)))
     rows, nearest = model.near(model.points, np.full((4, 4), np.nan), 1.0)
     assert len(rows) == len(nearest) == 0
 
