@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import best_sighting, estimate_path, headings_of, is_standing, lay_near
+from carlasc.motion.paths import estimate_path, headings_of, is_standing
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.smoothing import resample
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last segment
-_INTEGRATED = np.array([0.05, 0.05, 0.02, 0.015])  # error of a path by flow: metres, and radians of the heading
 _STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
 LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
 _SURE = 0.8  # actors with less confidence are doubtful
@@ -132,12 +131,6 @@ def make_track(
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
         positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
-        if keeps_shape and len(chain) > 1:
-            sightings, path = [segment.points for segment in chain], np.column_stack([positions, headings])
-            path = lay_near(
-                sightings, seconds, path, _INTEGRATED, best_sighting(sightings)
-            )  # in bends, integration drifts
-            positions, headings = path[:, :3], path[:, 3]
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     path, speed = resample(at, seconds, positions, velocities)
