@@ -30,10 +30,8 @@ _PAIRS, _APART_S = 12, 1.0  # pairs of sightings that are compared, and their di
 _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
 _STANDING_M = 0.38  # sightings of a standing actor are closer to each other, although they show different sides of it
 _HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
-_TURN_S, _MIN_TURNS = (
-    1.0,
-    4,
-)  # half width of the window in which directions correct registered turns, and the fewest directions
+_TURN_S = 1.0  # half width of the window in which directions correct registered turns
+_MIN_TURNS = 4  # the fewest directions that do
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of a sighting that are registered to the model
@@ -75,10 +73,12 @@ def estimate_path(
         middle = np.mean(chosen[0], axis=0) if chosen else np.zeros(3)
         return np.tile(middle, (len(seconds), 1)), np.zeros((len(seconds), 3)), np.zeros(len(seconds))
     best = best_sighting(chosen)
-    path, turns = follow(chosen, at, best) if rigid else (middles_of(chosen), np.zeros(len(chosen)))
+    path, turns = follow(chosen, at, best) if rigid else (middles_of(chosen), None)
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
     positions, velocities = resample(seconds, at, positions, _limit_acceleration(velocities, at, best))
-    return positions, velocities, headings_of(velocities, np.interp(seconds, at, turns) if rigid else None, seconds)
+    if turns is None:
+        return positions, velocities, headings_of(velocities)
+    return positions, velocities, headings_by_turns(velocities, np.interp(seconds, at, turns), seconds)
 
 
 def is_standing(
@@ -142,29 +142,41 @@ def _limit_acceleration(
     return bounded
 
 
-def headings_of(
-    velocities: NDArray[np.float64],
-    turns: NDArray[np.float64] | None = None,
-    seconds: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow.
-
-    Args:
-        velocities: (F, 3) m/s.
-        turns: (F,) headings but for a constant, radians, as registration shows them: better than directions for a second or two,
-            because a vehicle that enters a bend does not move where it points.
-        seconds: (F,) times, rising; needed with turns.
-    """
-    fast = np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
+def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow."""
+    fast = _fast(velocities)
     if not len(fast):
         mean = velocities.mean(axis=0)
         return np.full(len(velocities), np.arctan2(mean[1], mean[0]))
     angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
-    every = np.arange(len(velocities))
-    if turns is None or seconds is None or len(fast) < _MIN_TURNS:
-        return np.interp(every, fast, angles)
-    left = smooth((angles - turns[fast])[:, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][:, 0]
-    return turns + np.interp(every, fast, left)
+    return np.interp(np.arange(len(velocities)), fast, angles)
+
+
+def headings_by_turns(
+    velocities: NDArray[np.float64], turns: NDArray[np.float64], seconds: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return headings that turn as registration shows, and are the direction of motion over a second or two.
+
+    A vehicle that enters a bend does not move where it points, so directions alone are wrong there; registered turns alone drift.
+
+    Args:
+        velocities: (F, 3) m/s.
+        turns: (F,) headings but for a constant, radians, as registration shows them.
+        seconds: (F,) times, rising.
+
+    Returns:
+        (F,) radians, unwrapped; those of `headings_of` if the actor is fast too seldom.
+    """
+    fast, directions = _fast(velocities), headings_of(velocities)
+    if len(fast) < _MIN_TURNS:
+        return directions
+    left = smooth((directions - turns)[fast, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][:, 0]
+    return turns + np.interp(np.arange(len(velocities)), fast, left)
+
+
+def _fast(velocities: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return at which of (F, 3) velocities an actor moves fast enough to show where it points."""
+    return np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
 
 
 def follow(
@@ -207,14 +219,14 @@ def follow(
     return np.stack([transform_points(_pose(state), middle) for state in states]), states[:, 3]
 
 
-def lay_near(
+def corrections(
     sightings: Sequence[NDArray[np.float64]],
     seconds: NDArray[np.float64],
     states: NDArray[np.float64],
     error: NDArray[np.float64],
     best: int,
-) -> NDArray[np.float64]:
-    """Correct the path of a rigid, upright actor so that its sightings fit each other. The corrections change smoothly.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how the path of a rigid, upright actor has to change so that its sightings fit each other. The change is smooth.
 
     Args:
         sightings: (M, 3) points of the actor at each time, metres, world.
@@ -224,7 +236,7 @@ def lay_near(
         best: index of the sighting to start with: see `best_sighting`.
 
     Returns:
-        (F, 4) states near those.
+        (F, 4) what is to be added to the states, and (F, 4) its change per second.
     """
     laid, model = states.copy(), Planes()
     for index in [best, *range(best + 1, len(states)), *range(best - 1, -1, -1)]:
@@ -233,7 +245,7 @@ def lay_near(
             laid[index] = _register(points, model, states[index], error, states[index, :3], ())
         model.add(transform_points(invert(_pose(laid[index])), points))
     counts = np.array([min(len(points), _REGISTERED) for points in sightings], np.float64)
-    return states + smooth(laid - states, seconds, counts, _DRIVE_S)[0]
+    return smooth(laid - states, seconds, counts, _DRIVE_S)
 
 
 def _register(

@@ -5,7 +5,17 @@ import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
 from carlasc.core.geometry import rotation_z
-from carlasc.motion.paths import best_sighting, ends, estimate_path, follow, headings_of, is_standing, lay, lay_near
+from carlasc.motion.paths import (
+    best_sighting,
+    corrections,
+    ends,
+    estimate_path,
+    follow,
+    headings_by_turns,
+    headings_of,
+    is_standing,
+    lay,
+)
 
 FRAMES = range(25)
 SECONDS = np.array(FRAMES) * PERIOD_S
@@ -89,7 +99,10 @@ def test_a_vehicle_in_a_bend_points_where_registration_says():
     noise = np.random.default_rng(4).normal(0, 0.05, len(SECONDS))
     motion = turns + 0.3 + np.where(SECONDS > 1.8, 0.09, 0.0) + noise
     velocities = 6 * np.column_stack([np.cos(motion), np.sin(motion), np.zeros(len(SECONDS))])
-    by_turns, by_motion = headings_of(velocities, turns, SECONDS) - turns - 0.3, headings_of(velocities) - turns - 0.3
+    by_turns, by_motion = (
+        headings_by_turns(velocities, turns, SECONDS) - turns - 0.3,
+        headings_of(velocities) - turns - 0.3,
+    )
     assert np.abs(by_turns[:12]).max() < 0.6 * np.abs(by_motion[:12]).max()
 
 
@@ -97,15 +110,15 @@ def test_sightings_are_laid_on_each_other_near_what_is_known():
     actor = MovingBox((10, 6, 0), speed=8.0, yaw_rate=0.2)
     poses = [actor.pose(time) for time in SECONDS]
     true = np.array([[*pose[:3, 3], np.arctan2(pose[1, 0], pose[0, 0])] for pose in poses])
-    waves = np.sin(
-        np.add.outer(SECONDS * np.pi, [0.0, 1.0, 2.0, 3.0])
-    )  # errors that change slowly, as those of a path do
+    # errors that change slowly, as those of a path do
+    waves = np.sin(np.add.outer(SECONDS * np.pi, [0.0, 1.0, 2.0, 3.0]))
     wrong = true + waves * (0.12, 0.12, 0.0, 0.015)
-    laid = lay_near(sightings_of(actor), SECONDS, wrong, np.array([0.08, 0.08, 0.02, 0.01]), 12)
+    error = np.array([0.08, 0.08, 0.02, 0.01])
+    laid = wrong + corrections(sightings_of(actor), SECONDS, wrong, error, 12)[0]
     shape = lambda states: np.std(states - true, axis=0)  # noqa: E731 (a common error of all blurs nothing)
     assert (shape(laid)[:2] < 0.5 * shape(wrong)[:2]).all()
     few = [points[:2] for points in sightings_of(actor)]
-    assert np.allclose(lay_near(few, SECONDS, wrong, np.array([0.08, 0.08, 0.02, 0.01]), 12), wrong)
+    assert np.allclose(wrong + corrections(few, SECONDS, wrong, error, 12)[0], wrong)
 
 
 class TestStanding:

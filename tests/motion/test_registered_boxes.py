@@ -1,6 +1,7 @@
 """Annotated boxes that follow the points in them: nearer to the truth than what was drawn; what stands, walks or is hardly seen stays."""
 
 import numpy as np
+import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, scan_of
 
 from carlasc import Boxes
@@ -68,3 +69,17 @@ def test_frames_without_a_box_in_between_are_moved_too():
     after = register_boxes(track, [s for s in segments if not 10 <= s.frame < 15], TIMES)
     off = np.linalg.norm((after.world_T_actor - all_seen.world_T_actor)[9:16, :3, 3], axis=1)
     assert 0 < off.max() < 0.06
+
+
+@pytest.mark.parametrize("seconds", [[0.0] * 30, [0.1 * (f % 4) for f in FRAMES], [0.1 * (30 - f) for f in FRAMES]])
+def test_times_that_do_not_rise_give_finite_tracks(seconds):
+    track, _, segments = drawn(CAR)
+    after = register_boxes(track, segments, dict(enumerate(seconds)))
+    assert np.isfinite(after.world_T_actor).all() and np.isfinite(after.velocity).all()
+
+
+def test_two_sightings_in_one_scan_give_a_finite_track():
+    """Boxes of one number that jump give two tracks, which both extend to some frames."""
+    track, _, segments = drawn(CAR)
+    after = register_boxes(track, [s for segment in segments for s in (segment, segment)], TIMES)
+    assert np.isfinite(after.velocity).all()

@@ -24,9 +24,8 @@ from carlasc.storage import layout
 STATIC = 0  # region of the voxels that belong to no actor
 _DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
 _RECENT_S = 0.25  # what scans saw within this time before and after a frame is so at the frame
-_AROUND_M = np.array(
-    [0.3, 0.3, 0.1]
-)  # what is so near to an actor's body may be a part of it that its path puts elsewhere
+# What is so near to an actor's body may be a part of it that its path puts elsewhere: metres along, across and up.
+_AROUND_M = np.array([0.3, 0.3, 0.1])
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -207,6 +206,20 @@ class PreparedScan:
                 sure=None if self.sure is None else self.sure[rays.part],
             )
 
+    def through(
+        self, world_T_box: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
+    ) -> Iterator[tuple[RaysFromPlace, Transform, NDArray[np.int32]]]:
+        """Yield the rays from each place, (4, 4) box_T_place, and the indices of those of its points whose rays intersect a box.
+
+        Args:
+            world_T_box: (4, 4) to the world from the frame in which the box is axis-aligned.
+            lower: (3,) lower corner, metres.
+            upper: (3,) upper corner.
+        """
+        for rays in self.rays:
+            box_T_place = invert(world_T_box) @ self.world_T_sensor @ rays.sensor_T_place
+            yield rays, box_T_place, rays.through(box_T_place, lower, upper)
+
 
 class Merger:
     """Merges the scans of a window into the observations of one frame.
@@ -324,11 +337,11 @@ class Merger:
             static[scan.moving] = False
             static[self.actors.is_own(scan.points)] = False
             static[self.actors.moving.get(frame, [])] = False
-            standing_on = np.isin(scan.labels, sorted(self.classes.ground))
+            ground = np.isin(scan.labels, sorted(self.classes.ground))
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
                 near = _points_near(track, scan)
-                static[near[~standing_on[near]]] = False
+                static[near[~ground[near]]] = False
             self._static[frame] = static
         return self._static[frame]
 
@@ -351,9 +364,7 @@ class Merger:
             scan = self.scan_of(other)
             own = np.zeros(len(scan.points), np.bool_)
             own[track.members.get(other, [])] = True
-            for rays in scan.rays:
-                actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
-                crossing = rays.through(actor_T_place, track.lower, track.upper)
+            for rays, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
                 if len(crossing):
                     labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
                     found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
@@ -366,9 +377,7 @@ def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:
     if pose is None:
         return found[0]
     lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-    for rays in scan.rays:
-        actor_T_place = invert(pose) @ scan.world_T_sensor @ rays.sensor_T_place
-        crossing = rays.through(actor_T_place, lower, upper)
+    for rays, actor_T_place, crossing in scan.through(pose, lower, upper):
         body = transform_points(actor_T_place, rays.points[crossing])
         found.append(rays.part.start + crossing[((body >= lower) & (body <= upper)).all(axis=1)])
     return np.concatenate(found)
