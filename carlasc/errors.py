@@ -124,6 +124,10 @@ class MissingDataError(CarlascError):
     """Something that was asked for does not exist: a file, a frame, a field, a sequence."""
 
 
+class MissingKeyError(MissingDataError, KeyError):
+    """A mapping, such as a Source, has no value of a key."""
+
+
 class DependencyError(CarlascError, ImportError):
     """An optional package is not installed, or cannot be loaded."""
 

@@ -1,7 +1,8 @@
-"""Which frames: a half-open range of frame numbers; and their times in seconds, told from counts of smaller units."""
+"""Which frames: a half-open range of frame numbers, or a list of them; and their times in seconds, told from counts of smaller units."""
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +14,12 @@ from carlasc.errors import ArgumentError, FormatError
 
 @dataclass(frozen=True)
 class FrameRange:
-    """A half-open range of frame numbers, `start <= frame < stop`.
+    """A half-open range of frame numbers, `start <= frame < stop`, or only some of the numbers in it.
 
     Attributes:
         start: first frame; None leaves this end open.
         stop: the frame after the last one; None leaves this end open.
+        only: the frames, where not all numbers from `start` to `stop` are chosen; None chooses all.
 
     Raises:
         ArgumentError: a bound that is not a whole number, or a range that holds no frame.
@@ -25,28 +27,49 @@ class FrameRange:
 
     start: int | None = None
     stop: int | None = None
+    only: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
-        for bound in (self.start, self.stop):
+        for bound in (self.start, self.stop, *(self.only or ())):
             if bound is not None and (isinstance(bound, bool) or not isinstance(bound, int | np.integer)):
                 raise ArgumentError("frames", expected="whole numbers or None", found=repr(bound))
         if self.start is not None and self.stop is not None and self.start >= self.stop:
             raise ArgumentError("frames", expected="a range that holds a frame", found=str(self))
 
     @classmethod
-    def of(cls, frames: FrameRange | tuple[int | None, int | None] | None) -> FrameRange:
-        """Return what a `frames` argument means: a FrameRange, a tuple of its bounds, or None for all frames.
+    def of(cls, frames: Frames) -> FrameRange:
+        """Return what a `frames` argument means: see `Frames`.
 
         Raises:
             ArgumentError: it is none of these.
         """
-        if frames is None:
-            return cls()
-        if isinstance(frames, FrameRange):
-            return frames
-        if not isinstance(frames, tuple) or len(frames) != 2:
-            raise ArgumentError("frames", expected="(start, stop), a FrameRange or None", found=repr(frames))
-        return cls(*frames)
+        match frames:
+            case None:
+                return cls()
+            case FrameRange():
+                return frames
+            case str():
+                return cls.parse(frames)
+            case slice(step=None | 1):
+                return cls(frames.start, frames.stop)
+            case (start, stop) if isinstance(frames, tuple):
+                return cls(start, stop)
+            case range() | list() | np.ndarray():
+                return cls._listed(frames)
+        expected = "a range, a slice without a step, A:B, a list of frame numbers, (start, stop) or None"
+        raise ArgumentError("frames", expected=expected, found=repr(frames))
+
+    @classmethod
+    def _listed(cls, frames: range | list[int] | NDArray[np.integer]) -> FrameRange:
+        """Return the range of some frame numbers, in any order."""
+        try:
+            chosen = sorted({operator.index(frame) for frame in frames})
+        except TypeError:
+            raise ArgumentError("frames", expected="a list of whole numbers", found=repr(frames)) from None
+        if not chosen:
+            raise ArgumentError("frames", expected="a range that holds a frame", found=repr(frames))
+        gapless = chosen[-1] - chosen[0] == len(chosen) - 1
+        return cls(chosen[0], chosen[-1] + 1, None if gapless else tuple(chosen))
 
     @classmethod
     def parse(cls, text: str) -> FrameRange:
@@ -65,7 +88,8 @@ class FrameRange:
         return cls(start, stop)
 
     def __contains__(self, frame: int) -> bool:
-        return (self.start is None or frame >= self.start) and (self.stop is None or frame < self.stop)
+        inside = (self.start is None or frame >= self.start) and (self.stop is None or frame < self.stop)
+        return inside and (self.only is None or frame in self.only)
 
     def select(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Return those of (N,) frame numbers that are in the range, in their order, as an array of shape (M,)."""
@@ -74,9 +98,13 @@ class FrameRange:
             chosen &= frames >= self.start
         if self.stop is not None:
             chosen &= frames < self.stop
+        if self.only is not None:
+            chosen &= np.isin(frames, self.only)
         return frames[chosen]
 
     def __str__(self) -> str:
+        if self.only is not None:
+            return ", ".join(map(str, self.only))
         return ":".join("" if bound is None else str(bound) for bound in (self.start, self.stop))
 
 
@@ -91,8 +119,8 @@ def expand(frames: range | NDArray[np.int64]) -> NDArray[np.int64]:
     return np.arange(frames.start, frames.stop, dtype=np.int64) if isinstance(frames, range) else frames
 
 
-Frames = FrameRange | tuple[int | None, int | None] | None
-"""What a `frames` argument takes: a FrameRange, a tuple of its bounds, or None for all frames."""
+Frames = FrameRange | tuple[int | None, int | None] | slice | range | str | list[int] | NDArray[np.integer] | None
+"""What a `frames` argument takes: a range, a slice, "A:B", a list of frame numbers, a FrameRange, a tuple of its bounds, or None for all frames."""
 
 
 _LATEST_S = 1e11  # no clock in seconds says so; milliseconds since 1970 are more

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
+from carlasc.core.notebook import describe
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
 Triple = tuple[float, float, float]
 
 _PI32 = float(np.float32(np.pi))  # a little above pi: an azimuth of exactly pi is inside the published bounds
 _SIDE = float(np.float32(25.6))
+_PIXELS = 200  # width and height of a small picture
+_DARKEST = 0.4  # brightness of the lowest layer in it; the highest has 1
 _PROPORTION = 128 * 0.234375  # azimuth cells times radial cell of the published cylindrical grid
 
 
@@ -238,6 +241,34 @@ class GridSpec:
         cells, inside = self.index(self.to_axes(points))
         return np.where(inside, np.ravel_multi_index(tuple(cells.T), self.size), -1)
 
+    def seen_from_above(
+        self, labels: NDArray[np.integer], palette: NDArray[np.uint8] | None = None, *, left_handed: bool = True
+    ) -> NDArray[np.uint8]:
+        """Return a small picture, (H, W, 3) RGB, of the highest occupied voxel of each column: x points up, y to the right.
+
+        Args:
+            labels: (X, Y, Z) class ids, 0 is free.
+            palette: (K, 3) RGB by class id; None draws heights in grey.
+            left_handed: False for data whose y points to the left: it points to the left of the picture.
+        """
+        occupied, layers = labels > 0, self.size[2]
+        top = layers - 1 - np.argmax(occupied[:, :, ::-1], axis=2)
+        highest = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
+        colors = np.full((*highest.shape, 3), 255.0) if palette is None else palette[highest].astype(np.float64)
+        colors *= _DARKEST + (1 - _DARKEST) * top[:, :, None] / max(layers - 1, 1)
+        colors[~occupied.any(axis=2)] = 255
+        radius, steps = self.upper[0], (np.arange(_PIXELS) + 0.5) / _PIXELS
+        ends = (
+            [(-radius, radius)] * 2
+            if self.coordinates == "cylindrical"
+            else [*zip(self.lower, self.upper, strict=True)][:2]
+        )
+        x, y = (low + (high - low) * steps for low, high in ends)
+        above = np.stack(np.broadcast_arrays(x[::-1, None], y if left_handed else y[::-1], self.lower[2]), axis=-1)
+        cells, inside = self.index(self.to_axes(above.reshape(-1, 3)))
+        picture = np.where(inside[:, None], colors[cells[:, 0], cells[:, 1]], 255)
+        return picture.astype(np.uint8).reshape(_PIXELS, _PIXELS, 3)
+
     def edges(self, axis: int) -> NDArray[np.float64]:
         """Return the (n + 1,) cell edges along an axis."""
         return self.lower[axis] + np.arange(self.size[axis] + 1) * self.voxel_size[axis]
@@ -277,6 +308,16 @@ class Grid:
     def known(self) -> NDArray[np.bool_]:
         """(X, Y, Z) bool: voxels with at least one vote; all voxels if the grid has no counts."""
         return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
+
+    def __repr__(self) -> str:
+        occupied, known = np.count_nonzero(self.labels), np.count_nonzero(self.known)
+        return f"<Grid {self.spec}: {occupied:,} occupied and {known - occupied:,} free voxels>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the geometry, and the heights of the occupied voxels from above."""
+        spec = self.spec
+        rows = {"bounds": f"{spec.lower} to {spec.upper}", "classes": np.unique(self.labels[self.labels > 0]).tolist()}
+        return describe(repr(self), rows, spec.seen_from_above(self.labels))
 
 
 def _float32(value: float) -> float:

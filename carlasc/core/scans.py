@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.grids import GridSpec
+from carlasc.core.notebook import count, describe
 from carlasc.errors import FormatError
 
 
@@ -53,6 +55,26 @@ class Scan:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def fields(self) -> tuple[str, ...]:
+        """Return the names of what the scan has for each point, without `points`."""
+        own = (name for name in ("labels", "flow", "instances", "remission") if getattr(self, name) is not None)
+        return (*own, *self.others)
+
+    def __repr__(self) -> str:
+        boxes = "" if self.boxes is None else f"; {count(len(self.boxes.tracks), 'box', 'boxes')}"
+        return f"<Scan of {count(len(self), 'point')}: {', '.join(self.fields()) or 'no other field'}{boxes}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the fields, and the heights of the points from above."""
+        reach = float(np.percentile(np.abs(self.points[:, :2]), 99)) if len(self) else 1.0
+        low, high = np.percentile(self.points[:, 2], (1, 99)).tolist() if len(self) else (0.0, 1.0)
+        spec = GridSpec("cartesian", (200, 200, 32), (-reach, -reach, low), (reach, reach, max(high, low + 0.1)))
+        labels = np.zeros(spec.num_voxels, np.uint8)
+        voxels = spec.flat_index(self.points)
+        labels[voxels[voxels >= 0]] = 1
+        rows = {"fields": ", ".join(self.fields()), "drawn": f"{reach:.0f} m in x and y"}
+        return describe(repr(self), rows, spec.seen_from_above(labels.reshape(spec.size)))
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
         """Return the points that a mask of shape (N,) or indices of shape (M,) select, with all of their fields; boxes are kept."""

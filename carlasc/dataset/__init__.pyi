@@ -1,8 +1,8 @@
+from .fields import EVIDENCE_FIELDS as EVIDENCE_FIELDS
+from .fields import FIELDS as FIELDS
+from .fields import Sample as Sample
+from .fields import collate as collate
 from .labels import RemapLike as RemapLike
-from .samples import EVIDENCE_FIELDS as EVIDENCE_FIELDS
-from .samples import FIELDS as FIELDS
 from .samples import Dataset as Dataset
-from .samples import collate as collate
 from .sampling import ShardSampler as ShardSampler
 from .transforms import Flip as Flip
-from .transforms import Sample as Sample

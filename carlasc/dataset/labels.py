@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import VoxelFlag, is_confident
 from carlasc.core.tables import remap_named
-from carlasc.dataset.transforms import Sample
+from carlasc.dataset.fields import Values
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import Sequence, layout
 
@@ -125,7 +125,7 @@ class GridFields:
             parts = parts - {"counts"} | {"labels"}  # every voxel is known, in all frames that have labels
         return parts
 
-    def read(self, grids: Sequence, grid: str, frame: int, label_map: LabelMap) -> Sample:
+    def read(self, grids: Sequence, grid: str, frame: int, label_map: LabelMap) -> Values:
         """Read the fields of a frame.
 
         Raises:
@@ -138,7 +138,7 @@ class GridFields:
         def where(part: str) -> str:
             return f"{grids.location}: {grid}/{part} of frame {frame}"
 
-        sample: Sample = {name: np.array(read(name), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
+        sample: Values = {name: np.array(read(name), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
         if "labels" in self.fields:
             sample["labels"] = label_map(read("labels"), where("labels"))
         if "counts" in self.fields:

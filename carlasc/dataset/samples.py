@@ -6,17 +6,21 @@ the last `history` scans, moved into the frame's own sensor frame and binned. Se
 
 from __future__ import annotations
 
+import copy
 import operator
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, SupportsIndex
+from typing import TYPE_CHECKING, Any, Self, SupportsIndex, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
+from carlasc.core.notebook import count, describe
+from carlasc.dataset.fields import ALWAYS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.selection import (
     RecentScans,
@@ -27,30 +31,11 @@ from carlasc.dataset.selection import (
     find_grid_name,
     find_grid_sequences,
 )
-from carlasc.dataset.transforms import Sample
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, import_extra
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.metadata import Axes
 from carlasc.storage.transport.caching import CachedTree
 
-FIELDS = (
-    "occupancy",
-    "density",
-    "visibility",
-    "labels",
-    "known",
-    "counts",
-    "points",
-    "point_labels",
-    "flow",
-    "remission",
-    "poses",
-)
-"""Fields that samples of published data may have."""
-EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
-"""Fields of grids that say how certain each voxel is, which published grids do not."""
-ALWAYS = ("valid", "sequence", "frame")
-RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
 _STACKS = frozenset({"occupancy", "density", "visibility"})
 _OF_SCAN = {
     "points": "points",
@@ -119,13 +104,13 @@ class Dataset(_MapStyle):
         align: bool = True,
         inferred: bool = True,
         min_confidence: float = 0.0,
-        transform: Callable[[Sample], Sample] | None = None,
+        transform: Callable[[Sample], Mapping[str, object]] | None = None,
     ) -> None:
         """Find the frames. No scan and no grid is read.
 
         Args:
             source: anything that `carlasc.open` takes, or a Source.
-            split: "train", "val" or "test" in any case, or names of sequences; None takes all sequences.
+            split: "train", "val" or "test" in any case, the name of a sequence, or a list of such names; None takes all sequences.
             history: T, number of scans in a stack, the frame's own scan included.
             coordinates: coordinates of the grids: "cartesian" or "cylindrical"; ignored if `grid` is a GridSpec. Scans, poses and
                 times are read from the sequence's folder of that name if it has scans, else from `cartesian/`.
@@ -198,20 +183,27 @@ class Dataset(_MapStyle):
     def __len__(self) -> int:
         return int(self._starts[-1])
 
-    def __getitem__(self, index: SupportsIndex) -> Sample:
-        """Return one sample; a negative index counts from the end.
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> Self: ...
+    def __getitem__(self, index: SupportsIndex | slice) -> Sample | Self:
+        """Return one sample; a negative index counts from the end. A slice gives a Dataset of these samples.
 
         Raises:
             IndexError: the index is beyond the end.
+            ArgumentError: a slice with a step below 0: samples are in the order of their frames.
             FormatError: a file does not hold what it must; names the file.
         """
+        if isinstance(index, slice):
+            return self._part_of(range(len(self))[index])
         place = operator.index(index)
         if not -len(self) <= place < len(self):
             raise IndexError(f"sample {place} is out of range: there are {len(self)} samples")
         part, frame = self._frame_at(place % len(self))
         past = part.history(frame, self.history)
 
-        sample: Sample = {}
+        sample: Values = {}
         if self._needs_poses:
             sample["poses"] = part.current_T_past(frame, past)
         if self._asks(_STACKS):
@@ -222,8 +214,21 @@ class Dataset(_MapStyle):
             sample |= self._scan(part, frame)
         sample["valid"] = np.array([number is not None for number in past])
         sample |= {"sequence": part.scans.name, "frame": frame}
-        sample = {name: sample[name] for name in (*self.fields, *ALWAYS)}
-        return sample if self.transform is None else self.transform(sample)
+        made = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
+        return made if self.transform is None else cast(Sample, self.transform(made))
+
+    def _part_of(self, places: range) -> Self:
+        """Return the data set of some of the samples."""
+        if places.step < 0:
+            raise ArgumentError("index", expected="a slice with a step of 1 or more", found=str(places.step))
+        part = copy.copy(self)
+        ends = zip(self._starts[:-1].tolist(), self._starts[1:].tolist(), self._parts, strict=True)
+        part._parts = [
+            replace(whole, frames=whole.frames[[place - start for place in places if start <= place < end]])
+            for start, end, whole in ends
+        ]
+        part._starts = np.cumsum([0, *(len(chosen.frames) for chosen in part._parts)])
+        return part
 
     @property
     def frames(self) -> tuple[NDArray[np.int64], ...]:
@@ -263,7 +268,21 @@ class Dataset(_MapStyle):
         )
 
     def __repr__(self) -> str:
-        return f"<Dataset of {len(self)} frames in {len(self._parts)} sequences: {', '.join(self.fields)}>"
+        return f"<Dataset of {count(len(self), 'frame')} in {count(len(self._parts), 'sequence')}: {', '.join(self.fields)}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: what the samples hold, and the first one from above."""
+        rows = {
+            "fields": ", ".join(self.fields),
+            "history": self.history,
+            "grid": self._spec,
+            "classes": self.classes.name,
+        }
+        picture = None
+        if self._spec is not None and "labels" in self.fields and len(self):
+            labels = self[0]["labels"]
+            picture = self._spec.seen_from_above(labels, self.classes.palette, left_handed=self.axes == "left")
+        return describe(repr(self), rows, picture)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the decoded scans: each process keeps its own."""
@@ -316,14 +335,14 @@ class Dataset(_MapStyle):
         which = int(np.searchsorted(self._starts, place, side="right")) - 1
         return self._parts[which], int(self._parts[which].frames[place - self._starts[which]])
 
-    def _stacks(self, part: SequenceFrames, past: list[int | None], poses: NDArray[np.float64] | None) -> Sample:
+    def _stacks(self, part: SequenceFrames, past: list[int | None], poses: NDArray[np.float64] | None) -> Values:
         from carlasc.dataset.stacking import stack_scans
 
         spec = self.spec
         moves = poses if self.align and poses is not None else np.tile(np.eye(4), (self.history, 1, 1))
         scans = self._recent.read(part.scans, past)
         ranges = (part.scans.metadata.min_range_m, part.scans.metadata.max_range_m)
-        stacks: Sample = {}
+        stacks: Values = {}
         if "density" in self.fields:
             stacks["density"] = stack_scans(scans, moves, spec, "density", *ranges)
         if "visibility" in self.fields:
@@ -341,8 +360,8 @@ class Dataset(_MapStyle):
             )
         return stacks
 
-    def _scan(self, part: SequenceFrames, frame: int) -> Sample:
-        sample: Sample = {}
+    def _scan(self, part: SequenceFrames, frame: int) -> Values:
+        sample: Values = {}
         if "points" in self.fields:
             (points,) = self._recent.read(part.scans, [frame])
             sample["points"] = np.array(points[:, :3] if points is not None else (), np.float32, order="C")
@@ -358,22 +377,6 @@ class Dataset(_MapStyle):
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
             raise FormatError(f"{part.scans.location}: frame {frame}", expected="the same number of each", found=found)
         return sample
-
-
-def collate(samples: list[Sample]) -> dict[str, Any]:
-    """Return a batch of samples that may hold fields with one row per point. Give it to a DataLoader as `collate_fn`.
-
-    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, one per sample. All other fields are stacked as torch's
-    default_collate does.
-
-    Raises:
-        DependencyError: torch is not installed.
-    """
-    torch = import_extra("torch", "torch")
-    dense = [{name: value for name, value in sample.items() if name not in RAGGED} for sample in samples]
-    batch: dict[str, Any] = import_extra("torch.utils.data", "torch").default_collate(dense)
-    ragged = {name: [torch.from_numpy(sample[name]) for sample in samples] for name in samples[0] if name in RAGGED}
-    return {name: ragged[name] if name in ragged else batch[name] for name in samples[0]}
 
 
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:

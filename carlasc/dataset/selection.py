@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.frames import compact, expand
 from carlasc.core.grids import Coordinates, GridSpec
+from carlasc.core.notebook import first_names
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
@@ -103,7 +104,7 @@ def choose_sequences(source: Source, split: str | Iterable[str] | None, coordina
     """Return the sequences of a split, or those with the given names, in the order of the source. Scans are read from them.
 
     Raises:
-        ArgumentError: `split` is neither one of the splits nor a list of names.
+        ArgumentError: `split` is neither one of the splits nor the name of a sequence, nor a list of names.
         MissingDataError: no sequence has that split or name.
     """
     groups = _groups(source)
@@ -232,13 +233,14 @@ def _with_scans(group: dict[str, Sequence], coordinates: Coordinates) -> Sequenc
 def _match(source: Source, groups: Mapping[_Key, object], split: str | Iterable[str] | None) -> list[_Key]:
     if split is None:
         return list(groups)
-    if isinstance(split, str):
-        if split.lower() not in map(str.lower, layout.SPLITS):
-            raise ArgumentError(
-                "split",
-                expected=f"{', '.join(layout.SPLITS)} in any case, or a list of names of sequences",
-                found=repr(split),
+    if isinstance(split, str) and split.lower() not in map(str.lower, layout.SPLITS):
+        if not any(split in _names(key) for key in groups):
+            expected = (
+                f"{', '.join(layout.SPLITS)} in any case, or one or more of {first_names(key[1] for key in groups)}"
             )
+            raise ArgumentError("split", expected=expected, found=repr(split))
+        split = [split]
+    if isinstance(split, str):
         chosen = [key for key in groups if (key[0] or "").lower() == split.lower()]
         if not chosen:
             existing = ", ".join(sorted({key[0] or "none" for key in groups}))

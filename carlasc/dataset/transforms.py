@@ -7,15 +7,14 @@ import multiprocessing
 import zlib
 from collections.abc import Callable, Iterable
 from multiprocessing.context import get_spawning_popen
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
+from carlasc.dataset.fields import Sample, Values
 from carlasc.errors import ArgumentError
-
-Sample = dict[str, Any]  # what `Dataset` gives: see there
 
 _DIRECTIONS = ("x", "y")
 _TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, which is off by 9e-8
@@ -102,20 +101,20 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
     Raises:
         ArgumentError: the grid is not symmetric in this direction.
     """
-    column = _DIRECTIONS.index(direction)
-    flipped = dict(sample)
+    column, given = _DIRECTIONS.index(direction), cast(Values, sample)
+    flipped = dict(given)
     if spec is not None:
         _check_symmetric(spec, direction)
-        for name in _FIRST_GRID_AXIS.keys() & sample.keys():
-            flipped[name] = _flip_grid(sample[name], _FIRST_GRID_AXIS[name], column, spec)
-    for name in {"points", "flow"} & sample.keys():
-        flipped[name] = sample[name].copy()
+        for name in _FIRST_GRID_AXIS.keys() & given.keys():
+            flipped[name] = _flip_grid(given[name], _FIRST_GRID_AXIS[name], column, spec)
+    for name in {"points", "flow"} & given.keys():
+        flipped[name] = given[name].copy()
         flipped[name][:, column] *= -1
     if "poses" in sample:
         mirror = np.eye(4)
         mirror[column, column] = -1
         flipped["poses"] = mirror @ sample["poses"] @ mirror
-    return flipped
+    return cast(Sample, flipped)
 
 
 def _flip_grid(grid: NDArray[Any], first: int, column: int, spec: GridSpec) -> NDArray[Any]:

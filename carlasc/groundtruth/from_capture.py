@@ -104,8 +104,8 @@ class CaptureSequence(SequenceInput):
 
         An open end of the range stays open, so that a run continues after the capture has grown.
         """
-        first, last = self.frames[0].source_frame, self.frames[-1].source_frame
-        frames = f"{first}:" if self.plan.frames.stop is None else f"{first}:{last + 1}"
+        asked, first, last = self.plan.frames, self.frames[0].source_frame, self.frames[-1].source_frame
+        frames = f"{first}:" if asked.stop is None else f"{first}:{last + 1}" if asked.only is None else str(asked)
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 

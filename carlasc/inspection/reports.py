@@ -24,8 +24,9 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import write_output
 from carlasc.storage.folder import FolderSequence
-from carlasc.storage.protocol import ChosenSequences, Sequence, Source
+from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
+from carlasc.storage.views import ChosenSequences
 
 _MOST_LEFT_OUT = 20  # scans that are left out of a long sequence for its held-out scores
 

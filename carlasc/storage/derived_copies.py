@@ -26,10 +26,11 @@ from carlasc.storage.files import to_json, write_atomic
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.packed.output import remove
-from carlasc.storage.protocol import ChosenSequences, Sequence, SequenceView, Source
+from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 from carlasc.storage.transport.trees import is_url
 from carlasc.storage.unpacking import UnpackResult, unpack
+from carlasc.storage.views import ChosenSequences, SequenceView
 
 
 @dataclass

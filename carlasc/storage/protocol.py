@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import ItemsView, Iterable, Iterator, Mapping, ValuesView
 from functools import cached_property
-from pathlib import PurePosixPath
 from typing import Any, Protocol, Self, cast
 
 import numpy as np
@@ -22,9 +21,10 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
+from carlasc.core.notebook import describe, first_names
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, MissingKeyError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.metadata import Metadata, check_format
@@ -51,6 +51,8 @@ class FileTree(Protocol):
 
 class Sequence(ABC):
     """One `<split>/<sequence>/<coordinates>`: fields and frames, read one at a time.
+
+    It is a collection of frame numbers: `for frame in sequence`, `frame in sequence` and `len(sequence)` are about `scan_frames()`.
 
     Attributes:
         path: path of the sequence in its Source, such as "Train/Town01_Light/cartesian", which is unique there; "" if the Source is
@@ -310,54 +312,41 @@ class Sequence(ABC):
         except FormatError as error:
             raise error.within(f"{self.location}: frame {frame}") from error
 
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.scan_frames().tolist())
+
+    def __len__(self) -> int:
+        return len(self.scan_frames())
+
+    def __contains__(self, frame: object) -> bool:
+        return frame in self.scan_frames().tolist()
+
+    def __bool__(self) -> bool:
+        return True  # a sequence without frames is a sequence
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: what the sequence has, and its first grid from above."""
+        fields = ", ".join(sorted(field for field in self.fields() if "/" not in field))
+        rows = {"frames": len(self), "fields": fields} | {f"grid {name}": spec for name, spec in self.grids.items()}
+        picture, name = None, next(iter(self.grids), "")
+        if f"{name}/labels" in self.fields():
+            first, palette = self.frames(f"{name}/labels").tolist()[0], self.classes_of(name).palette
+            labels, left_handed = self.read(f"{name}/labels", first), self.metadata.axes == "left"
+            picture = self.grids[name].seen_from_above(labels, palette, left_handed=left_handed)
+        return describe(self.location, rows, picture)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what another process can read again faster than it is sent."""
         return {name: value for name, value in self.__dict__.items() if name not in ("poses", "times", "_frame_lines")}
 
 
-class SequenceView(Sequence):
-    """A sequence that shows another one, as far as a subclass does not change what it shows.
+class Source(Mapping[str, Sequence]):
+    """A store that sequences are read from: a mapping of their paths to them, in sorted order.
 
-    Attributes:
-        whole: the other sequence.
-    """
-
-    def __init__(self, whole: Sequence) -> None:
-        self.whole = whole
-        self.path, self.location = whole.path, whole.location
-        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
-        self._given_poses = whole._given_poses
-
-    def fields(self) -> frozenset[str]:
-        """Return the fields of the whole sequence."""
-        return self.whole.fields()
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field of the whole sequence."""
-        return self.whole.frames(field)
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame of the whole sequence."""
-        return self.whole.read(field, frame)
-
-    def documents(self) -> tuple[str, ...]:
-        """Return the text files of the whole sequence."""
-        return self.whole.documents()
-
-    def read_document(self, name: str) -> bytes:
-        """Return the bytes of a text file of the whole sequence."""
-        return self.whole.read_document(name)
-
-    def line_of(self, frame: int, lines: int, document: str) -> int:
-        """Return the line of a text file that belongs to a frame: the one in the whole sequence."""
-        return self.whole.line_of(frame, lines, document)
-
-
-class Source(ABC):
-    """A store that sequences are read from.
+    `source["Train/Town01_Light"]` finds a sequence by its path. The path may lack the coordinates, if they are Cartesian or the sequence has no others.
 
     Attributes:
         location: name of the source in errors: a folder, a file or a URL.
@@ -369,29 +358,36 @@ class Source(ABC):
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences by path, in sorted order."""
 
+    def __getitem__(self, path: str) -> Sequence:
+        """Return a sequence by its path.
+
+        Raises:
+            MissingKeyError: there is none; it is also a KeyError.
+        """
+        sequences = self.sequences()
+        for name in (path, *(f"{path}/{coordinates}" for coordinates in layout.COORDINATES)):
+            if name in sequences:
+                return sequences[name]
+        raise MissingKeyError(self.location, expected=f"the sequence {path}", found=first_names(sequences))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.sequences())
+
+    def __len__(self) -> int:
+        return len(self.sequences())
+
+    def values(self) -> ValuesView[Sequence]:
+        """Return the sequences. The store is listed once."""
+        return self.sequences().values()
+
+    def items(self) -> ItemsView[str, Sequence]:
+        """Return the paths and the sequences. The store is listed once."""
+        return self.sequences().items()
+
+    def __bool__(self) -> bool:
+        return True  # a store without sequences is a store
+
+    __eq__, __hash__ = object.__eq__, object.__hash__  # two sources are equal if they are one: nothing is read
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
-
-
-class ChosenSequences(Source):
-    """Some of the sequences of a source, or others in their place."""
-
-    def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
-        self.location, self.chosen = location, sequences
-
-    def sequences(self) -> Mapping[str, Sequence]:
-        """Return the sequences."""
-        return self.chosen
-
-
-def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
-    """Return the split, the name and the coordinates of a sequence from its path.
-
-    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be missing. If the last part is not the
-    name of coordinates, it is the name of the sequence, whose coordinates are then Cartesian.
-    """
-    parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("/", ".")]
-    coordinates = parts.pop() if parts and parts[-1] in layout.COORDINATES else "cartesian"
-    name = parts.pop() if parts else ""
-    split = next((split for split in layout.SPLITS if parts and parts[-1].lower() == split.lower()), None)
-    return split, name, cast(Coordinates, coordinates)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from carlasc.core.frames import compact, expand
 from carlasc.errors import MissingDataError
 from carlasc.storage import layout
-from carlasc.storage.protocol import Sequence, Source, identity_of
+from carlasc.storage.naming import identity_of
+from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.transport.trees import Tree
 
 _DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them, as some zips have it

@@ -15,6 +15,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.notebook import first_names
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES, remaps_between, to_table
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
@@ -84,7 +85,7 @@ def find_truth(truth: SceneSource, prediction: Sequence) -> FoundSequence:
         raise MissingDataError(
             source.location,
             expected=f"the sequence {prediction.name} ({prediction.coordinates})",
-            found=_shorten(sequences),
+            found=first_names(sequences),
             advice="give the folder of the sequence",
         )
     return FoundSequence(match)
@@ -130,13 +131,8 @@ def _choose_sequence(source: Source, name: str | None) -> FoundSequence:
     same_name = (sequence for sequence in sequences.values() if sequence.name == name)
     match = sequences.get(name) or next(same_name, None)
     if match is None:
-        raise MissingDataError(source.location, expected=f"the sequence {name}", found=_shorten(sequences))
+        raise MissingDataError(source.location, expected=f"the sequence {name}", found=first_names(sequences))
     return FoundSequence(match)
-
-
-def _shorten(names: Iterable[str]) -> str:
-    names = list(names)
-    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
 
 
 def table_of(classes: ClassTable | str | None) -> ClassTable | None:

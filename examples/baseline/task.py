@@ -48,7 +48,7 @@ class Seen(Task):
     def prepare(self, batch: Batch, device: torch.device, draw: torch.Generator | None = None) -> Batch:
         """Return the batch on the device."""
         (name,) = self.fields
-        return batch | {name: batch[name].to(device, non_blocking=True)}
+        return {**batch} | {name: batch[name].to(device, non_blocking=True)}
 
     def arguments(self, batch: Batch, dtype: torch.dtype = torch.float32) -> tuple[Any, ...]:
         """Return the stack."""

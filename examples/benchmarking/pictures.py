@@ -76,7 +76,7 @@ def draw_scene(rows: Sequence[Row], scenes: Scenes, folder: Path, path: Path) ->
     phantoms = [_count_phantoms(networks[0], sample) for sample in samples]
     sample = samples[int(np.argsort(phantoms, kind="stable")[len(samples) // 2])]
     grids = {f"trained on {row.name}": _complete(network, sample) for row, network in zip(rows, networks, strict=True)}
-    grids["capture truth"] = sample["labels"]
+    grids["capture truth"] = sample["labels"].astype(np.int64)
     colors, seen = ClassColors(CARLASC11), sample["known"]
     panels = [
         Panel(grid_drawing(Grid(scenes.spec, np.where(seen, labels, 0).astype(np.uint8)), colors), title=title)

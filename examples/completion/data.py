@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -19,6 +19,7 @@ from torch.utils.data import Dataset as TorchDataset
 
 from carlasc import Dataset, Flip, ShardSampler, Source, collate
 from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS, Remap
+from carlasc.dataset import Sample
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics import CONVENTIONS
 from completion.config import Config
@@ -26,7 +27,7 @@ from completion.losses import FREE, IGNORE
 from completion.networks import KINDS
 from completion.tasks import WEIGHTINGS
 
-Sample = dict[str, Any]
+Values = Mapping[str, Any]  # a sample, or a batch of samples
 
 
 class ShuffleHistory:
@@ -35,24 +36,24 @@ class ShuffleHistory:
     def __init__(self, seed: int) -> None:
         self.seed = seed
 
-    def __call__(self, sample: Sample) -> Sample:
+    def __call__(self, sample: Values) -> Values:
         """Return the sample with its history shuffled."""
         last = len(sample["valid"]) - 1
         order = [*np.random.default_rng([self.seed, sample["frame"]]).permutation(last), last]
-        return sample | {name: sample[name][order] for name in ("occupancy", "visibility") if name in sample}
+        return {**sample} | {name: sample[name][order] for name in ("occupancy", "visibility") if name in sample}
 
 
 class SemanticKittiRule:
     """Maps SemanticKITTI's ids to the classes of the benchmark. Voxels of ignored classes become unknown, points of them class 0."""
 
-    def __call__(self, sample: Sample) -> Sample:
+    def __call__(self, sample: Values) -> Values:
         """Return the sample in the benchmark's classes."""
         labels, counted = _benchmark_classes(sample["labels"])
         mapped = {"labels": labels, "known": sample["known"] & counted}
         if "point_labels" in sample:
             labels, counted = _benchmark_classes(sample["point_labels"])
             mapped["point_labels"] = np.where(counted, labels, FREE).astype(np.uint8)
-        return sample | mapped
+        return {**sample} | mapped
 
 
 def _benchmark_classes(raw: NDArray[np.unsignedinteger]) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
@@ -67,7 +68,7 @@ class Compose:
     def __init__(self, *transforms: Any) -> None:
         self.transforms = transforms
 
-    def __call__(self, sample: Sample) -> Sample:
+    def __call__(self, sample: Values) -> Values:
         """Return the sample after all of them."""
         for transform in self.transforms:
             sample = transform(sample)
@@ -146,7 +147,7 @@ class EpochSampler(DistributedSampler[int]):
         self.epoch, self._trained = state["epoch"], state["position"]
 
 
-class Kept(TorchDataset[Sample]):
+class Kept(TorchDataset[Values]):
     """Keeps the samples of a data set in memory, as they are before they are transformed."""
 
     def __init__(self, data: Dataset) -> None:
@@ -157,7 +158,7 @@ class Kept(TorchDataset[Sample]):
     def __len__(self) -> int:
         return len(self.data)
 
-    def __getitem__(self, index: int) -> Sample:
+    def __getitem__(self, index: int) -> Values:
         """Return a sample; it is read once."""
         if index not in self._samples:
             self._samples[index] = self.data[index]
@@ -216,14 +217,14 @@ def _share_files(data: Dataset) -> bool:
     return any(before and before == after for before, after in pairwise(files))
 
 
-def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Sample]:
+def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Values]:
     """Return a loader that gives each sample once, in order. Each process takes every `world`-th sample."""
     samples: Any = Kept(data) if config.keep_samples else data
     mine: Any = samples if world == 1 else Subset(samples, range(rank, len(data), world))
     return _loader(mine, config, max(1, config.batch_size // world))
 
 
-def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataLoader[Sample]:
+def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataLoader[Values]:
     return DataLoader(
         data,
         batch_size,
@@ -235,13 +236,13 @@ def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataL
     )
 
 
-def target_of(batch: Sample, device: torch.device) -> Tensor:
+def target_of(batch: Values, device: torch.device) -> Tensor:
     """Return a batch's target (B, X, Y, Z) int64, `IGNORE` where unknown."""
     labels = batch["labels"].to(device, non_blocking=True).long()
     return labels.masked_fill(~batch["known"].to(device, non_blocking=True), IGNORE)
 
 
-def soft_target(batch: Sample, target: Tensor) -> Tensor:
+def soft_target(batch: Values, target: Tensor) -> Tensor:
     """Return a batch's soft target (B, K, X, Y, Z) float32: the probability of each class, zeros where `target` is `IGNORE`."""
     posterior = batch["posterior"].to(target.device, non_blocking=True)
     return posterior.masked_fill((target == IGNORE).unsqueeze(1), 0)

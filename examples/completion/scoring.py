@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from completion.tasks import Batch, task_of
 
 @torch.no_grad()
 def score_with_certainty(
-    network: nn.Module, loader: DataLoader[dict[str, Any]], num_classes: int, processes: Processes
+    network: nn.Module, loader: DataLoader[Mapping[str, Any]], num_classes: int, processes: Processes
 ) -> tuple[ConfusionMatrix, Uncertainty]:
     """Return the confusion matrix of a network over the known voxels of a split, and how well its probabilities are calibrated."""
     network.eval()
@@ -39,7 +40,11 @@ def score_with_certainty(
 
 @torch.no_grad()
 def score(
-    network: nn.Module, loader: DataLoader[dict[str, Any]], num_classes: int, processes: Processes, bf16: bool = False
+    network: nn.Module,
+    loader: DataLoader[Mapping[str, Any]],
+    num_classes: int,
+    processes: Processes,
+    bf16: bool = False,
 ) -> ConfusionMatrix:
     """Return the confusion matrix of a network over the known voxels of a split, summed over all processes."""
     network.eval()

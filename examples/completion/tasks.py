@@ -14,7 +14,7 @@ from carlasc import GridSpec
 from carlasc.core import class_weights
 from completion.losses import completion_loss
 
-Batch = dict[str, Any]
+Batch = Mapping[str, Any]
 
 
 def root_weights(counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
@@ -65,7 +65,7 @@ class Task:
             device: the device of the network.
             draw: random generator of the CPU for augmentations. None does not augment.
         """
-        return batch | {"occupancy": batch["occupancy"].to(device, non_blocking=True)}
+        return {**batch} | {"occupancy": batch["occupancy"].to(device, non_blocking=True)}
 
     def arguments(self, batch: Batch, dtype: torch.dtype = torch.float32) -> tuple[Any, ...]:
         """Return the arguments of the network for a prepared batch; occupancy in the dtype."""

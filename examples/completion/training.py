@@ -6,7 +6,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -233,7 +233,7 @@ def _train_epoch(
 def _train_step(
     networks: tuple[nn.Module, nn.Module],
     optimizer: torch.optim.Optimizer,
-    batch: dict[str, Any],
+    batch: Mapping[str, Any],
     class_weights: Tensor,
     place: tuple[int, int],
     config: Config,

@@ -63,7 +63,7 @@ class PointsAndVoxels(Task):
         Raises:
             ArgumentError: a scan has no points, or values that are not finite, or no remission if it needs one; names the frame.
         """
-        prepared = batch | {"points": [], "cells": [], "point_labels": []}
+        prepared = {**batch} | {"points": [], "cells": [], "point_labels": []}
         for i, xyz in enumerate(batch["points"]):
             scan = pad(xyz, (0, 1))
             if "remission" in self.fields:

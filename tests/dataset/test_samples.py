@@ -375,7 +375,10 @@ def test_constructing_prints_nothing_and_loads_neither_torch_nor_numba(world):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"split": "training"}, "split: expected Train, Val, Test in any case, or a list .*, found 'training'"),
+        (
+            {"split": "training"},
+            "split: expected Train, Val, Test in any case, or one or more of Town01_Light, .*, found 'training'",
+        ),
         ({"fields": ("occupancy", "label")}, "fields: expected any of occupancy, .*, found 'label'"),
         ({"fields": ()}, "fields: expected at least one"),
         ({"history": 0}, "history: expected a number of scans of 1 or more, found 0"),

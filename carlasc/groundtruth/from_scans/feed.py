@@ -35,8 +35,9 @@ from carlasc.motion import (
 )
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
-from carlasc.storage.protocol import Sequence, SequenceView
+from carlasc.storage.protocol import Sequence
 from carlasc.storage.resuming import scans_digest
+from carlasc.storage.views import SequenceView
 
 _SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground

@@ -17,8 +17,9 @@ from carlasc.inspection.statistics import Histogram, Statistics, stats
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.packed.stores import PackedSource
-from carlasc.storage.protocol import ChosenSequences, Source
 from carlasc.storage.protocol import Sequence as StoredSequence
+from carlasc.storage.protocol import Source
+from carlasc.storage.views import ChosenSequences
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import leads_outside
+from carlasc.storage.naming import identity_of
 from carlasc.storage.packed.output import unfinished_error
-from carlasc.storage.protocol import Sequence, Source, identity_of
+from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter, Sink
 
 VERSION = 3  # of the format in docs/storage.md, the same for all packed stores

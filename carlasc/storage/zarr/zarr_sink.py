@@ -16,10 +16,10 @@ from carlasc.core.grids import Coordinates
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
+from carlasc.storage.naming import identity_of
 from carlasc.storage.packed.array_layout import SEQUENCE, document_node, field_node, typical_size
 from carlasc.storage.packed.chunks import in_threads
 from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of
-from carlasc.storage.protocol import identity_of
 from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame

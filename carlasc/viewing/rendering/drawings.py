@@ -97,7 +97,7 @@ def scan_extent(scan: Scan) -> Extent:
 
 
 def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawing:
-    """Return the occupied voxels of a grid, without free and unknown ones.
+    """Return the occupied voxels of a grid, without free and unknown ones: coloured by class; by height if all have the same class.
 
     Args:
         grid: the grid.
@@ -110,13 +110,18 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
     colors.table.check(grid.labels, "grid labels")
     occupied = grid.labels > 0
     ids = np.flatnonzero(np.bincount(grid.labels.reshape(-1), minlength=1))
-    if colors.palette == "height":
+    if colors.palette == "height" or _is_one_class(ids):
         low, high = grid.spec.lower[2], grid.spec.upper[2]
         layers = palette.height_colors(grid.spec.centers()[0, 0, :, 2], low, high)
         voxel_colors, legend = np.broadcast_to(layers, (*grid.spec.size, 3)), palette.height_entries(low, high)
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
     return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
+
+
+def _is_one_class(ids: NDArray[np.int64]) -> bool:
+    """Whether no more than one of the (K,) ids that occur is a class: colours of classes show nothing then."""
+    return len(ids) > 0 and len(ids[ids > 0]) <= 1
 
 
 def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
@@ -138,7 +143,7 @@ def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing
 
 
 def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
-    """Return the points of a scan, coloured by class; by height if there are no labels or the palette is "height".
+    """Return the points of a scan, coloured by class; by height if there are no labels, one label, or the palette is "height".
 
     Args:
         scan: the scan.
@@ -151,7 +156,8 @@ def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
     """
     points = without_invalid_points(scan)
     extent = scan_extent(points) if extent is None else extent
-    if colors.palette == "height" or points.labels is None:
+    ids = np.zeros(0, np.int64) if points.labels is None else np.flatnonzero(np.bincount(points.labels))
+    if colors.palette == "height" or points.labels is None or _is_one_class(ids):
         low, high = float(extent[:, 2].min()), float(extent[:, 2].max())
         point_colors = palette.height_colors(points.points[:, 2], low, high)
         legend = palette.height_entries(low, high)
@@ -159,9 +165,8 @@ def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
         colors.table.check(points.labels, "scan labels")
         by_id = colors.by_id.copy()
         by_id[0] = palette.UNLABELLED
-        ids = np.flatnonzero(np.bincount(points.labels, minlength=1)).tolist()
         unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
-        point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids)
+        point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids.tolist())
     note = None if len(points) else "the scan has no point"
     return Drawing(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
 

@@ -1,0 +1,49 @@
+"""How objects show themselves: in words, and in notebooks as a table with a small picture."""
+
+from __future__ import annotations
+
+import base64
+import html
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def describe(title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] | None = None) -> str:
+    """Return HTML: a title, a table, and a picture, (H, W, 3) RGB, where there is one."""
+    lines = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(str(value))}</td></tr>"
+        for name, value in rows.items()
+    )
+    image = "" if picture is None else f"<img alt='seen from above' src='data:image/png;base64,{_png(picture)}'>"
+    return f"<div><b>{html.escape(title)}</b><table>{lines}</table>{image}</div>"
+
+
+def count(number: int, noun: str, plural: str = "") -> str:
+    """Return "1 frame", "2 frames"."""
+    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
+
+
+def first_names(names: Iterable[str], most: int = 8) -> str:
+    """Return names separated by commas, without those after the first few."""
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _png(rgb: NDArray[np.uint8]) -> str:
+    """Return an (H, W, 3) picture as a PNG file in base64: Pillow is an extra, and a picture this small needs no filter."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width, _ = rgb.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in rgb)
+    parts = (
+        (b"IHDR", struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(rows)),
+        (b"IEND", b""),
+    )
+    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)).decode()

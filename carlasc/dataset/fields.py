@@ -1,0 +1,74 @@
+"""The fields of a sample: their names, their types, and how they become those of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.errors import import_extra
+
+FIELDS = (
+    "occupancy",
+    "density",
+    "visibility",
+    "labels",
+    "known",
+    "counts",
+    "points",
+    "point_labels",
+    "flow",
+    "remission",
+    "poses",
+)
+"""Fields that samples of published data may have."""
+EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
+"""Fields of grids that say how certain each voxel is, which published grids do not."""
+ALWAYS = ("valid", "sequence", "frame")
+RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
+
+
+class Sample(TypedDict, total=False):
+    """What `Dataset` gives: the fields that were asked for, and `valid`, `sequence` and `frame`. Shapes and units: see `Dataset`."""
+
+    occupancy: NDArray[np.uint8]
+    density: NDArray[np.uint16]
+    visibility: NDArray[np.uint8]
+    labels: NDArray[np.unsignedinteger[Any]]
+    known: NDArray[np.bool_]
+    counts: NDArray[np.float32]
+    posterior: NDArray[np.float32]
+    occupied: NDArray[np.float32]
+    flags: NDArray[np.uint8]
+    views: NDArray[np.uint16]
+    points: NDArray[np.float32]
+    point_labels: NDArray[np.unsignedinteger[Any]]
+    flow: NDArray[np.float32]
+    remission: NDArray[np.float32]
+    poses: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    sequence: str
+    frame: int
+
+
+Values = dict[str, Any]
+"""Some fields of a sample, by names that are known at run time only."""
+
+
+def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
+    """Return a batch of samples that may hold fields with one row per point. Give it to a DataLoader as `collate_fn`.
+
+    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, one per sample. All other fields are stacked as torch's
+    default_collate does.
+
+    Raises:
+        DependencyError: torch is not installed.
+    """
+    torch = import_extra("torch", "torch")
+    given: list[Values] = [dict(sample) for sample in samples]
+    dense = [{name: value for name, value in sample.items() if name not in RAGGED} for sample in given]
+    batch: dict[str, Any] = import_extra("torch.utils.data", "torch").default_collate(dense)
+    ragged = {name: [torch.from_numpy(sample[name]) for sample in given] for name in given[0] if name in RAGGED}
+    return {name: ragged[name] if name in ragged else batch[name] for name in given[0]}

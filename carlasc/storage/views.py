@@ -1,0 +1,60 @@
+"""Sequences that show others, and sources that hold some of the sequences of others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.storage.protocol import Sequence, Source
+
+
+class SequenceView(Sequence):
+    """A sequence that shows another one, as far as a subclass does not change what it shows.
+
+    Attributes:
+        whole: the other sequence.
+    """
+
+    def __init__(self, whole: Sequence) -> None:
+        self.whole = whole
+        self.path, self.location = whole.path, whole.location
+        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
+        self._given_poses = whole._given_poses
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields of the whole sequence."""
+        return self.whole.fields()
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field of the whole sequence."""
+        return self.whole.frames(field)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame of the whole sequence."""
+        return self.whole.read(field, frame)
+
+    def documents(self) -> tuple[str, ...]:
+        """Return the text files of the whole sequence."""
+        return self.whole.documents()
+
+    def read_document(self, name: str) -> bytes:
+        """Return the bytes of a text file of the whole sequence."""
+        return self.whole.read_document(name)
+
+    def line_of(self, frame: int, lines: int, document: str) -> int:
+        """Return the line of a text file that belongs to a frame: the one in the whole sequence."""
+        return self.whole.line_of(frame, lines, document)
+
+
+class ChosenSequences(Source):
+    """Some of the sequences of a source, or others in their place."""
+
+    def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
+        self.location, self.chosen = location, sequences
+
+    def sequences(self) -> Mapping[str, Sequence]:
+        """Return the sequences."""
+        return self.chosen
