@@ -23,7 +23,7 @@ Triple = tuple[float, float, float]
 _PI32 = float(np.float32(np.pi))  # a little above pi: an azimuth of exactly pi is inside the published bounds
 _SIDE = float(np.float32(25.6))
 _PIXELS = 200  # width and height of a small picture
-_DARKEST = 0.4  # brightness of the lowest layer in it; the highest has 1
+_DARKEST = (0.3, 0.8)  # brightness of its lowest layer, of heights and of classes; the highest has 1
 _PROPORTION = 128 * 0.234375  # azimuth cells times radial cell of the published cylindrical grid
 
 
@@ -255,7 +255,8 @@ class GridSpec:
         top = layers - 1 - np.argmax(occupied[:, :, ::-1], axis=2)
         highest = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
         colors = np.full((*highest.shape, 3), 255.0) if palette is None else palette[highest].astype(np.float64)
-        colors *= _DARKEST + (1 - _DARKEST) * top[:, :, None] / max(layers - 1, 1)
+        darkest = _DARKEST[palette is not None]
+        colors *= darkest + (1 - darkest) * top[:, :, None] / max(layers - 1, 1)
         colors[~occupied.any(axis=2)] = 255
         radius, steps = self.upper[0], (np.arange(_PIXELS) + 0.5) / _PIXELS
         ends = (
