@@ -83,7 +83,7 @@ TORCH := torch==2.13.0
 
 $(DEMO_VENV)/ready: pyproject.toml constraints.txt
 	$(call virtual_environment,$(DEMO_VENV))
-	$(DEMO_VENV)/bin/pip install --quiet --no-compile --constraint constraints.txt --editable '.[simulate,render]'
+	$(DEMO_VENV)/bin/pip install --quiet --no-compile --constraint constraints.txt --editable '.[demo]'
 	@touch $@
 
 # uv installs five times as fast as pip but does not read pip's settings, such as a mirror: where it fails, pip does the work.

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from carlasc.core.choices import Preset, TrafficLevel
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ConflictError
+from carlasc.errors import ConflictError, import_extra
 from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
@@ -25,8 +26,10 @@ Progress = Callable[[int, int], None]
 Step = Callable[[str], AbstractContextManager[Progress]]
 """Takes the name of a step, and returns a context manager that gives its progress callback."""
 
-SEQUENCE = Path("Train", "Demo_Heavy")
-"""The simulated sequence, relative to the folder of the demonstration."""
+TRAIN, VAL = Path("Train", "Demo_Heavy"), Path("Val", "Demo_Light")
+"""The simulated sequences, relative to the folder of the demonstration."""
+_MODULES = ("trimesh", "embreex", "PIL", "imageio_ffmpeg")  # what it needs, apart from what every installation has
+_VAL_SHARE = 5  # of the LiDARs, one in so many records the drive for validation
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class DemoResult:
     """What the demonstration made.
 
     Attributes:
-        sequence: folder of the simulated sequence, with its raw capture and its ground truth.
-        grids: folders of the grids.
+        sequences: folders of the simulated sequences, with their raw captures and their ground truth.
+        grids: folders of the grids of the first sequence.
         pictures: files of the pictures.
         page: file of the page, which opens in any browser.
         validation: result of validating everything.
@@ -43,7 +46,7 @@ class DemoResult:
         elapsed_s: duration, seconds.
     """
 
-    sequence: Path
+    sequences: tuple[Path, ...]
     grids: tuple[Path, ...]
     pictures: tuple[Path, ...]
     page: Path
@@ -55,21 +58,21 @@ class DemoResult:
 def demonstrate(
     out: str | os.PathLike[str],
     *,
-    count: int = 4,
+    count: int = 6,
     sensors: int = 20,
     seed: int = 0,
     step: Step | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> DemoResult:
-    """Simulate a short drive, make its ground truth in three grids, validate it, count its classes, and draw it.
+    """Simulate two short drives, make their ground truth in the published grids, validate them, count their classes, and draw them.
 
-    A second run with the same arguments makes only what is missing, and draws the pictures and the page again.
+    One drive is for training, one for validation. A second run with the same arguments makes only what is missing, and draws the pictures and the page again.
 
     Args:
         out: folder to write to.
-        count: number of frames.
-        sensors: number of LiDARs.
-        seed: seed of the simulated town.
+        count: number of frames of each drive. Stacks of five scans need five.
+        sensors: number of LiDARs of the drive for training; a fifth of them record the other one.
+        seed: seed of the simulated towns.
         step: called with the name of each step. Returns a context manager that gives the step's progress callback.
         run: how the work is spread; `step` is told of its progress.
 
@@ -79,7 +82,7 @@ def demonstrate(
     Raises:
         ArgumentError: an argument is out of its range.
         ConflictError: `out` holds something else.
-        DependencyError: a package of the extras `simulate` or `render` is missing. Nothing is written.
+        DependencyError: a package of the extra `demo` is missing. Nothing is written.
     """
     from carlasc.captures import simulate
     from carlasc.groundtruth import regrid
@@ -87,30 +90,30 @@ def demonstrate(
     from carlasc.inspection.validation import validate
     from carlasc.viewing import Scene, render, view
 
+    for module in _MODULES:
+        import_extra(module, "demo")
     start, out, step = time.perf_counter(), Path(out), step or _without_progress
-    sequence = out / SEQUENCE
-    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not sequence.is_dir())):
+    train, val = out / TRAIN, out / VAL
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not train.is_dir())):
         raise ConflictError(
             out, expected="an empty folder or an earlier demo", found="something else", advice="choose another folder"
         )
 
-    with step("simulate a town") as progress:
-        simulate(
-            sequence, count=count, sensors=sensors, seed=seed, traffic="heavy", run=replace(run, progress=progress)
-        )
+    drives: tuple[tuple[Path, int, TrafficLevel], ...] = (
+        (train, sensors, "heavy"),
+        (val, max(1, sensors // _VAL_SHARE), "light"),
+    )
+    for folder, own, traffic in drives:
+        with step(f"simulate a town, {folder.parent.name}") as progress:
+            spread = replace(run, progress=progress)
+            simulate(folder, count=count, sensors=own, seed=seed + (folder == val), traffic=traffic, run=spread)
     grids = []
-    published = GridSpec.published()
-    specs = {
-        "published coarse": published,
-        "0.2 m": published.with_resolution(0.2),
-        "cylindrical": GridSpec.published("cylindrical"),
-    }
-    for name, spec in specs.items():
-        with step(f"ground truth, {name}") as progress:
-            made = regrid(sequence, spec, run=replace(run, progress=progress))
+    for preset in get_args(Preset):
+        with step(f"ground truth, {preset}") as progress:
+            made = regrid(out, GridSpec.published(preset), run=replace(run, progress=progress))
             if made.failures:
                 raise ConflictError(made.failures[0].message)
-            grids += [Path(folder) for folder in made.grids]
+            grids += [Path(folder) for folder in made.grids if Path(folder).is_relative_to(train)]
     with step("check every file") as progress:
         validation = validate(out, every=1, run=Run(workers=1, progress=progress))
     with step("count classes") as progress:
@@ -126,7 +129,7 @@ def demonstrate(
     with step("write a page for a browser") as progress:
         view(Scene(grids[0]), page, overwrite=True, progress=progress)
     elapsed_s = time.perf_counter() - start
-    return DemoResult(sequence, tuple(grids), tuple(pictures), page, validation, statistics, elapsed_s)
+    return DemoResult((train, val), tuple(grids), tuple(pictures), page, validation, statistics, elapsed_s)
 
 
 def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, CameraOptions]]:

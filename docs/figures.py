@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import matplotlib as mpl
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from carlasc.captures import TownDrive
+from carlasc.core.choices import Preset
 from carlasc.core.geometry import relative_to
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, REMAPS
@@ -121,9 +122,9 @@ def draw_grids() -> bytes:
     """The published grids, coarse, fine and cylindrical, of one frame."""
     panels = [
         Panel(
-            grid_drawing(_ground_truth(GridSpec.published(name)), ClassColors(REMAPS["carlasc11"].target)), title=title
+            grid_drawing(_ground_truth(GridSpec.published(name)), ClassColors(REMAPS["carlasc11"].target)), title=name
         )
-        for name, title in (("cartesian", "coarse"), ("cartesian_fine", "fine"), ("cylindrical", "cylindrical"))
+        for name in get_args(Preset)
     ]
     return _png(draw_panels(panels, size=(1500, 470)))
 

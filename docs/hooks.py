@@ -23,6 +23,7 @@ from typer.models import ArgumentInfo, ParameterInfo
 from carlasc import cli
 from carlasc.cli.flags import flatten
 from carlasc.core.benchmarks import IGNORED, OCC3D, SSCBENCH, TO_OCC3D, TO_SSCBENCH
+from carlasc.core.choices import Preset
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI
@@ -135,8 +136,8 @@ def _layout() -> str:
 
 def _grids() -> str:
     rows = ["| grid | `--preset` | cells | lower bounds | upper bounds | cell |", "|---|---|---|---|---|---|"]
-    for preset, name in (("coarse", "cartesian"), ("fine", "cartesian_fine"), ("cylindrical", "cylindrical")):
-        spec = GridSpec.published(name)
+    for preset in get_args(Preset):
+        spec = GridSpec.published(preset)
         bounds = [", ".join(f"{value:.7g}" for value in side) for side in (spec.lower, spec.upper)]
         cell = " x ".join(f"{edge:.4g}" for edge in spec.voxel_size)
         rows.append(f"| {spec} | `{preset}` | {spec.num_voxels:,} | {bounds[0]} | {bounds[1]} | {cell} |")

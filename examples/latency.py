@@ -19,8 +19,8 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
     repetitions: Annotated[int, typer.Option(help="Number of timed calls, after a first one.", min=1)] = 100,
     grid: Annotated[
-        str, typer.Option(help="A published grid: cartesian, cartesian_fine or cylindrical.")
-    ] = "cartesian",
+        str, typer.Option(help="A published grid: coarse, fine or cylindrical.")
+    ] = "coarse",
     threads: Annotated[
         int | None, typer.Option(help="Number of threads on the CPU. Default: all cores.", min=1)
     ] = None,

@@ -26,7 +26,7 @@ def main(
     grid: Annotated[
         str,
         typer.Option(
-            help="Grid of the data whose geometry is predicted, or a published geometry: cartesian, cartesian_fine, cylindrical."
+            help="Grid of the data whose geometry is predicted, or a published geometry: coarse, fine, cylindrical."
         ),
     ] = "evaluation",
     frames: Annotated[str | None, typer.Option(help="Frames A:B (B not included), A:, :B, or one frame A.")] = None,
@@ -44,7 +44,7 @@ def main(
     own = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     mode: Mode = "eager" if eager else "compile"
     model = Model.read(weights, history)
-    geometry = GridSpec.published(grid) if grid in ("cartesian", "cartesian_fine", "cylindrical") else grid
+    geometry = GridSpec.published(grid) if grid in ("coarse", "fine", "cylindrical") else grid
     raw = Path(data).is_dir() and any(Path(data).glob("*.bin"))
     with progress_bar("Completing") as progress:
         if raw:

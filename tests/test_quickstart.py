@@ -35,7 +35,7 @@ def downloads(tmp_path, monkeypatch):
     """A folder with CarlaSC, eval_fine and eval_cylindrical in it: one short sequence; the current folder."""
     sequence = Path("Train") / "Town01_Light"
     write_drive(tmp_path / "CarlaSC" / sequence / "cartesian", range(4))
-    fine, cylindrical = GridSpec.published("cartesian_fine"), GridSpec.published("cylindrical")
+    fine, cylindrical = GridSpec.published("fine"), GridSpec.published("cylindrical")
     write_drive(tmp_path / "eval_fine" / sequence / "cartesian", [], grid_frames=range(4), spec=fine)
     write_drive(tmp_path / "eval_cylindrical" / sequence / "cylindrical", [], grid_frames=range(4), spec=cylindrical)
     monkeypatch.chdir(tmp_path)

@@ -99,7 +99,9 @@ def convert(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="NAME", help="The data set: kitti, argoverse2, ... (see --list). NAME --help shows its own options."
+            metavar="NAME",
+            help="The data set: kitti, argoverse2, ... (see --list). NAME --help shows its own options.",
+            autocompletion=carlasc.converting.converter_names,
         ),
     ],
     source: Annotated[Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")],

@@ -20,11 +20,13 @@ from carlasc.cli.validate import print_result
 def demo(
     work: WorkFlags,
     out: Annotated[Path, file_argument("Folder to write to.")] = Path("carlasc-demo"),
-    count: Annotated[int, typer.Option(help="Number of frames.", min=1)] = 4,
-    sensors: Annotated[int, typer.Option(help="Number of LiDARs.", min=1)] = 20,
+    count: Annotated[int, typer.Option(help="Number of frames of each drive.", min=1)] = 6,
+    sensors: Annotated[
+        int, typer.Option(help="Number of LiDARs; a fifth of them record the drive for validation.", min=1)
+    ] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
 ) -> None:
-    """Simulate a drive, make its ground truth in three grids, check it, and draw it in pictures and a page. This takes a minute or two."""
+    """Simulate two drives, for training and validation, make their ground truth in the published grids, check it, and draw it in pictures and a page. This takes a minute or two."""
     from carlasc.demo import demonstrate
 
     with work.spread("demo", shown=False) as run:
@@ -32,14 +34,14 @@ def demo(
     print_statistics(result.statistics)
     print_result(result.validation)
     echo(f"\ndone in {result.elapsed_s:.0f} s")
-    echo(f"capture  {result.sequence / 'raw'}")
+    for sequence in result.sequences:
+        echo(f"capture  {sequence / 'raw'}")
     for grid in result.grids:
         echo(f"grid     {grid}")
     for picture in result.pictures:
         echo(f"picture  {picture}")
-    echo(
-        f"next     carlasc regrid {result.sequence} --res 0.4    or    carlasc render {result.sequence} --frames 0:{count} -o drive.mp4"
-    )
+    first = result.sequences[0]
+    echo(f"next     carlasc regrid {first} --res 0.4    or    carlasc render {first} --frames 0:{count} -o drive.mp4")
     echo(f"page     {result.page}    (open it in a browser)")
     if not result.validation.ok:
         raise typer.Exit(FAILED)

@@ -111,7 +111,8 @@ def evaluate(
         typer.Option(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, occ3d-lidar, occ3d-lidar-sparseocc,"
             " occ3d-camera, openoccupancy; own scores the data's own classes. If not given: the benchmark whose files TRUTH holds; otherwise carlasc, or own for"
-            " classes that it has no map for."
+            " classes that it has no map for.",
+            autocompletion=lambda: [*carlasc.metrics.CONVENTIONS, "own"],
         ),
     ] = None,
     all_conventions: Annotated[

@@ -35,6 +35,7 @@ def export(
         typer.Argument(
             metavar="NAME",
             help="The other data set: kitti, occ3d, ... (see --list). NAME --help shows its own options.",
+            autocompletion=carlasc.converting.exporter_names,
         ),
     ],
     source: Annotated[str, place_argument("Folder, zip, store or URL of one or more sequences.")],

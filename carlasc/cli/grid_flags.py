@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import typer
 
 import carlasc
-from carlasc.cli.common import parse_numbers
+from carlasc.cli.common import echo, parse_numbers
 from carlasc.cli.flags import Flags
-from carlasc.core.choices import Complete, Coordinates, Dynamic, VoteRule
+from carlasc.core.choices import Complete, Coordinates, Dynamic, Preset, VoteRule
 from carlasc.errors import ArgumentError
 
-Preset = Literal["coarse", "fine", "cylindrical"]
-"""The grids of the published data set."""
+_FEW = 8  # voxels along an axis, of a grid that is unusual
+_MOVED_M = 1e-3  # bounds that move less are those that were asked for, rounded
+_VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # of a label and a count; of a frame that is unusual
 
 
 @dataclass(frozen=True)
 class GridFlags(Flags):
-    """The geometry of a grid."""
-
-    heading: ClassVar[str] = "Grid: one of --res, --size and --preset"
+    """The geometry of a grid. Most people need these options: they are the first ones, without a heading."""
 
     res: Annotated[
         str | None,
-        typer.Option(help="Size of a voxel: one value in metres, or one value per axis: x,y,z or radius,degrees,z."),
+        typer.Option(
+            help="Size of a voxel: one value in metres, or one value per axis: x,y,z or radius,degrees,z. Give this, --size or --preset."
+        ),
     ] = None
     size: Annotated[str | None, typer.Option(help="Number of voxels per axis, X,Y,Z, within exactly the bounds.")] = (
         None
@@ -39,6 +41,9 @@ class GridFlags(Flags):
             help="x0,x1,y0,y1,z0,z1 in metres (cylindrical: radius in metres, azimuth in degrees, z in metres); default: the published bounds."
         ),
     ] = None
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Make the grid although its size or its bounds are probably a mistake.")
+    ] = False
 
     def spec_or_published(self) -> carlasc.GridSpec:
         """Return the grid that the options describe, or the published one of the coordinates if they name none."""
@@ -47,11 +52,25 @@ class GridFlags(Flags):
         return self.spec()
 
     def spec(self) -> carlasc.GridSpec:
-        """Return the grid that the options describe. Azimuths are degrees here and radians everywhere else.
+        """Return the grid that the options describe, and say on stderr what is unusual about it.
+
+        Azimuths are degrees here and radians everywhere else.
 
         Raises:
-            ArgumentError: not exactly one of --res, --size and --preset, or values that are not valid for a grid.
+            ArgumentError: not exactly one of --res, --size and --preset, values that are not valid for a grid, or values that are
+                probably a mistake, without --yes.
         """
+        spec, asked = self._spec()
+        unusual = [*unusual_of(spec, asked)]
+        found = "; ".join(text for text, _ in unusual)
+        if any(mistake for _, mistake in unusual) and not self.yes:
+            raise ArgumentError("grid", expected="a grid for scenes", found=found, advice="give --yes to make it")
+        if unusual:
+            echo(f"note: {found}", err=True)
+        return spec
+
+    def _spec(self) -> tuple[carlasc.GridSpec, carlasc.GridSpec]:
+        """Return the grid that the options describe, and the one whose bounds they ask for."""
         three = (("--res", self.res), ("--size", self.size), ("--preset", self.preset))
         given = [option for option, value in three if value is not None]
         if len(given) != 1:
@@ -73,15 +92,33 @@ class GridFlags(Flags):
                 values[2:4] = [math.radians(value) for value in values[2:4]]
             spec = spec.with_bounds(values[0::2], values[1::2])
         if self.size is not None:
-            return spec.with_size(parse_numbers(self.size, int, (3,), "--size"))
+            return spec.with_size(parse_numbers(self.size, int, (3,), "--size")), spec
         if self.res is not None:
             steps = list(parse_numbers(self.res, float, (1, 3), "--res"))
             if cylindrical and len(steps) == 3:
                 steps[1] = math.radians(steps[1])
-            return spec.with_resolution(steps)
-        if self.preset == "fine":
-            return spec.with_size(carlasc.GridSpec.published("cartesian_fine").size)
-        return spec
+            return spec.with_resolution(steps), spec
+        spec = spec if self.preset is None else carlasc.GridSpec.published(self.preset)
+        return spec, spec
+
+
+def unusual_of(spec: carlasc.GridSpec, asked: carlasc.GridSpec) -> Iterator[tuple[str, bool]]:
+    """Yield what is unusual about a grid, and whether it is probably a mistake.
+
+    Args:
+        spec: the grid.
+        asked: the grid with the bounds that were asked for.
+    """
+    axes = ("x", "y", "z") if spec.coordinates == "cartesian" else ("the radius", "the azimuth", "z")
+    for number, axis in enumerate(axes):
+        if spec.size[number] < _FEW:
+            yield f"{spec.size[number]} voxels along {axis}", axis != "z"
+        (low, up), (old, end) = ((grid.lower[number], grid.upper[number]) for grid in (spec, asked))
+        if abs(low - old) + abs(up - end) > _MOVED_M:
+            bounds = f"{axis} {low:.2f}..{up:.2f} m, not {old:.2f}..{end:.2f}"
+            yield bounds, up - low > 2 * (end - old)
+    if (size := spec.num_voxels * _VOXEL_BYTES) > _LARGE_BYTES:
+        yield f"{spec.num_voxels:,} voxels, {size / 1e9:.1f} GB for each frame", True
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import carlasc
 from carlasc.cli.common import Json, console, line, place_argument, print_json
+from carlasc.core.notebook import count
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview
@@ -29,13 +30,13 @@ def _print(overview: Overview) -> None:
     from carlasc.cli.tables import print_table
 
     out = console()
-    splits = ", ".join(f"{name} {count}" for name, count in overview.splits.items())
+    splits = ", ".join(f"{name} {number}" for name, number in overview.splits.items())
     out.print(line(overview.location, "bold") + line(f": {overview.level} ({overview.store})"))
     if overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
-        out.print(line(f"{len(overview.sequences)} sequences: {splits}{size}"))
+        out.print(line(f"{count(len(overview.sequences), 'sequence')}: {splits}{size}"))
         header = ("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Frame", "Classes", "Size")
-        print_table(out, header, [_row(sequence) for sequence in overview.sequences])
+        print_table(out, header, [_row(sequence) for sequence in overview.sequences], turn=False)
     for sequence in overview.sequences:
         if sequence.problem:
             out.print(line(f"{sequence.path or sequence.name}: {sequence.problem}"))

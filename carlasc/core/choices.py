@@ -8,6 +8,9 @@ Axes = Literal["left", "right"]
 Coordinates = Literal["cartesian", "cylindrical"]
 """Axes of a grid."""
 
+Preset = Literal["coarse", "fine", "cylindrical"]
+"""The grids of the published data set."""
+
 VoteRule = Literal["sensor", "sample", "ray"]
 """How votes are counted."""
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import Preset
 from carlasc.core.notebook import describe
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
@@ -78,15 +79,18 @@ class GridSpec:
                 )
 
     @classmethod
-    def published(cls, name: str = "cartesian") -> GridSpec:
-        """Return a grid of the data set: "cartesian", "cartesian_fine" or "cylindrical"; see `docs/format.md#layout`."""
+    def published(cls, name: Preset | Coordinates = "coarse") -> GridSpec:
+        """Return a grid of the data set: "coarse", "fine" or "cylindrical"; see `docs/format.md#layout`.
+
+        "cartesian" gives the one that predictions are evaluated in, as "cylindrical" does: the coarse one.
+        """
         presets = {
-            "cartesian": cls("cartesian", (128, 128, 8), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
-            "cartesian_fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
+            "coarse": cls("cartesian", (128, 128, 8), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
+            "fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
             "cylindrical": cls("cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)),
         }
-        check_choice("published grid", name, presets)
-        return presets[name]
+        check_choice("published grid", name, (*presets, "cartesian"))
+        return presets["coarse" if name == "cartesian" else name]
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], where: str = "params.json") -> GridSpec:

@@ -6,8 +6,9 @@ The other files are Occ3D's `.npz`, OpenOccupancy's `.npy`, and the folders of S
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -17,11 +18,13 @@ from numpy.typing import NDArray
 from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
+from carlasc.core.notebook import first_names
 from carlasc.core.tables import SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
+from carlasc.storage.naming import identity_of
 
 Place = str | os.PathLike[str] | Source
 
@@ -147,12 +150,14 @@ def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "t
             yield OpenOccupancyScene(scene, scene.name, files)
     if (folder / "gts").is_dir():
         yield from foreign_grids(folder / "gts", grid, role)
-    name = grid or {"prediction": "predictions", "truth": "voxels"}[role]
-    for pattern, benchmark in ((f"sequences/*/{name}", "semantickitti"), (f"data_2d_raw/*/{name}", "sscbench")):
-        for sequence in sorted(path for path in folder.glob(pattern) if path.is_dir()):
-            grids = KittiFolder(sequence, sequence.parent.name, benchmark)
-            if len(grids.frames()):
-                yield grids
+    # a folder without predictions is scored as it is: an export, or another ground truth
+    names = (grid,) if grid else {"prediction": ("predictions", "voxels"), "truth": ("voxels",)}[role]
+    for pattern, benchmark in (("sequences/*", "semantickitti"), ("data_2d_raw/*", "sscbench")):
+        for sequence in sorted(folder.glob(pattern)):
+            found = (
+                KittiFolder(sequence / name, sequence.name, benchmark) for name in names if (sequence / name).is_dir()
+            )
+            yield from islice((grids for grids in found if len(grids.frames())), 1)
 
 
 @dataclass(frozen=True)
@@ -192,19 +197,28 @@ def pair_grids(
     else:
         pairs = []
         for prediction in predictions:
-            if prediction.path not in truths:
-                raise MissingDataError(
-                    prediction.location,
-                    expected=f"ground truth for the sequence {prediction.path!r}",
-                    found=", ".join(list(truths)[:3]) + (", ..." if len(truths) > 3 else ""),
-                    advice="give both sides from the same level, such as two data sets or two splits",
-                )
-            pairs.append(Pair(prediction, truths[prediction.path]))
+            pairs.append(Pair(prediction, _truth_of(prediction, truths)))
     for pair in pairs:
         pair.prediction.follow(pair.truth)
     left = sorted(set(truths) - {pair.truth.path for pair in pairs})
     note = f"{len(left)} of {len(truths)} sequences of the truth have no prediction and were not scored: {', '.join(left[:3])}"
     return pairs, (note + (", ..." if len(left) > 3 else ""),) if left else ()
+
+
+def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridFrames:
+    """Return the true grid of the path, or the only one of the name: other benchmarks' folders name sequences without their splits."""
+    if prediction.path in truths:
+        return truths[prediction.path]
+    name = identity_of(prediction.path)[1:]
+    same_name = [truth for path, truth in truths.items() if identity_of(path)[1:] == name]
+    if len(same_name) != 1:
+        raise MissingDataError(
+            prediction.location,
+            expected=f"ground truth for the sequence {prediction.path!r}",
+            found=first_names(truths, 3),
+            advice="sequences are matched by path or by name; give one sequence of each side if they have other names",
+        )
+    return same_name[0]
 
 
 def _open_grids(place: Place, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:

@@ -69,8 +69,8 @@ class SynthCity(Converter):
             str | None, "Names of columns that are not found by themselves: x=X_noise,y=Y_noise,label=Class."
         ] = None,
         grid: Annotated[
-            Literal["cartesian", "cartesian_fine"], "Published grid whose size and voxels tiles have."
-        ] = "cartesian",
+            Literal["coarse", "fine"], "Published grid whose size and voxels tiles have."
+        ] = "coarse",
     ) -> None:
         super().__init__(source)
         self.columns, self.grid = columns, grid

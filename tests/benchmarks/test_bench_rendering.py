@@ -28,7 +28,7 @@ def street(spec):
 
 @pytest.mark.benchmark(group="rendering")
 @pytest.mark.parametrize("view", ["perspective", "bev"])
-@pytest.mark.parametrize("name", ["cartesian", "cartesian_fine", "cylindrical"])
+@pytest.mark.parametrize("name", ["coarse", "fine", "cylindrical"])
 def test_bench_full_grid(benchmark, name, view):
     grid = street(GridSpec.published(name))
     benchmark.pedantic(render_grid, (grid,), {"view": view}, rounds=5, warmup_rounds=1)

@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.benchmark(timer=time.process_time)] 
 FINEST = GridSpec.published().with_resolution(0.1)
 CASES = {
     "128x128x8": (GridSpec.published("cartesian"), "sensor"),
-    "256x256x16": (GridSpec.published("cartesian_fine"), "sensor"),
+    "256x256x16": (GridSpec.published("fine"), "sensor"),
     "512x512x30": (FINEST, "sensor"),
     "cylindrical": (GridSpec.published("cylindrical"), "sensor"),
     "every sample": (GridSpec.published("cartesian"), "sample"),

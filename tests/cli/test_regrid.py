@@ -160,7 +160,7 @@ def test_options_for_scans_and_grids_say_what_observes_the_scene(capture):
 def test_presets_are_the_published_grids_in_the_coordinates_asked_for():
     published = GridSpec.published
     assert GridFlags(preset="coarse").spec() == published("cartesian")
-    assert GridFlags(preset="fine").spec() == published("cartesian_fine")
+    assert GridFlags(preset="fine").spec() == published("fine")
     assert GridFlags(preset="cylindrical").spec() == published("cylindrical")
     assert GridFlags(preset="coarse", coordinates="cylindrical").spec() == published("cylindrical")
 

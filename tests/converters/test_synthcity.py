@@ -59,7 +59,7 @@ def test_tiles_lie_on_a_lattice_above_their_ground(table: Path) -> None:
     assert recording(table).sensors[0].height_m == pytest.approx(1.8)
 
 
-@pytest.mark.parametrize("grid", ["cartesian", "cartesian_fine"])
+@pytest.mark.parametrize("grid", ["coarse", "fine"])
 def test_voxels_have_the_class_of_most_of_their_points_and_nothing_is_free(table: Path, grid: str) -> None:
     area = recording(table, grid=grid)
     spec = GridSpec.published(grid)
@@ -155,7 +155,7 @@ def test_areas_are_found_below_the_folder(table: Path, tmp_path: Path) -> None:
     assert [area.name for area in SynthCity(tmp_path).sequences()] == ["SYNTHCITY_area1", "SYNTHCITY_area-2"]
     with pytest.raises(MissingDataError, match="Parquet tables, one per area"):
         SynthCity(tmp_path / "none").sequences()
-    with pytest.raises(ArgumentError, match="grid: expected one of cartesian, cartesian_fine, found 'cylindrical'"):
+    with pytest.raises(ArgumentError, match="grid: expected one of coarse, fine, found 'cylindrical'"):
         convert("synthcity", tmp_path, tmp_path / "out", options={"grid": "cylindrical"}, run=Run(1))
 
 

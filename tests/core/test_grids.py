@@ -13,7 +13,7 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.files import parse_json, to_json
 
 PI32 = float(np.float32(np.pi))
-PUBLISHED = ["cartesian", "cartesian_fine", "cylindrical"]
+PUBLISHED = ["coarse", "fine", "cylindrical"]
 
 sizes = st.tuples(*[st.integers(1, 40)] * 3)
 widths = st.tuples(*[st.floats(0.5, 60, width=32)] * 3)
@@ -45,8 +45,8 @@ def test_params_go_in_and_out_with_their_numbers_untouched(name):
 
 def test_the_golden_params_are_those_of_the_presets(golden_capture):
     for folder, name in (
-        ("cartesian", "cartesian"),
-        ("cartesian_fine", "cartesian_fine"),
+        ("cartesian", "coarse"),
+        ("cartesian_fine", "fine"),
         ("cylindrical", "cylindrical"),
     ):
         params = parse_json((golden_capture / folder / "evaluation" / "params.json").read_bytes(), folder)

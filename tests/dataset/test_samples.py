@@ -193,7 +193,7 @@ def test_cylindrical_grids_beside_cartesian_ones_take_their_own_scans_if_there_a
 
 def test_two_roots_that_are_one_sequence_each_go_together(golden_capture):
     fine = Dataset(golden_capture / "cartesian", history=3, grids_source=golden_capture / "cartesian_fine")
-    assert fine.spec == GridSpec.published("cartesian_fine") and len(fine) == 3
+    assert fine.spec == GridSpec.published("fine") and len(fine) == 3
     cylindrical = Dataset(
         golden_capture / "cartesian", coordinates="cylindrical", grids_source=golden_capture / "cylindrical"
     )
@@ -216,7 +216,7 @@ def test_a_grid_is_chosen_by_name_or_by_geometry(tmp_path):
     with pytest.raises(MissingDataError, match=r"evaluation_32x16x8 \(cartesian 32 x 16 x 8\)"):
         Dataset(tmp_path, grid="evaluation_9x9x9")
     with pytest.raises(MissingDataError, match="found evaluation"):
-        Dataset(tmp_path, grid=GridSpec.published("cartesian_fine"))
+        Dataset(tmp_path, grid=GridSpec.published("fine"))
 
 
 def test_scans_alone_take_any_geometry_and_need_no_grid(tmp_path):

@@ -24,7 +24,7 @@ KEYS = ("grid_size", "min_bound", "max_bound", "num_channels", "coordinates")
 GOLDEN = {
     "cartesian": (GridSpec.published(), 1.5),
     "cylindrical": (GridSpec.published("cylindrical"), 1.5),
-    "cartesian_fine": (GridSpec.published("cartesian_fine"), 1.5),
+    "cartesian_fine": (GridSpec.published("fine"), 1.5),
     "cartesian_step0.5": (GridSpec.published().with_size((64, 64, 8)), 0.5),
 }
 

@@ -115,7 +115,7 @@ def test_scans_alone_raise_no_false_alarm(tmp_path: Path, poses: np.ndarray, lab
     assert [finding.check for finding in result.findings] == ["no-grids"]
 
 
-@pytest.mark.parametrize("name", ["cartesian_fine", "cylindrical"])
+@pytest.mark.parametrize("name", ["fine", "cylindrical"])
 @pytest.mark.parametrize("labelled", [True, False])
 def test_other_grids_raise_no_false_alarm(tmp_path: Path, name: str, labelled: bool) -> None:
     spec = GridSpec.published(name)

@@ -104,7 +104,7 @@ def test_file_names_are_those_of_the_format():
     assert layout.field_named("evaluation/votes").file(1234567) == "evaluation/1234567.votes.npz"
     assert layout.grid_folder(GridSpec.published()) == "evaluation"
     assert layout.grid_folder(GridSpec.published("cylindrical")) == "evaluation"
-    assert layout.grid_folder(GridSpec.published("cartesian_fine")) == "evaluation_256x256x16"
+    assert layout.grid_folder(GridSpec.published("fine")) == "evaluation_256x256x16"
     # the published number of cells, but -2..1.2 m high: not the published grid
     assert layout.grid_folder(GridSpec.published().with_resolution(0.4)) == "evaluation_128x128x8"
     assert layout.frame_of("000012.label", ".label") == 12

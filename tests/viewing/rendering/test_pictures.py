@@ -26,7 +26,7 @@ pytest.importorskip("PIL")
 pytest.importorskip("embreex")
 
 SIZE = (320, 180)
-PUBLISHED = [GridSpec.published(name) for name in ("cartesian", "cartesian_fine", "cylindrical")]
+PUBLISHED = [GridSpec.published(name) for name in ("coarse", "fine", "cylindrical")]
 views = pytest.mark.parametrize("view", ["perspective", "bev"])
 
 
@@ -262,7 +262,7 @@ def test_edges_of_voxels_are_drawn_only_if_the_voxels_are_large():
         return np.abs(middle - light).max()
 
     assert shades((400, 400)) > 20
-    tiny = grid_with({}, GridSpec.published("cartesian_fine"))
+    tiny = grid_with({}, GridSpec.published("fine"))
     tiny.labels[:, :, 0] = CARLA.id_of("Terrain")
     picture = render_grid(tiny, view="bev", size=(200, 200), legend=False, ego=False).astype(int)
     assert np.abs(picture[80:120, 80:120] - light).max() < 12

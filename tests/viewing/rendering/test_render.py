@@ -366,7 +366,7 @@ def test_bad_input_names_the_file(drive, tmp_path):
 
 
 def test_a_truth_of_another_geometry_is_refused(drive, tmp_path):
-    other = write_sequence(tmp_path / "fine", spec=GridSpec.published("cartesian_fine"), frames=1)
+    other = write_sequence(tmp_path / "fine", spec=GridSpec.published("fine"), frames=1)
     with pytest.raises(ArgumentError, match="256 x 256 x 16"):
         render(Scene(drive, truth=other), tmp_path / "a.png")
 
