@@ -101,7 +101,9 @@ def convert(
         typer.Argument(
             metavar="NAME",
             help="The data set: kitti, argoverse2, ... (see --list). NAME --help shows its own options.",
-            autocompletion=carlasc.converting.converter_names,
+            autocompletion=lambda incomplete: [
+                name for name in carlasc.converting.converter_names() if name.startswith(incomplete)
+            ],
         ),
     ],
     source: Annotated[Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")],

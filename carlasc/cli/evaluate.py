@@ -112,7 +112,9 @@ def evaluate(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, occ3d-lidar, occ3d-lidar-sparseocc,"
             " occ3d-camera, openoccupancy; own scores the data's own classes. If not given: the benchmark whose files TRUTH holds; otherwise carlasc, or own for"
             " classes that it has no map for.",
-            autocompletion=lambda: [*carlasc.metrics.CONVENTIONS, "own"],
+            autocompletion=lambda incomplete: [
+                n for n in (*carlasc.metrics.CONVENTIONS, "own") if n.startswith(incomplete)
+            ],
         ),
     ] = None,
     all_conventions: Annotated[

@@ -35,7 +35,9 @@ def export(
         typer.Argument(
             metavar="NAME",
             help="The other data set: kitti, occ3d, ... (see --list). NAME --help shows its own options.",
-            autocompletion=carlasc.converting.exporter_names,
+            autocompletion=lambda incomplete: [
+                name for name in carlasc.converting.exporter_names() if name.startswith(incomplete)
+            ],
         ),
     ],
     source: Annotated[str, place_argument("Folder, zip, store or URL of one or more sequences.")],

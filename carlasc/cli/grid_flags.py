@@ -98,7 +98,8 @@ class GridFlags(Flags):
             if cylindrical and len(steps) == 3:
                 steps[1] = math.radians(steps[1])
             return spec.with_resolution(steps), spec
-        spec = spec if self.preset is None else carlasc.GridSpec.published(self.preset)
+        if self.preset == "fine":
+            spec = spec.with_size(carlasc.GridSpec.published("fine").size)
         return spec, spec
 
 

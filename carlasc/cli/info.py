@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import carlasc
 from carlasc.cli.common import Json, console, line, place_argument, print_json
-from carlasc.core.notebook import count
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview
@@ -28,6 +27,7 @@ def info(
 
 def _print(overview: Overview) -> None:
     from carlasc.cli.tables import print_table
+    from carlasc.core.notebook import count
 
     out = console()
     splits = ", ".join(f"{name} {number}" for name, number in overview.splits.items())

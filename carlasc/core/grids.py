@@ -315,8 +315,8 @@ class Grid:
         return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
 
     def __repr__(self) -> str:
-        occupied, known = np.count_nonzero(self.labels), np.count_nonzero(self.known)
-        return f"<Grid {self.spec}: {occupied:,} occupied and {known - occupied:,} free voxels>"
+        occupied, free = np.count_nonzero(self.labels), np.count_nonzero(self.known & (self.labels == 0))
+        return f"<Grid {self.spec}: {occupied:,} occupied and {free:,} free voxels>"
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the geometry, and the heights of the occupied voxels from above."""

@@ -199,6 +199,9 @@ def pair_grids(
         for prediction in predictions:
             pairs.append(Pair(prediction, _truth_of(prediction, truths)))
     for pair in pairs:
+        if isinstance(pair.prediction, KittiFolder) and pair.prediction.location == pair.truth.location:
+            expected, found = "predictions in another folder than the ground truth", "the ground truth itself"
+            raise MissingDataError(pair.truth.location, expected=expected, found=found)
         pair.prediction.follow(pair.truth)
     left = sorted(set(truths) - {pair.truth.path for pair in pairs})
     note = f"{len(left)} of {len(truths)} sequences of the truth have no prediction and were not scored: {', '.join(left[:3])}"

@@ -124,7 +124,7 @@ def test_messages_of_a_batch_name_options_too():
 def test_a_range_of_frames_is_an_option_with_a_message_of_one_line():
     command = run_with_options(None)
     assert command().stdout == "None\n"
-    assert command("--frames", "3:7").stdout == "FrameRange(start=3, stop=7)\n"
+    assert command("--frames", "3:7").stdout == "FrameRange(start=3, stop=7, only=None)\n"
     result = command("--frames", "7:3")
     assert (result.exit_code, result.stderr) == (
         2,

@@ -168,7 +168,7 @@ WRONG = {
     "a slash was lost": (["info", "s3:/bucket/x"], 2, "SOURCE: expected a path, or a URL such as s3://bucket/folder"),
     "a picture in a bucket": (["render", ".", "-o", "s3://bucket/x.png"], 2, "--out: expected a path on this machine"),
     "an export to a bucket": (["export", "kitti", ".", "s3://bucket/x"], 2, "found the URL s3://bucket/x"),
-    "a file in a bucket": (["regrid", ".", "-o", "s3://bucket/x.h5", "--res", "1"], 2, "--out: expected a .zarr store, or a folder"),
+    "a file in a bucket": (["regrid", ".", "-o", "s3://bucket/x.h5", "--preset", "coarse"], 2, "--out: expected a .zarr store, or a folder"),
     "a web server": (["simulate", "https://host/x"], 2, "found a web server"),
     "several processes in memory": (["simulate", "memory://x", "--workers", "2"], 2, "--workers: expected 1 with memory"),
     "nothing given": (["info", ""], 2, "SOURCE: expected a path or a URL"),
@@ -190,7 +190,9 @@ def test_a_store_that_always_fails_is_one_line(
     folder, url = made
     server.reset(lambda number, method, path: fault if not writing or method == "PUT" else None)
     out = f"s3://{BUCKET}/other {fault}"
-    arguments = ["regrid", f"{folder}/town", "-o", out, "--res", "1.6", "--workers", "1"] if writing else ["info", url]
+    arguments = (
+        ["regrid", f"{folder}/town", "-o", out, "--size", "32,32,8", "--workers", "1"] if writing else ["info", url]
+    )
     code, _, err = run(*arguments)
     assert code == 1 and message in err and err.count("\n") == 1 and SECRET not in err, err
 

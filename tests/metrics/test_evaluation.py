@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -175,9 +176,11 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     pred, truth = folders
     with pytest.raises(ArgumentError, match="convention: expected one of carlasc, semantickitti"):
         evaluate(pred, truth, convention="nuscenes")
-    found = "found Town10_Heavy/cartesian, Town10_Light/cartesian: give both sides from the same level"
+    shutil.copytree(truth / "Test" / "Town10_Heavy", tmp_path / "renamed" / "Test" / "Town99_Heavy")
+    shutil.copytree(truth / "Test" / "Town10_Light", tmp_path / "renamed" / "Test" / "Town98_Light")
+    found = "found Test/Town98_Light/cartesian, Test/Town99_Heavy/cartesian: sequences are matched by path or by name"
     with pytest.raises(MissingDataError, match=f"expected ground truth for the sequence '{SEQUENCES[0]}', {found}"):
-        evaluate(pred, truth / "Test")
+        evaluate(pred, tmp_path / "renamed")
     with pytest.raises(MissingDataError, match="grid nothing"):
         evaluate(pred, truth, grid="nothing")
     with pytest.raises(MissingDataError, match="none in the range"):
@@ -188,6 +191,11 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
         evaluate(pred, truth, frames=(2, 1))
     write_grids(tmp_path / "without_counts", world[0])
     assert "expected counts" in evaluate(pred, tmp_path / "without_counts").failures[0][1]
+
+
+def test_sides_from_different_levels_are_matched_by_the_names_of_their_sequences(folders):
+    pred, truth = folders
+    assert evaluate(pred, truth / "Test").matrix == evaluate(pred, truth).matrix
 
 
 def test_the_datas_own_classes_can_be_scored_as_they_are(folders, world):

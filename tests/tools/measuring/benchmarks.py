@@ -77,9 +77,7 @@ FILES: dict[str, dict[str, Row]] = {
     },
     "rendering": {
         "test_bench_full_grid[coarse-perspective]": Row("render.coarse", "ms", "render, 128 x 128 x 8, 1280 x 720"),
-        "test_bench_full_grid[fine-perspective]": Row(
-            "render.fine", "ms", "render, 256 x 256 x 16, 1280 x 720"
-        ),
+        "test_bench_full_grid[fine-perspective]": Row("render.fine", "ms", "render, 256 x 256 x 16, 1280 x 720"),
         "test_bench_full_grid[cylindrical-perspective]": Row(
             "render.cylindrical", "ms", "render, cylindrical, 1280 x 720"
         ),
