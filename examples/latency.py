@@ -18,9 +18,7 @@ def main(
     networks: Annotated[list[str], typer.Argument(help="Names of networks, with :T for a history of T scans.")],
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
     repetitions: Annotated[int, typer.Option(help="Number of timed calls, after a first one.", min=1)] = 100,
-    grid: Annotated[
-        str, typer.Option(help="A published grid: coarse, fine or cylindrical.")
-    ] = "coarse",
+    grid: Annotated[str, typer.Option(help="A published grid: coarse, fine or cylindrical.")] = "coarse",
     threads: Annotated[
         int | None, typer.Option(help="Number of threads on the CPU. Default: all cores.", min=1)
     ] = None,

@@ -68,9 +68,7 @@ class SynthCity(Converter):
         columns: Annotated[
             str | None, "Names of columns that are not found by themselves: x=X_noise,y=Y_noise,label=Class."
         ] = None,
-        grid: Annotated[
-            Literal["coarse", "fine"], "Published grid whose size and voxels tiles have."
-        ] = "coarse",
+        grid: Annotated[Literal["coarse", "fine"], "Published grid whose size and voxels tiles have."] = "coarse",
     ) -> None:
         super().__init__(source)
         self.columns, self.grid = columns, grid
