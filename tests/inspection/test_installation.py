@@ -22,16 +22,26 @@ from carlasc.inspection.installation import Package, doctor, measure_disk, witho
 ROOT = Path(__file__).parents[2]
 
 
+def required(lines, extras):
+    """Yield the requirements of an extra, with those of the extras that it names in their place."""
+    for need in map(Requirement, lines):
+        if need.name == "carlasc":
+            for name in need.extras:
+                yield from required(extras[name], extras)
+        else:
+            yield need
+
+
 @pytest.fixture
 def metadata_of_project(monkeypatch):
     """The requirements as pyproject.toml has them now, whatever was installed; returns them by extra ("" without)."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = {"": project["dependencies"], **project["optional-dependencies"]}
     listed = [
-        line.replace(" ", "") + (f"; extra == '{extra}'" if extra else "")
+        f"{need.name}{need.specifier}" + (f"; extra == '{extra}'" if extra else "")
         for extra, wanted in lines.items()
-        for line in wanted
-        if ";" not in line
+        for need in required(wanted, lines)
+        if need.marker is None
     ]
     monkeypatch.setattr(metadata, "requires", lambda name: listed)
     return lines
@@ -42,7 +52,7 @@ def test_every_package_of_every_extra_for_users_is_listed(metadata_of_project):
     listed = {"": found.packages} | {extra.name: extra.packages for extra in found.extras}
     for extra, lines in metadata_of_project.items():
         if extra not in installation.FOR_DEVELOPERS:
-            wanted = {(need.name, next(iter(need.specifier)).version) for need in map(Requirement, lines)}
+            wanted = {(need.name, next(iter(need.specifier)).version) for need in required(lines, metadata_of_project)}
             assert {(package.name, package.lowest) for package in listed.pop(extra)} == wanted, extra
     assert listed == {}
     assert found.version == carlasc.__version__

@@ -174,14 +174,14 @@ def test_the_command_records_and_prints_its_figures_as_json(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("package", ["embreex", "trimesh", "PIL"])
-@pytest.mark.parametrize("run", [simulate, demonstrate])
+@pytest.mark.parametrize(("run", "extra"), [(simulate, "simulate"), (demonstrate, "demo")])
 def test_without_a_package_of_the_extra_nothing_is_written(
-    run: Callable[..., object], package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Callable[..., object], extra: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(DependencyError, match=rf"{package} .*pip install 'carlasc\[simulate\]'"):
+    with pytest.raises(DependencyError, match=rf"{package} .*pip install 'carlasc\[{extra}\]'"):
         run(tmp_path / "out", count=1, sensors=1)
     assert not (tmp_path / "out").exists()
 
