@@ -92,7 +92,8 @@ class GridFlags(Flags):
                 values[2:4] = [math.radians(value) for value in values[2:4]]
             spec = spec.with_bounds(values[0::2], values[1::2])
         if self.size is not None:
-            return spec.with_size(parse_numbers(self.size, int, (3,), "--size")), spec
+            spec = spec.with_size(parse_numbers(self.size, int, (3,), "--size"))
+            return spec, spec
         if self.res is not None:
             steps = list(parse_numbers(self.res, float, (1, 3), "--res"))
             if cylindrical and len(steps) == 3:
@@ -108,15 +109,15 @@ def unusual_of(spec: carlasc.GridSpec, asked: carlasc.GridSpec) -> Iterator[tupl
 
     Args:
         spec: the grid.
-        asked: the grid with the bounds that were asked for.
+        asked: the grid with the bounds, and the numbers of voxels, that were asked for.
     """
     axes = ("x", "y", "z") if spec.coordinates == "cartesian" else ("the radius", "the azimuth", "z")
     for number, axis in enumerate(axes):
-        if spec.size[number] < _FEW:
+        if spec.size[number] < _FEW and (axis != "z" or spec.size != asked.size):
             yield f"{spec.size[number]} voxels along {axis}", axis != "z"
         (low, up), (old, end) = ((grid.lower[number], grid.upper[number]) for grid in (spec, asked))
         if abs(low - old) + abs(up - end) > _MOVED_M:
-            bounds = f"{axis} {low:.2f}..{up:.2f} m, not {old:.2f}..{end:.2f}"
+            bounds = f"{axis} {low:.2f}..{up:.2f} m instead of {old:.2f}..{end:.2f}"
             yield bounds, up - low > 2 * (end - old)
     if (size := spec.num_voxels * _VOXEL_BYTES) > _LARGE_BYTES:
         yield f"{spec.num_voxels:,} voxels, {size / 1e9:.1f} GB for each frame", True

@@ -62,7 +62,7 @@ def regrid(
     Existing frames are skipped, so the same command continues an interrupted run. Inside a sequence's folder, `carlasc regrid --res 0.2` is
     enough.
     """
-    spec, voting, chosen = making.grid.spec(), making.votes.voting(), _observe(observe, making, poses, from_grid)
+    voting, chosen, spec = making.votes.voting(), _observe(observe, making, poses, from_grid), making.grid.spec()
     with run.spread("regrid") as spread:
         result = carlasc.regrid(
             source,
