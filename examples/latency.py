@@ -12,13 +12,14 @@ from completion.command import run
 from completion.latency import measure_network
 
 from carlasc import GridSpec
+from carlasc.core.choices import Preset
 
 
 def main(
     networks: Annotated[list[str], typer.Argument(help="Names of networks, with :T for a history of T scans.")],
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
     repetitions: Annotated[int, typer.Option(help="Number of timed calls, after a first one.", min=1)] = 100,
-    grid: Annotated[str, typer.Option(help="A published grid: coarse, fine or cylindrical.")] = "coarse",
+    grid: Annotated[Preset, typer.Option(help="A published grid.")] = "coarse",
     threads: Annotated[
         int | None, typer.Option(help="Number of threads on the CPU. Default: all cores.", min=1)
     ] = None,

@@ -6,7 +6,7 @@ DATA is anything in the CarlaSC layout, or a folder of raw `.bin` scans. Without
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast, get_args
 
 import torch
 import typer
@@ -16,6 +16,7 @@ from completion.predicting import Model, predict_dataset, predict_scans
 
 from carlasc import GridSpec
 from carlasc.core import FrameRange
+from carlasc.core.choices import Preset
 
 
 def main(
@@ -44,7 +45,7 @@ def main(
     own = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     mode: Mode = "eager" if eager else "compile"
     model = Model.read(weights, history)
-    geometry = GridSpec.published(grid) if grid in ("coarse", "fine", "cylindrical") else grid
+    geometry = GridSpec.published(cast(Preset, grid)) if grid in get_args(Preset) else grid
     raw = Path(data).is_dir() and any(Path(data).glob("*.bin"))
     with progress_bar("Completing") as progress:
         if raw:

@@ -45,4 +45,6 @@ def main(
 
 
 if __name__ == "__main__":
-    run(main)
+    run(
+        main, "with --resume, the same command continues from the last checkpoint (one an epoch, or --set save_every=N)"
+    )

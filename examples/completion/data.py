@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import islice, pairwise
@@ -225,11 +226,12 @@ def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) ->
 
 
 def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataLoader[Values]:
+    workers = min(config.workers, os.cpu_count() or 1)  # torch warns of more, and they gain nothing
     return DataLoader(
         data,
         batch_size,
-        num_workers=config.workers,
-        persistent_workers=config.workers > 0,
+        num_workers=workers,
+        persistent_workers=workers > 0,
         collate_fn=collate,
         pin_memory=torch.cuda.is_available(),
         **options,

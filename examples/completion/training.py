@@ -18,6 +18,7 @@ from torch.nn.parallel import DistributedDataParallel
 from carlasc import Source
 from carlasc.errors import ArgumentError, CarlascError, ConflictError
 from carlasc.metrics import ConfusionMatrix
+from completion.command import Line
 from completion.config import Config
 from completion.data import TrainLoader, class_weights, eval_loader, open_split, soft_target, target_of
 from completion.inference import check_compiler
@@ -192,7 +193,7 @@ def _train_epoch(
 ) -> None:
     """Make the steps of an epoch that are left, and note them in `progress`. `networks` are the network itself, and as it is wrapped."""
     networks[1].train()
-    epoch = progress.epoch
+    epoch, line = progress.epoch, Line()
     for step, batch in enumerate(loader.epoch(epoch, progress.step), progress.step):
         try:
             loss = _train_step(networks, optimizer, batch, class_weights, (epoch, step), config, processes)
@@ -222,12 +223,9 @@ def _train_epoch(
         progress.step, progress.loss_so_far = step + 1, progress.loss_so_far + loss
         if config.save_every and progress.step % config.save_every == 0 and progress.step < len(loader):
             save()
-        if processes.first and sys.stderr.isatty():
-            print(
-                f"\repoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss {progress.loss_so_far / (step + 1):.4f}",
-                end="",
-                file=sys.stderr,
-            )
+        if processes.first:
+            mean = progress.loss_so_far / (step + 1)
+            line.show(f"epoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss {mean:.4f}")
 
 
 def _train_step(
