@@ -1,0 +1,46 @@
+"""How much each set of extras installs: `python docs/studies/sizes.py [EXTRA ...]` prints a row as soon as it is measured.
+
+Each set is installed from this checkout into an environment of its own, with `-c constraints.txt`, and deleted. torch is the build that pip finds.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SETS = ("", "demo", "convert", "train", "demo,convert", "demo,train", "zarr,remote", "view", "rerun", "all")
+
+
+def install(extras: str, folder: Path) -> tuple[float, int, float]:
+    """Install carlasc with some extras; return MB of the packages, their number, and seconds."""
+    venv.create(folder, with_pip=True)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    before = measure(packages)
+    start = time.perf_counter()
+    wanted = f"{ROOT}[{extras}]" if extras else str(ROOT)
+    command = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-compile"]
+    subprocess.run([*command, "--constraint", ROOT / "constraints.txt", wanted], check=True)
+    return measure(packages) - before, len([*packages.glob("*.dist-info")]) - 1, time.perf_counter() - start
+
+
+def measure(folder: Path) -> float:
+    """Return MB of the files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+
+
+def main() -> None:
+    """Print the table."""
+    print("| extras | MB | packages | seconds |\n|---|---:|---:|---:|")
+    for extras in sys.argv[1:] or SETS:
+        with tempfile.TemporaryDirectory() as folder:
+            size, packages, elapsed_s = install(extras, Path(folder))
+        print(f"| `{extras or '(none)'}` | {size:,.0f} | {packages} | {elapsed_s:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
