@@ -23,7 +23,7 @@ def install(extras: str, folder: Path) -> tuple[float, int, float]:
     before = measure(packages)
     start = time.perf_counter()
     wanted = f"{ROOT}[{extras}]" if extras else str(ROOT)
-    command = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-compile"]
+    command: list[str | Path] = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-compile"]
     subprocess.run([*command, "--constraint", ROOT / "constraints.txt", wanted], check=True)
     return measure(packages) - before, len([*packages.glob("*.dist-info")]) - 1, time.perf_counter() - start
 
