@@ -172,6 +172,6 @@ def test_the_demo_runs_from_the_wheel_and_ends_with_the_page(from_wheel, tmp_pat
     ran = from_wheel("demo", str(tmp_path / "town"), "--count", "1", "--sensors", "2", extras="[demo]")
     assert ran.returncode == 0, ran.stderr
     lines = ran.stdout.splitlines()
-    assert re.fullmatch(r"simulate a town \.\.\. \d+\.\d s", lines[0])
+    assert re.fullmatch(r"simulate a town, Train \.\.\. \d+\.\d s", lines[0])
     page = re.fullmatch(r"page +(\S+) +\(open it in a browser\)", lines[-1])
     assert Path(page[1]).read_text().startswith("<!doctype html>")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,12 @@ def expand(frames: range | NDArray[np.int64]) -> NDArray[np.int64]:
     return np.arange(frames.start, frames.stop, dtype=np.int64) if isinstance(frames, range) else frames
 
 
-Frames = FrameRange | tuple[int | None, int | None] | slice | range | str | list[int] | NDArray[np.integer] | None
+if TYPE_CHECKING:  # at run time it takes no parameters
+    _Slice = slice[int | None, int | None, int | None]
+else:
+    _Slice = slice
+
+Frames = FrameRange | tuple[int | None, int | None] | _Slice | range | str | list[int] | NDArray[np.integer] | None
 """What a `frames` argument takes: a range, a slice, "A:B", a list of frame numbers, a FrameRange, a tuple of its bounds, or None for all frames."""
 
 
