@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.datasets.drives import write_drive
+from helpers.datasets.drives import write_drive, write_world
 
 import carlasc
 from carlasc import Dataset, Grid, GridSpec, Scan
@@ -25,11 +25,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    root = tmp_path_factory.mktemp("world")
-    write_drive(root / "Train" / "Town01_Light" / "cartesian", range(6), spec=SMALL, seed=1)
-    write_drive(root / "Train" / "Town02_Light" / "cartesian", range(4), spec=SMALL, seed=2)
-    write_drive(root / "Val" / "Town07_Light" / "cartesian", range(3), spec=SMALL, seed=3)
-    return root
+    return write_world(tmp_path_factory.mktemp("world"), SMALL)
 
 
 def test_a_source_is_a_mapping_of_paths(world):

@@ -98,6 +98,11 @@ Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
 
 
+def starting_with(incomplete: str, names: Iterable[str]) -> list[str]:
+    """Return the names that a shell offers to complete what was typed."""
+    return [name for name in names if name.startswith(incomplete)]
+
+
 def echo(text: object, *, err: bool = False, nl: bool = True) -> None:
     """Print lines on stdout or stderr. Names in them come from data: what a terminal would obey is shown escaped."""
     typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)

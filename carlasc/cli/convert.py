@@ -17,6 +17,7 @@ from carlasc.cli.common import (
     place_argument,
     print_frames,
     print_json,
+    starting_with,
 )
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
@@ -101,9 +102,7 @@ def convert(
         typer.Argument(
             metavar="NAME",
             help="The data set: kitti, argoverse2, ... (see --list). NAME --help shows its own options.",
-            autocompletion=lambda incomplete: [
-                name for name in carlasc.converting.converter_names() if name.startswith(incomplete)
-            ],
+            autocompletion=lambda incomplete: starting_with(incomplete, carlasc.converting.converter_names()),
         ),
     ],
     source: Annotated[Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")],

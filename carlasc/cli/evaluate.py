@@ -20,6 +20,7 @@ from carlasc.cli.common import (
     place_option,
     print_json,
     report_failures,
+    starting_with,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
 from carlasc.core.choices import Voxels
@@ -112,9 +113,7 @@ def evaluate(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, occ3d-lidar, occ3d-lidar-sparseocc,"
             " occ3d-camera, openoccupancy; own scores the data's own classes. If not given: the benchmark whose files TRUTH holds; otherwise carlasc, or own for"
             " classes that it has no map for.",
-            autocompletion=lambda incomplete: [
-                n for n in (*carlasc.metrics.CONVENTIONS, "own") if n.startswith(incomplete)
-            ],
+            autocompletion=lambda incomplete: starting_with(incomplete, (*carlasc.metrics.CONVENTIONS, "own")),
         ),
     ] = None,
     all_conventions: Annotated[

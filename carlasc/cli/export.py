@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, echo, file_argument, place_argument, print_frames
+from carlasc.cli.common import Json, echo, file_argument, place_argument, print_frames, starting_with
 from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
 
 
@@ -35,9 +35,7 @@ def export(
         typer.Argument(
             metavar="NAME",
             help="The other data set: kitti, occ3d, ... (see --list). NAME --help shows its own options.",
-            autocompletion=lambda incomplete: [
-                name for name in carlasc.converting.exporter_names() if name.startswith(incomplete)
-            ],
+            autocompletion=lambda incomplete: starting_with(incomplete, carlasc.converting.exporter_names()),
         ),
     ],
     source: Annotated[str, place_argument("Folder, zip, store or URL of one or more sequences.")],

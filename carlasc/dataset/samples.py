@@ -196,7 +196,7 @@ class Dataset(_MapStyle):
             FormatError: a file does not hold what it must; names the file.
         """
         if isinstance(index, slice):
-            return self._part_of(range(len(self))[index])
+            return self._part_of(index)
         place = operator.index(index)
         if not -len(self) <= place < len(self):
             raise IndexError(f"sample {place} is out of range: there are {len(self)} samples")
@@ -217,14 +217,14 @@ class Dataset(_MapStyle):
         made = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
         return made if self.transform is None else cast(Sample, self.transform(made))
 
-    def _part_of(self, places: range) -> Self:
+    def _part_of(self, chosen: slice) -> Self:
         """Return the data set of some of the samples."""
-        if places.step < 0:
-            raise ArgumentError("index", expected="a slice with a step of 1 or more", found=str(places.step))
-        part = copy.copy(self)
+        if chosen.step is not None and chosen.step < 0:
+            raise ArgumentError("index", expected="a slice with a step of 1 or more", found=str(chosen.step))
+        part, places = copy.copy(self), np.arange(len(self))[chosen]
         ends = zip(self._starts[:-1].tolist(), self._starts[1:].tolist(), self._parts, strict=True)
         part._parts = [
-            replace(whole, frames=whole.frames[[place - start for place in places if start <= place < end]])
+            replace(whole, frames=whole.frames[places[(places >= start) & (places < end)] - start])
             for start, end, whole in ends
         ]
         part._starts = np.cumsum([0, *(len(chosen.frames) for chosen in part._parts)])

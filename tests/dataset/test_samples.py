@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from helpers.datasets.drives import bend, write_drive
+from helpers.datasets.drives import bend, write_drive, write_world
 from helpers.references.plain_loader import PlainLoader
 
 import carlasc.storage
@@ -26,11 +26,7 @@ SMALL_CYLINDRICAL = GridSpec("cylindrical", (8, 16, 4), (0.0, -np.pi, -2.0), (20
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     """Two training sequences and one to validate with, small grids."""
-    root = tmp_path_factory.mktemp("world")
-    write_drive(root / "Train" / "Town01_Light" / "cartesian", range(6), spec=SMALL, seed=1)
-    write_drive(root / "Train" / "Town02_Light" / "cartesian", range(4), spec=SMALL, seed=2)
-    write_drive(root / "Val" / "Town07_Light" / "cartesian", range(3), spec=SMALL, seed=3)
-    return root
+    return write_world(tmp_path_factory.mktemp("world"), SMALL)
 
 
 @pytest.mark.parametrize("history", [1, 3])

@@ -71,3 +71,11 @@ def write_drive(
         writer.write("evaluation/labels", frame, rng.integers(0, 23, spec.size).astype(np.uint32))
         writer.write("evaluation/counts", frame, rng.integers(0, 5, spec.size).astype(np.float32))
     return folder
+
+
+def write_world(root: Path, spec: GridSpec) -> Path:
+    """Write two training sequences, of six and four frames, and one of three frames to validate with; return the folder."""
+    write_drive(root / "Train" / "Town01_Light" / "cartesian", range(6), spec=spec, seed=1)
+    write_drive(root / "Train" / "Town02_Light" / "cartesian", range(4), spec=spec, seed=2)
+    write_drive(root / "Val" / "Town07_Light" / "cartesian", range(3), spec=spec, seed=3)
+    return root
