@@ -80,6 +80,7 @@ define virtual_environment
 	@$(PYTHON) -m venv $(1) || { echo "no virtual environment could be made: on Debian, apt install python3-venv"; exit 1; }
 endef
 TORCH := torch==2.13.0
+EVERYTHING := all,torch,view,rerun,dev
 
 $(DEMO_VENV)/ready: pyproject.toml constraints.txt
 	$(call virtual_environment,$(DEMO_VENV))
@@ -90,18 +91,18 @@ $(DEMO_VENV)/ready: pyproject.toml constraints.txt
 $(VENV)/ready: pyproject.toml constraints.txt
 	$(call virtual_environment,$(VENV))
 	$(RUN)/pip install --quiet --no-compile uv '$(TORCH)'
-	VIRTUAL_ENV=$(VENV) $(RUN)/uv pip install --quiet --constraint constraints.txt --editable '.[all,dev]' \
-		|| $(RUN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[all,dev]'
+	VIRTUAL_ENV=$(VENV) $(RUN)/uv pip install --quiet --constraint constraints.txt --editable '.[$(EVERYTHING)]' \
+		|| $(RUN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[$(EVERYTHING)]'
 	@touch $@
 
 .venv-lowest/ready: pyproject.toml
 	$(call virtual_environment,.venv-lowest)
 	.venv-lowest/bin/pip install --quiet --no-compile uv '$(TORCH)'
-	VIRTUAL_ENV=.venv-lowest .venv-lowest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[all,dev]'
+	VIRTUAL_ENV=.venv-lowest .venv-lowest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[$(EVERYTHING)]'
 	@touch $@
 
-# Without torch, which on Linux is gigabytes: its tests skip. `EXTRAS=all,dev` has it too.
-EXTRAS ?= zarr,hdf5,parquet,remote,kitti,scans,bags,ncore,render,simulate,view,plots,rerun,foxglove,hub,dev
+# Without torch, which on Linux is gigabytes: its tests skip. `EXTRAS=all,torch,view,rerun,dev` has it too.
+EXTRAS ?= all,view,rerun,dev
 .venv-newest/ready: pyproject.toml
 	$(call virtual_environment,.venv-newest)
 	.venv-newest/bin/pip install --quiet --no-compile --editable '.[$(EXTRAS)]'

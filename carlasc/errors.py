@@ -12,7 +12,7 @@ import re
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType, ModuleType
 from typing import Any, Self, get_args
 
@@ -179,9 +179,24 @@ def import_extra(module: str, extra: str) -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         problem = "is not installed" if error.name == package else f"does not load ({error})"
-        raise DependencyError(
-            f"{package} {problem}", advice=f"install it with `pip install 'carlasc[{extra}]'`"
-        ) from error
+        raise DependencyError(f"{package} {problem}", advice=f"install it with `{install_command(extra)}`") from error
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra to this installation, from where it came: a checkout, a file, or an index."""
+    import json
+    import shlex
+    from importlib import metadata
+    from urllib.parse import unquote, urlsplit
+
+    found, editable = "carlasc", ""
+    with suppress(metadata.PackageNotFoundError, ValueError):  # not installed, only on the path; not JSON
+        origin = json.loads(metadata.distribution("carlasc").read_text("direct_url.json") or "{}")  # PEP 610
+        url = urlsplit(origin.get("url", ""))
+        if url.scheme == "file":
+            found = unquote(url.path)
+            editable = "-e " if origin.get("dir_info", {}).get("editable") else ""
+    return f"pip install {editable}{shlex.quote(f'{found}[{extra}]')}"
 
 
 @contextmanager

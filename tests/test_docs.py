@@ -49,13 +49,58 @@ def session(page):
     return [(command, "\n".join(lines)) for command, lines in steps]
 
 
-def play(page, folder):
-    """Run a page's commands in one shell; return (command, expected, found, exit code) of each."""
+def packages_for(page):
+    """Return (extras, packages) that a page tells its reader to install before its last session; "start here" has told to install `demo`."""
+    before = PAGES[page].read_text().rpartition("```console")[0]
+    lines = [
+        line for block in re.findall(r"```(?:sh|bash)\n(.*?)```", before, re.DOTALL) for line in block.splitlines()
+    ]
+    wanted = " ".join(line.partition("#")[0] for line in lines if line.startswith("pip install "))
+    extras = {extra for group in re.findall(r"\.\[([\w,]+)\]", wanted) for extra in group.split(",")}
+    return extras | {"demo"}, set(re.findall(r"(?<= )[a-z][\w-]+", wanted)) - {"install"}
+
+
+@pytest.fixture(scope="session")
+def environment(tmp_path_factory):
+    """Makes the environment of a page's reader, with nothing but what the page tells to install; the folder of its programs."""
+    made = {}
+
+    def make(page):
+        extras, packages = packages_for(page)
+        key = (*sorted(extras), *sorted(packages))
+        if key not in made:
+            folder = tmp_path_factory.mktemp("environment") / ".venv"
+            subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+            torch = ["torch==2.13.0"] if {"train", "torch"} & extras else []
+            wanted = [*torch, *sorted(packages), "--editable", f"{ROOT}[{','.join(sorted(extras))}]"]
+            wanted += ["--constraint", str(ROOT / "constraints.txt")]
+            python = folder / "bin" / "python"
+            ways = (
+                [sys.executable, "-m", "uv", "pip", "install", "--python", python],
+                [python, "-m", "pip", "install"],
+            )
+            for way in ways:  # uv is faster and does not read pip's settings, such as a mirror
+                ran = subprocess.run([*way, "--quiet", *wanted], check=False, capture_output=True, text=True)
+                if ran.returncode == 0:
+                    break
+            if ran.returncode and re.search(
+                r"Could not find a version|No matching distribution|Connection", ran.stderr
+            ):
+                pytest.skip(f"no package index within reach: {ran.stderr.strip().splitlines()[-1]}")
+            assert ran.returncode == 0, ran.stderr
+            made[key] = python.parent
+        return made[key]
+
+    return make
+
+
+def play(page, folder, programs):
+    """Run a page's commands in one shell, with the programs of an environment; return (command, expected, found, exit code) of each."""
     for name, text in scripts(page).items():
         (folder / name).write_text(text)
     steps = session(page)
     script = "".join(f"{command}\n__code=$?; printf '%d{END}' $__code; (exit $__code)\n" for command, _ in steps)
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "COLUMNS": "160"}
+    environment = os.environ | {"PATH": f"{programs}:{os.environ['PATH']}", "COLUMNS": "160"}
     ran = subprocess.run(
         ["bash"],
         check=False,
@@ -82,10 +127,10 @@ def check(results):
 
 
 @pytest.fixture(scope="session")
-def started(tmp_path_factory):
+def started(tmp_path_factory, environment):
     """The folder of a reader who followed "start here", and what each command printed."""
     folder = tmp_path_factory.mktemp("start")
-    return folder, play(START, folder)
+    return folder, play(START, folder, environment(START))
 
 
 @pytest.mark.slow
@@ -99,9 +144,9 @@ def test_start_here_works_from_the_demo_to_the_training_step(started):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if page != START and session(page)])
-def test_commands_of_a_page_print_what_it_shows(page, started, tmp_path):
+def test_commands_of_a_page_print_what_it_shows(page, started, environment, tmp_path):
     shutil.copytree(started[0] / "town", tmp_path / "town", copy_function=os.link)
-    check(play(page, tmp_path))
+    check(play(page, tmp_path, environment(page)))
 
 
 def command_lines():

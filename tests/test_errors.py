@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
+from importlib import metadata
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from carlasc.errors import (
     MissingDataError,
     StorageError,
     import_extra,
+    install_command,
     postponed_interrupts,
     printable,
     reading,
@@ -112,11 +114,25 @@ def test_whatever_a_block_raises_is_one_error_that_names_the_file_and_keeps_its_
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install():
-    with pytest.raises(
-        DependencyError, match=r"no_such_module is not installed: .*pip install 'carlasc\[zarr\]'"
-    ) as caught:
+    with pytest.raises(DependencyError, match=r"no_such_module is not installed: .*pip install .*\[zarr\]'") as caught:
         import_extra("no_such_module.part", "zarr")
     assert "\n" not in str(caught.value)
+
+
+ORIGINS = {
+    '{"url": "file:///home/a%20b/carlasc", "dir_info": {"editable": true}}': "pip install -e '/home/a b/carlasc[zarr]'",
+    '{"url": "file:///tmp/carlasc", "dir_info": {}}': "pip install '/tmp/carlasc[zarr]'",
+    '{"url": "file:///tmp/carlasc-1.whl", "archive_info": {}}': "pip install '/tmp/carlasc-1.whl[zarr]'",
+    '{"url": "https://example.org/carlasc.whl", "archive_info": {}}': "pip install 'carlasc[zarr]'",
+    "broken": "pip install 'carlasc[zarr]'",
+    None: "pip install 'carlasc[zarr]'",  # from an index
+}
+
+
+@pytest.mark.parametrize(("origin", "command"), ORIGINS.items(), ids=map(str, ORIGINS))
+def test_an_extra_is_installed_from_where_carlasc_came(origin, command, monkeypatch):
+    monkeypatch.setattr(metadata.PathDistribution, "read_text", lambda self, name: origin)
+    assert install_command("zarr") == command
 
 
 def test_a_module_that_fails_to_load_says_why(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Objects behave as Python's own do: stores are mappings, sequences are collections of frames, data sets take slices, and all show themselves."""
 
 import base64
+import json
 import pickle
 import re
 import subprocess
@@ -16,7 +17,8 @@ import carlasc
 from carlasc import Dataset, Grid, GridSpec, Scan
 from carlasc.core import SEMANTICKITTI
 from carlasc.core.frames import FrameRange
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.core.notebook import data_frame
+from carlasc.errors import ArgumentError, DependencyError, MissingDataError
 from carlasc.storage.views import ChosenSequences, SequenceView
 
 SMALL = GridSpec("cartesian", (16, 16, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
@@ -182,6 +184,36 @@ carlasc.regrid(source, carlasc.GridSpec.published("fine"), frames=range(0, 10))
 reveal_type(sample["known"])
 sample["nothing"]
 """
+
+
+def test_tables_of_pandas_hold_what_the_objects_hold(world, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    found = carlasc.info(world)
+    overview = found.to_pandas()
+    assert overview.index.name == "path" and list(overview.index) == [one.path for one in found.sequences]
+    assert list(overview["frames"]) == [one.frames for one in found.sequences]
+    counted = carlasc.stats(world, grid="evaluation_0")
+    table = counted.to_pandas()
+    named = counted.summed(counted.total.voxels)
+    assert dict(table.groupby("class")["voxels"].sum()) == named and list(table.columns) == [
+        "split", "class", "points", "voxels",
+    ]  # fmt: skip
+    file = tmp_path / "net.json"
+    result = {"name": "net", "convention": "carlasc", "frames": 2, "class_iou": {"Road": 0.5, "Pole": None}}
+    figures = {"miou": 0.25, "iou": 0.5, "precision": 0.5, "recall": 1.0, "false_free": None}
+    file.write_text(json.dumps(result | figures))
+    scores = carlasc.scores([file]).to_pandas()
+    assert (
+        scores.loc["net", "Road"] == 0.5 and pandas.isna(scores.loc["net", "Pole"]) and scores.index.name == "Network"
+    )
+
+
+def test_a_table_of_nothing_has_no_rows_and_missing_pandas_is_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("pandas")
+    assert data_frame((), "path").empty
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(DependencyError, match="pandas is not installed"):
+        data_frame((), "path")
 
 
 @pytest.mark.slow

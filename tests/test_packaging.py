@@ -77,26 +77,26 @@ def test_every_requirement_has_a_lowest_version():
             assert any(one.operator == ">=" for one in needed.specifier), needed
 
 
-def test_all_is_every_extra_but_those_of_developers():
+FOR_DEVELOPERS, SETS = {"dev", "docs", "study", "faults"}, {"all", "demo", "train", "convert"}
+HEAVY = {"torch", "view", "rerun", "carla"}  # gigabytes, and carla has few wheels
+
+
+def test_all_is_every_extra_but_sets_of_others_the_heavy_ones_and_those_of_developers():
     extras = PROJECT["optional-dependencies"]
     (line,) = extras["all"]
-    assert Requirement(line).extras == set(extras) - {
-        "all",
-        "dev",
-        "docs",
-        "study",
-        "faults",
-        "carla",  # it has few wheels
-        "demo",
-        "train",
-        "convert",
-    }  # the last three are sets of others
+    assert Requirement(line).extras == set(extras) - FOR_DEVELOPERS - SETS - HEAVY
+
+
+def test_the_table_of_extras_names_each_and_nothing_that_is_none():
+    page = (ROOT / "docs" / "index.md").read_text().partition("## Extras")[2].partition("## Next")[0]
+    rows = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
+    assert set(re.findall(r"`([a-z0-9]+)`", " ".join(rows))) == set(PROJECT["optional-dependencies"])
 
 
 @pytest.mark.skipif(sys.version_info[:2] != (3, 11) or sys.platform != "linux", reason="where the pins were made")
 def test_constraints_pin_what_the_tests_install_and_nothing_else():
     try:
-        needed = installed_for("carlasc", ("all", "dev")) - {"carlasc"}
+        needed = installed_for("carlasc", ("all", "torch", "view", "rerun", "dev")) - {"carlasc"}
     except PackageNotFoundError as error:
         pytest.skip(f"not all extras are installed: {error.name}")
     pinned = pins()

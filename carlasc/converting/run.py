@@ -34,6 +34,8 @@ from carlasc.storage.sinks import Sink
 from carlasc.storage.transport.targets import LocalTarget, check_shared
 
 Grids = GridOptions | Literal["voxels"] | None
+_LOOKED_AT = 3  # sequences, and scans of each, from which it is found how many points a grid leaves out
+_MANY = 0.05  # of the points between the sides of a grid: worth a note if they lie above or below it
 
 
 def convert(
@@ -167,8 +169,9 @@ def _make_grids(
     observe = replace(
         grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=replace(poses, source="file")
     )
-    voting = grids.voting or Voting()
-    result = regrid(_ConvertedScans(sink, conversions), spec, out, observe=observe, voting=voting, run=run)
+    voting, scans = grids.voting or Voting(), _ConvertedScans(sink, conversions)
+    notes += _what_is_cut(spec, scans)
+    result = regrid(scans, spec, out, observe=observe, voting=voting, run=run)
     return replace(result, notes=(*notes, *result.notes))
 
 
@@ -183,6 +186,30 @@ def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec,
         f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to {fitted.upper[2]:g} m in z"
         f" instead of {spec.lower[2]:g} to {spec.upper[2]:g}; bounds that are given are kept"
     ]
+
+
+def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
+    """Return a note on how many points lie above or below the grid, if many do, from a few scans of a few sequences."""
+    inside = above = below = 0
+    for sequence in list(source.values())[:_LOOKED_AT]:
+        frames = sequence.frames("points")
+        for frame in frames[:: max(len(frames) // _LOOKED_AT, 1)][:_LOOKED_AT]:
+            axes = spec.to_axes(sequence.read("points", int(frame))[:, :3])
+            heights = axes[((axes >= spec.lower) & (axes < spec.upper))[:, :2].all(axis=1), 2]
+            above += int(np.count_nonzero(heights >= spec.upper[2]))
+            below += int(np.count_nonzero(heights < spec.lower[2]))
+            inside += len(heights)
+    shares = [
+        f"{100 * count / inside:.0f} % {where} it (z {sign} {limit:g} m)"
+        for count, where, sign, limit in ((above, "above", ">", spec.upper[2]), (below, "below", "<", spec.lower[2]))
+        if count > _MANY * inside
+    ]
+    advice = "scans keep them, and --bounds makes a higher grid"
+    return (
+        [f"{source.location}: of the points between the sides of the grid {' and '.join(shares)} lie; {advice}"]
+        if shares
+        else []
+    )
 
 
 def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:

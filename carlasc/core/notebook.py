@@ -1,4 +1,4 @@
-"""How objects show themselves: in words, and in notebooks as a table with a small picture."""
+"""How objects show themselves: in words, in notebooks as a table with a small picture, and as tables of pandas."""
 
 from __future__ import annotations
 
@@ -7,9 +7,15 @@ import html
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from carlasc.errors import DependencyError
+
+if TYPE_CHECKING:
+    import pandas
 
 
 def describe(title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] | None = None) -> str:
@@ -20,6 +26,24 @@ def describe(title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] 
     )
     image = "" if picture is None else f"<img alt='seen from above' src='data:image/png;base64,{_png(picture)}'>"
     return f"<div><b>{html.escape(title)}</b><table>{lines}</table>{image}</div>"
+
+
+def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataFrame:
+    """Return rows as a table of pandas, which is no dependency: whoever asks for such a table has it.
+
+    Args:
+        rows: the values of each row by column.
+        index: the column that names the rows.
+
+    Raises:
+        DependencyError: pandas is not installed.
+    """
+    try:
+        import pandas  # noqa: PLC0415
+    except ImportError as error:
+        raise DependencyError("pandas is not installed", advice="install it with `pip install pandas`") from error
+    table = pandas.DataFrame(list(rows))
+    return table if table.empty else table.set_index(index)
 
 
 def count(number: int, noun: str, plural: str = "") -> str:

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.core.versions import carlasc_version
-from carlasc.errors import ArgumentError, DependencyError, StorageError, describe, import_extra
+from carlasc.errors import ArgumentError, DependencyError, StorageError, describe, import_extra, install_command
 from carlasc.running import count_cores
 from carlasc.running.pools import ONE_THREAD
 from carlasc.storage.durability import is_durable
 
 FOR_DEVELOPERS = ("all", "dev", "docs", "faults", "study")
-"""Extras that are not listed: `all` is the others, and the rest is for those who work on the package."""
+"""Extras that are not listed: `all` is a set of others, and the rest is for those who work on the package."""
 
 _PACKAGE = Path(__file__).parents[1]  # the folder of carlasc
 _FEATURES = "sse4.2 avx avx2 fma bmi2 avx512f avx512bw avx512vl neon asimd sve sve2".split()
@@ -60,7 +60,7 @@ class Package:
 
 @dataclass(frozen=True)
 class Extra:
-    """An extra, as in `pip install 'carlasc[zarr]'`.
+    """An extra, as in `pip install '.[zarr]'`.
 
     Attributes:
         name: its name.
@@ -78,7 +78,7 @@ class Extra:
     @property
     def command(self) -> str:
         """The command that installs it."""
-        return f"pip install 'carlasc[{self.name}]'"
+        return without_names(install_command(self.name)).replace("'~/", "~/'")  # a shell knows ~ outside quotes alone
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,21 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.raw import Capture, find_captures
+from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, without_credentials
 from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
+
+if TYPE_CHECKING:
+    import pandas
 
 _SIZED = 3  # files of a field from which the size of all of them is estimated
 
@@ -130,6 +134,20 @@ class Overview:
         for sequence in self.sequences:
             found[sequence.split or "none"] = found.get(sequence.split or "none", 0) + 1
         return found
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a row per sequence, with the attributes of `SequenceOverview`; fields, documents and grids as their names.
+
+        Raises:
+            DependencyError: pandas is not installed.
+        """
+        return data_frame(
+            (
+                vars(sequence) | {"fields": [*sequence.fields], "grids": [grid.name for grid in sequence.grids]}
+                for sequence in self.sequences
+            ),
+            "path",
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""

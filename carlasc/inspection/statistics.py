@@ -6,12 +6,13 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable, Remap, class_weights
+from carlasc.core.notebook import data_frame
 from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.running.processes import run_all
@@ -19,6 +20,9 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
+
+if TYPE_CHECKING:
+    import pandas
 
 Kind = Literal["points", "voxels"]
 KINDS: tuple[Kind, ...] = ("points", "voxels")
@@ -128,6 +132,23 @@ class Statistics:
         weights = class_weights(self.total.voxels, self.remap)
         table = self.classes if self.remap is None else self.remap.target
         return {name: float(weights[index]) for index, name in table.names.items()}
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a row per sequence and class: split, class, and the numbers of points and of voxels.
+
+        Raises:
+            DependencyError: pandas is not installed.
+        """
+        return data_frame(
+            (
+                {"sequence": path, "split": self.splits[path], "class": name, "points": points, "voxels": voxels}
+                for path, histogram in self.sequences.items()
+                for (name, points), voxels in zip(
+                    self.summed(histogram.points).items(), self.summed(histogram.voxels).values(), strict=True
+                )
+            ),
+            "sequence",
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""

@@ -8,11 +8,15 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from carlasc.core.notebook import data_frame
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics.results import Cell, FigureTable
 from carlasc.storage.files import parse_json
+
+if TYPE_CHECKING:
+    import pandas
 
 _FIGURES = {"miou": "mIoU", "iou": "IoU", "precision": "Precision", "recall": "Recall", "false_free": "False free"}
 _REQUIRED = ("name", "convention", "frames", "class_iou", *_FIGURES)
@@ -62,6 +66,19 @@ class ScoreTable:
         lines = [table.header, ["---"] + ["---:"] * (len(table.header) - 1), *table.texts()]
         rows = ("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
         return f"{table.title}\n\n" + "\n".join(rows) + "\n"
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a row per result, with the columns of `table`; figures as fractions, NaN where one is not defined.
+
+        Raises:
+            DependencyError: pandas is not installed.
+        """
+        table = self.table()
+        rows = (dict(zip(table.header, row, strict=True)) for row in table.rows)
+        return data_frame(
+            ({name: cell / 100 if isinstance(cell, float) else cell for name, cell in row.items()} for row in rows),
+            table.header[0],
+        )
 
     def to_latex(self) -> str:
         """Return a LaTeX `tabular`."""

@@ -102,4 +102,4 @@ def test_without_a_screen_the_window_says_what_to_do(tmp_path, monkeypatch):
 def test_without_open3d_the_window_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     result = call(write_blocks(tmp_path / "data" / "cartesian", frames=1))
-    assert result.exit_code == 1 and "carlasc[view]" in result.stderr
+    assert result.exit_code == 1 and "[view]'" in result.stderr

@@ -284,7 +284,7 @@ def test_a_card_without_the_packages_that_draw_says_so(
     monkeypatch.setitem(sys.modules, "PIL.Image", None)
     result = write_card(town, tmp_path / "card", **SAID)
     assert len(result.files) == 2
-    assert all("carlasc[render]" in note for note in result.notes) and result.notes
+    assert all("[render]'" in note for note in result.notes) and result.notes
 
 
 def test_a_non_commercial_set_stays_so_and_each_source_keeps_its_licence(mixed: Path) -> None:

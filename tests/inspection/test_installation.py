@@ -87,7 +87,7 @@ def test_a_missing_extra_is_no_problem_and_names_its_command(monkeypatch):
     assert ran.exit_code == 0, ran.output
     assert re.search(r"^  parquet +pyarrow is not installed$", ran.output, re.MULTILINE)
     missing, _, problems = ran.output.partition("\nmissing\n")[2].partition("\nproblems\n")
-    assert "pip install 'carlasc[parquet]'" in missing and problems == "  none\n"
+    assert re.search(r"pip install .*\[parquet\]'", missing) and problems == "  none\n"
 
 
 def test_a_needed_package_that_is_too_old_is_a_problem(monkeypatch):
