@@ -85,6 +85,8 @@ class StyleFlags(Flags):
 class ContentFlags(Flags):
     """What is drawn."""
 
+    heading: ClassVar[str] = "What is drawn"
+
     what: Annotated[
         str | None,
         typer.Option(help="grid, scan, flow, truth, errors; several, separated by commas, are drawn side by side."),
@@ -96,12 +98,24 @@ class ContentFlags(Flags):
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes around actors.")] = False
 
 
+@dataclass(frozen=True)
+class PanelFlags(Flags):
+    """What several panels show, and in which colours."""
+
+    heading: ClassVar[str] = ContentFlags.heading
+
+    grid_of: Annotated[
+        bool,
+        typer.Option("--grid-of", help="Draw panels of several SOURCES, or of the frames of one, with captions."),
+    ] = False
+    palette: Annotated[
+        PaletteName,
+        typer.Option(help="Colours of the class table, colours for colour-blind readers, or colours by height."),
+    ] = "class"
+
+
 def render(
-    scene: SceneFlags,
-    content: ContentFlags,
-    camera: CameraFlags,
-    style: StyleFlags,
-    work: WorkFlags,
+    *,
     sources: Annotated[
         list[str],
         places_argument(
@@ -112,32 +126,30 @@ def render(
     out: Annotated[
         Path | None, file_option("-o", "--out", text="A .png, .gif, .mp4 or .webp. Default: named after the sequence.")
     ] = None,
-    grid_of: Annotated[
-        bool,
-        typer.Option("--grid-of", help="Draw panels of several SOURCES, or of the frames of one, with captions."),
-    ] = False,
-    palette: Annotated[
-        PaletteName,
-        typer.Option(help="Colours of the class table, colours for colour-blind readers, or colours by height."),
-    ] = "class",
+    scene: SceneFlags,
     fps: Annotated[
         float | None, typer.Option(help="Pictures per second of a film. Default: 10, the rate of the data.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     as_json: Json = False,
+    content: ContentFlags,
+    panels: PanelFlags,
+    camera: CameraFlags,
+    style: StyleFlags,
+    work: WorkFlags,
 ) -> None:
     """Draw a frame (PNG) or several frames (GIF, MP4, WebP): grids, scans, scene flow, predictions with ground truth and errors.
 
     No screen and no GPU are needed. The camera is behind and above the ego vehicle and follows it.
     Without --frames, a picture shows the first frame and a film shows all frames.
     """
-    scenes = [scene.scene(source, palette) for source in sources]
-    if len(scenes) > 1 and not grid_of:
+    scenes = [scene.scene(source, panels.palette) for source in sources]
+    if len(scenes) > 1 and not panels.grid_of:
         raise ArgumentError("SOURCE", expected="one", found=str(len(scenes)), advice="draw several with --grid-of")
     taken, looks = camera.options(), style.options()
     with work.spread("Rendering", "pictures") as run:
         result = carlasc.render(
-            scenes if grid_of else scenes[0],
+            scenes if panels.grid_of else scenes[0],
             out,
             **vars(content),
             camera=taken,

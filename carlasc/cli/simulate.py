@@ -15,13 +15,14 @@ from carlasc.cli.grid_flags import GridFlags
 
 
 def simulate(
-    sensors: SensorFlags,
-    grid: GridFlags,
-    run: RunFlags,
+    *,
     out: OutArgument,
     count: Annotated[int, typer.Option(help="Number of frames, 0.1 s apart.", min=1)] = 20,
     first_frame: Annotated[int, typer.Option(help="Number of the first frame. The drive starts at 0.", min=0)] = 0,
+    grid: GridFlags,
     json: Json = False,
+    sensors: SensorFlags,
+    run: RunFlags,
 ) -> None:
     """Record a drive through a simulated town as a raw capture, or its scans and ground truth at once.
 

@@ -49,11 +49,15 @@ class HoldoutFlags(Flags):
     ] = None
 
 
+@dataclass(frozen=True)
+class HoldoutGridFlags(GridFlags):
+    """The grid whose free voxels are tested."""
+
+    heading: ClassVar[str] = HoldoutFlags.heading
+
+
 def validate(
-    holdout: HoldoutFlags,
-    grid: GridFlags,
-    scans: WindowFlags,
-    work: OneWorkerFlags,
+    *,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     every: Annotated[
         int | None,
@@ -66,6 +70,10 @@ def validate(
         bool, typer.Option("--all", help="Print all findings, not only the first three of each kind.")
     ] = False,
     as_json: Json = False,
+    holdout: HoldoutFlags,
+    grid: HoldoutGridFlags,
+    scans: WindowFlags,
+    work: OneWorkerFlags,
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids. The exit code is 1 if there is an error.
 

@@ -39,7 +39,7 @@ def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataF
         DependencyError: pandas is not installed.
     """
     try:
-        import pandas  # noqa: PLC0415
+        import pandas
     except ImportError as error:
         raise DependencyError("pandas is not installed", advice="install it with `pip install pandas`") from error
     table = pandas.DataFrame(list(rows))

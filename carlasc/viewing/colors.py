@@ -106,6 +106,11 @@ class ClassColors:
         """(num_channels, 3) uint8 RGB by class id."""
         return colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
 
+    def tell_shapes(self, ids: NDArray[np.int64]) -> bool:
+        """Whether the colours of the (K,) ids that occur show anything; height does where there is nothing but what data without labels have."""
+        without = {0, self.table.geometry_id, self.table.ground_id}
+        return self.palette != "height" and (self.table.geometry_id not in ids or not {*ids.tolist()} <= without)
+
     def entries(self, ids: Iterable[int]) -> list[Entry]:
         """Return the legend of the given class ids, sorted by id, without free (0)."""
         colors = self.by_id

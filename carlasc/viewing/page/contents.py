@@ -246,6 +246,7 @@ class PageContent:
             "leftHanded": reader.left_handed,
             "tables": {name: _describe_classes(colors) for name, colors in tables.items()},
             "pointTable": reader.table.name,
+            "colorBy": "class" if self._has_classes() else "height",
             "panels": [_describe_panel(panel) for panel in self.panels],
             "runs": list(self.runs),
             "frames": list(self.frames),
@@ -256,6 +257,15 @@ class PageContent:
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
         }
+
+    def _has_classes(self) -> bool:
+        """Whether the first frame has classes, whose colours show more than heights do."""
+        content = self.reader.read(self.frames[0])
+        labels = [grid.labels for grid in content.grids]
+        if content.scan is not None and content.scan.labels is not None:
+            labels.append(content.scan.labels)
+        ids = [np.flatnonzero(np.bincount(some.reshape(-1), minlength=1)) for some in labels]
+        return any(self.reader.colors.tell_shapes(some) for some in ids)
 
     def _fields_of(self, reader: SceneReader) -> tuple[str, ...]:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
-from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
@@ -111,18 +110,13 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
     colors.table.check(grid.labels, "grid labels")
     occupied = grid.labels > 0
     ids = np.flatnonzero(np.bincount(grid.labels.reshape(-1), minlength=1))
-    if colors.palette == "height" or not _has_classes(ids, colors.table):
+    if not colors.tell_shapes(ids):
         low, high = grid.spec.lower[2], grid.spec.upper[2]
         layers = palette.height_colors(grid.spec.centers()[0, 0, :, 2], low, high)
         voxel_colors, legend = np.broadcast_to(layers, (*grid.spec.size, 3)), palette.height_entries(low, high)
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
     return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
-
-
-def _has_classes(ids: NDArray[np.int64], table: ClassTable) -> bool:
-    """Whether some of the (K,) ids that occur are classes, and not what data without labels have: their colours show no shape."""
-    return table.geometry_id not in ids or not {*ids.tolist()} <= {0, table.geometry_id, table.ground_id}
 
 
 def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
@@ -158,7 +152,7 @@ def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
     points = without_invalid_points(scan)
     extent = scan_extent(points) if extent is None else extent
     ids = np.zeros(0, np.int64) if points.labels is None else np.flatnonzero(np.bincount(points.labels))
-    if colors.palette == "height" or points.labels is None or not _has_classes(ids, colors.table):
+    if points.labels is None or not colors.tell_shapes(ids):
         low, high = float(extent[:, 2].min()), float(extent[:, 2].max())
         point_colors = palette.height_colors(points.points[:, 2], low, high)
         legend = palette.height_entries(low, high)

@@ -88,6 +88,8 @@ class Viewer {
     const select = byId('color-by');
     for (const mode of modesOf(this.scene)) select.append(make('option', { value: mode }, MODES[mode].label));
     select.addEventListener('change', () => this.colorBy(select.value));
+    select.value = this.scene.colorBy;
+    this.colorBy(this.scene.colorBy);
   }
 
   makeLegends() {
