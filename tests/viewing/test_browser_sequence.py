@@ -257,6 +257,19 @@ def test_colours_show_the_evidence(browser, drive_page):
     assert page.complaints() == []
 
 
+def test_data_without_classes_are_shown_by_height_at_first(browser, tmp_path):
+    folder = write_blocks(tmp_path / "Train" / "Town01_Light" / "cartesian", 1)
+    for file in folder.glob("**/*.label"):
+        labels = np.fromfile(file, np.uint32)
+        np.where(labels > 0, 3 if file.parent.name == "evaluation" else 0, 0).astype(labels.dtype).tofile(file)
+    page = Page(browser, view(folder, tmp_path / "a.html").out)
+    assert page.run("return document.getElementById('color-by').value") == "height" and page.text("#ramp").startswith("HEIGHT")
+    ramp = [colored(page.canvas("page_height"), color).mean() for color in ((68, 1, 84), (253, 231, 37))]
+    choose(page, "#color-by", "class")
+    assert min(ramp) > 0.001 and not colored(page.canvas(), (253, 231, 37)).any()
+    assert page.complaints() == []
+
+
 def test_modes_without_data_are_not_offered(browser, blocks, tmp_path):
     page = Page(browser, view(blocks, tmp_path / "a.html").out)
     assert page.text("#color-by").split() == ["class", "height", "votes"]

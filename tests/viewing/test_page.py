@@ -47,6 +47,7 @@ def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
         ["missed: predicted free", "#105abe"],
         ["invented: free in truth", "#f0c828"],
     ]
+    assert scene["colorBy"] == "class"
     assert [panel["title"] for panel in scene["panels"]] == ["prediction", "truth", "errors"]
     assert [panel["table"] for panel in scene["panels"]] == ["carla", "carla", "errors"]
     assert scene["panels"][0]["upper"] == pytest.approx([25.6, 25.6, 1.0], abs=1e-3)

@@ -265,7 +265,8 @@ class PageContent:
         if content.scan is not None and content.scan.labels is not None:
             labels.append(content.scan.labels)
         ids = [np.flatnonzero(np.bincount(some.reshape(-1), minlength=1)) for some in labels]
-        return any(self.reader.colors.tell_shapes(some) for some in ids)
+        labelled = [some for some in ids if some.any()]
+        return not labelled or any(self.reader.colors.tell_shapes(some) for some in labelled)
 
     def _fields_of(self, reader: SceneReader) -> tuple[str, ...]:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
