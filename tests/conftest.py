@@ -11,11 +11,14 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from carlasc.cli import common
 from carlasc.errors import DependencyError
 
 DATA = Path(__file__).parent / "data"
 
 os.environ.setdefault("CARLASC_REMOTE_BACKOFF_S", "0.01")  # servers of tests that fail need no time to recover
+
+common._LINE_S = float("inf")  # what a command prints must not depend on how long it takes
 
 # How long an example takes is the machine's affair. Equal code gets equal examples; `--hypothesis-profile default` looks for others.
 hypothesis.settings.register_profile("carlasc", deadline=None, derandomize=True)

@@ -111,7 +111,8 @@ def play(page, folder, programs):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    outputs = [re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups() for output in ran.stdout.split(END)[:-1]]
+    printed = re.sub(r"^.+: \d+ of \d+ \w+, \d+ s\n", "", ran.stdout, flags=re.MULTILINE)  # progress, on slow machines
+    outputs = [re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups() for output in printed.split(END)[:-1]]
     assert len(outputs) == len(steps), ran.stdout
     return [(*step, found, int(code)) for step, (found, code) in zip(steps, outputs, strict=True)]
 

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 from importlib.metadata import PackageNotFoundError, distribution, requires, version
 from pathlib import Path
@@ -146,8 +147,8 @@ def from_wheel(tmp_path_factory):
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     tool = [sys.executable, "-m", "uv", "tool", "run", "--no-config", "--python", sys.executable]
 
-    def run(*arguments, extras=""):
-        command = [*tool, "--from", f"carlasc{extras} @ {wheel.as_uri()}", "carlasc", *arguments]
+    def run(*arguments, extras="", archive=wheel):
+        command = [*tool, "--from", f"carlasc{extras} @ {archive.as_uri()}", "carlasc", *arguments]
         return subprocess.run(command, cwd=folder, env=clean, check=False, capture_output=True, text=True)
 
     ran = run("--version")
@@ -175,3 +176,25 @@ def test_the_demo_runs_from_the_wheel_and_ends_with_the_page(from_wheel, tmp_pat
     assert re.fullmatch(r"simulate a town, Train \.\.\. \d+\.\d s", lines[0])
     page = re.fullmatch(r"page +(\S+) +\(open it in a browser\)", lines[-1])
     assert Path(page[1]).read_text().startswith("<!doctype html>")
+
+
+@pytest.mark.slow
+def test_the_source_archive_installs_and_makes_the_same_wheel(from_wheel, tmp_path):
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as tar:
+        tar.extractall(tmp_path, filter="data")
+    (folder,) = tmp_path.glob("carlasc-*/")
+    assert {"carlasc", "converters", "examples", "docs", "tests"} <= {path.name for path in folder.iterdir()}
+    assert not (folder / "tests" / "data").exists() and not (folder / ".ci").exists()
+    held = []
+    for place in (ROOT, folder):
+        out = tmp_path / f"wheel of {place.name}"
+        command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(out)]
+        subprocess.run(command, cwd=place, check=True, capture_output=True)
+        with ZipFile(next(out.glob("*.whl"))) as wheel:
+            held.append({one.filename: one.CRC for one in wheel.infolist() if ".dist-info/" not in one.filename})
+    assert held[0] == held[1]
+    ran = from_wheel("--version", archive=archive)
+    assert (ran.returncode, ran.stdout.strip()) == (0, carlasc.__version__), ran.stderr

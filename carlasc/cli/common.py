@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,7 @@ else:
 
 _Number = TypeVar("_Number", int, float)
 
+_LINE_S = 10.0  # between two lines of progress where there is no terminal
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also one that lost a slash; a drive has one letter
@@ -169,7 +171,7 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
 def progress_bar(
     description: str, unit: str = "frames", *, transient: bool = False
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar on stderr while the block runs, if stderr is a terminal.
+    """Show progress on stderr while the block runs: a bar on a terminal, and else a line every ten seconds.
 
     Args:
         description: what is being done.
@@ -190,6 +192,9 @@ def progress_bar(
     )
 
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(description, unit)
+        return
     columns = (
         "{task.description}",
         BarColumn(),
@@ -198,9 +203,22 @@ def progress_bar(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=transient) as progress:
         task = progress.add_task(description, total=None)
         yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _lines(description: str, unit: str) -> Callable[[int, int], None]:
+    """Return a callback of (done, total) that prints a line on stderr, at most one every `_LINE_S` seconds."""
+    start = last = time.monotonic()
+
+    def show(done: int, total: int) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= _LINE_S:
+            last = now
+            echo(f"{description}: {done} of {total} {unit}, {now - start:.0f} s", err=True)
+
+    return show
 
 
 def console() -> Console:

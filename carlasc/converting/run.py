@@ -189,27 +189,23 @@ def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec,
 
 
 def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
-    """Return a note on how many points lie above or below the grid, if many do, from a few scans of a few sequences."""
-    inside = above = below = 0
+    """Return a note on how many points lie above the grid, if many do, from a few scans of a few sequences.
+
+    What lies below it is noted where the ground is measured.
+    """
+    within = above = 0
     for sequence in list(source.values())[:_LOOKED_AT]:
         frames = sequence.frames("points")
         for frame in frames[:: max(len(frames) // _LOOKED_AT, 1)][:_LOOKED_AT]:
             axes = spec.to_axes(sequence.read("points", int(frame))[:, :3])
             heights = axes[((axes >= spec.lower) & (axes < spec.upper))[:, :2].all(axis=1), 2]
-            above += int(np.count_nonzero(heights >= spec.upper[2]))
-            below += int(np.count_nonzero(heights < spec.lower[2]))
-            inside += len(heights)
-    shares = [
-        f"{100 * count / inside:.0f} % {where} it (z {sign} {limit:g} m)"
-        for count, where, sign, limit in ((above, "above", ">", spec.upper[2]), (below, "below", "<", spec.lower[2]))
-        if count > _MANY * inside
+            within, above = within + len(heights), above + int(np.count_nonzero(heights >= spec.upper[2]))
+    if above <= _MANY * within:
+        return []
+    return [
+        f"{source.location}: {100 * above / within:.0f}% of the points between the sides of the grid are above it (z > {spec.upper[2]:g} m);"
+        " the scans keep them, and --bounds makes a higher grid"
     ]
-    advice = "scans keep them, and --bounds makes a higher grid"
-    return (
-        [f"{source.location}: of the points between the sides of the grid {' and '.join(shares)} lie; {advice}"]
-        if shares
-        else []
-    )
 
 
 def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from helpers.datasets.captures import read_tree, write_capture
 from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
-from carlasc.cli import app
+from carlasc.cli import app, common
 from carlasc.cli.grid_flags import GridFlags
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
@@ -32,6 +33,14 @@ def test_inside_a_sequences_folder_res_is_all_it_needs(capture):
     assert result.stderr == ""  # no bar where there is no terminal
     assert (capture / "cartesian/evaluation_256x256x15/000002.bin").stat().st_size == 256 * 256 * 15 * 4
     assert "0 frames made (3 existed)" in _regrid("--res", 0.2).stdout
+
+
+def test_where_there_is_no_terminal_long_work_prints_a_line_now_and_then(capture, monkeypatch):
+    monkeypatch.setattr(common, "_LINE_S", 0)
+    result = _regrid("--res", 0.8)
+    lines = result.stderr.splitlines()[-3:]
+    assert [re.fullmatch(r"regrid: (\d) of 3 frames, \d+ s", line)[1] for line in lines] == ["1", "2", "3"]
+    assert result.stdout.splitlines()[0] == "cartesian/evaluation_64x64x4"
 
 
 def test_the_published_cartesian_grid_is_called_evaluation_and_another_of_its_size_is_not(capture):

@@ -90,6 +90,24 @@ def test_bounds_that_are_given_are_kept_and_a_note_says_what_is_below(tmp_path):
     assert not (sequence.grid(name, 1).labels == 7).any()
 
 
+@pytest.mark.parametrize(("up", "said"), [(1.0, True), (30.0, False)])
+def test_a_note_says_what_share_of_the_points_is_above_the_grid(up, said, tmp_path):
+    (tmp_path / "drive").mkdir()
+    spec = GridSpec("cartesian", (16, 16, 8), (-25.6, -25.6, -2.0), (25.6, 25.6, up))
+    grids = GridOptions(spec, observe=ALONE, follow_ground=False)
+    result = convert(drive_at(1.8), tmp_path / "drive", tmp_path / "out", grids=grids, run=Run(workers=1))
+    notes = [note for note in result.notes if "above it" in note]
+    assert len(notes) == said
+    if said:
+        (sequence,) = carlasc.open(tmp_path / "out").values()
+        points = np.concatenate([sequence.scan(frame).points for frame in sequence])
+        heights = points[(np.abs(points[:, :2]) < 25.6).all(axis=1), 2]
+        share = f"{100 * np.mean(heights >= up):.0f}%"
+        assert notes[0].startswith(
+            f"{tmp_path / 'out'}: {share} of the points between the sides of the grid are above it (z > 1 m)"
+        )
+
+
 def test_a_regrid_says_what_is_below_its_grid(tmp_path):
     sequence, _, _ = converted(2.6, tmp_path)
     result = carlasc.regrid(sequence.location, COARSE, tmp_path / "more", observe=ALONE, run=Run(workers=1))

@@ -263,7 +263,9 @@ def test_data_without_classes_are_shown_by_height_at_first(browser, tmp_path):
         labels = np.fromfile(file, np.uint32)
         np.where(labels > 0, 3 if file.parent.name == "evaluation" else 0, 0).astype(labels.dtype).tofile(file)
     page = Page(browser, view(folder, tmp_path / "a.html").out)
-    assert page.run("return document.getElementById('color-by').value") == "height" and page.text("#ramp").startswith("HEIGHT")
+    assert page.run("return document.getElementById('color-by').value") == "height" and page.text("#ramp").startswith(
+        "HEIGHT"
+    )
     ramp = [colored(page.canvas("page_height"), color).mean() for color in ((68, 1, 84), (253, 231, 37))]
     choose(page, "#color-by", "class")
     assert min(ramp) > 0.001 and not colored(page.canvas(), (253, 231, 37)).any()
