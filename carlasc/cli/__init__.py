@@ -14,7 +14,7 @@ import typer
 from carlasc.cli.commands import Command, CommandGroup
 from carlasc.cli.common import echo
 from carlasc.cli.flags import flatten
-from carlasc.core.first_use import note_compiling
+from carlasc.core.first_use import note_compiling, say_compiling
 
 if TYPE_CHECKING:
     from carlasc.converting import OptionDeclaration
@@ -162,5 +162,5 @@ def _root(
 def main() -> None:
     """Run the command line: the entry point `carlasc`."""
     if sys.stderr is not None and sys.stderr.isatty():  # as progress: logs and programs that read stderr are not told
-        note_compiling(lambda: echo("compiling (once per machine) ...", err=True))
+        note_compiling(say_compiling)
     app()

@@ -6,12 +6,17 @@ from which compiled loops take their decorators, connects what was asked for wit
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from threading import Timer
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.synchronize import Semaphore
 
 _asked: list[CompilingNote] = []
+_wishes: list[tuple[Callable[[], None], float]] = []  # what workers are given
 
 
 class CompilingNote:
@@ -51,13 +56,36 @@ class CompilingNote:
 
 
 def note_compiling(tell: Callable[[], None], after_s: float = 1.0) -> None:
-    """Call a function once this process has compiled for some time, now or later. Worker processes are processes of their own.
+    """Call a function once this process, or the first of the worker processes that it starts later, has compiled for some time.
 
     Args:
-        tell: the function.
+        tell: the function; workers find it by its name in its module.
         after_s: the time, seconds.
     """
+    _wishes.append((tell, after_s))
     _asked.append(CompilingNote(tell, after_s))
+
+
+def say_compiling() -> None:
+    """Say on stderr that loops are compiled."""
+    sys.stderr.write("compiling (once per machine) ...\n")
+    sys.stderr.flush()
+
+
+def wishes() -> tuple[tuple[Callable[[], None], float], ...]:
+    """Return (function, time) of what `note_compiling` was asked in this process."""
+    return tuple(_wishes)
+
+
+def note_in_workers(wishes: tuple[tuple[Callable[[], None], float], ...], first: Semaphore) -> None:
+    """Do in a worker process what its parent was asked; `first` lets one worker tell and no other."""
+    for tell, after_s in wishes:
+
+        def once(tell: Callable[[], None] = tell) -> None:
+            if first.acquire(block=False):
+                tell()
+
+        note_compiling(once, after_s)
 
 
 def connect() -> None:

@@ -12,8 +12,10 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing import parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.synchronize import Semaphore
 from typing import Any
 
+from carlasc.core.first_use import note_in_workers, wishes
 from carlasc.errors import CarlascError
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -170,7 +172,12 @@ class _ProcessGroup(ProcessPoolExecutor):
 
     def __init__(self, workers: int) -> None:
         self._context = _NotingContext()
-        super().__init__(workers, mp_context=self._context, initializer=_prepare_worker)
+        super().__init__(
+            workers,
+            mp_context=self._context,
+            initializer=_prepare_worker,
+            initargs=(self._context.Semaphore(), wishes()),
+        )
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         try:
@@ -221,7 +228,8 @@ def inherited_by_workers() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _prepare_worker() -> None:
+def _prepare_worker(first: Semaphore, wishes: tuple[tuple[Callable[[], None], float], ...]) -> None:
+    note_in_workers(wishes, first)
     signal.signal(signal.SIGTERM, _exit_worker)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

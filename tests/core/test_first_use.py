@@ -76,6 +76,41 @@ def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_
     assert told(tmp_path / "short", 60) == 0
 
 
+WORKERS = """
+import sys
+from carlasc.core import first_use
+from carlasc.running.pools import OwnProcesses
+
+def work(number):
+    from carlasc.metrics.confusion import ConfusionMatrix
+    import numpy as np
+    return ConfusionMatrix(3).update(np.ones(9, int), np.ones(9, int), np.ones(9, bool)).total
+
+if __name__ == "__main__":
+    first_use.note_compiling(first_use.say_compiling, after_s=1.0)
+    with OwnProcesses(2) as pool:
+        print([pool.submit(work, n).result() for n in range(4)])
+"""
+
+
+@pytest.mark.slow
+def test_of_several_workers_that_compile_one_says_so(tmp_path):
+    (tmp_path / "script.py").write_text(WORKERS.replace("after_s=1.0", "after_s=0.01"))
+    said = []
+    for _ in range(2):
+        ran = subprocess.run(
+            [sys.executable, str(tmp_path / "script.py")],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+        )
+        assert ran.stdout == "[9, 9, 9, 9]\n"
+        said.append(ran.stderr.count("compiling (once per machine)"))
+    assert said == [1, 0]
+
+
 def test_the_time_of_several_loops_is_added_up(monkeypatch):
     times, notes, timers = iter([0.0, 0.7, 5.0, 5.2]), [], []
 

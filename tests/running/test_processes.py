@@ -152,7 +152,7 @@ def is_alive(process: int) -> bool:
 def test_a_worker_that_is_told_to_end_between_tasks_leaves_the_next_one_whole():
     code = (
         "import os, signal, threading; from multiprocessing import Pipe; from carlasc.running import pools\n"
-        "pools._prepare_worker(); tasks, _writer = Pipe(duplex=False)\n"
+        "pools._prepare_worker(None, ()); tasks, _writer = Pipe(duplex=False)\n"
         "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()\n"
         "try: tasks.recv()\n"
         "except BaseException: print('the rest of the task is in the pipe', flush=True)"
