@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib import metadata
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers.processes import jobs
@@ -131,7 +132,9 @@ ORIGINS = {
 
 @pytest.mark.parametrize(("origin", "command"), ORIGINS.items(), ids=map(str, ORIGINS))
 def test_an_extra_is_installed_from_where_carlasc_came(origin, command, monkeypatch):
-    monkeypatch.setattr(metadata.PathDistribution, "read_text", lambda self, name: origin)
+    monkeypatch.setattr(
+        metadata, "distribution", lambda name: SimpleNamespace(read_text={"direct_url.json": origin}.get)
+    )
     assert install_command("zarr") == command
 
 

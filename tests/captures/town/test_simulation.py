@@ -181,7 +181,7 @@ def test_without_a_package_of_the_extra_nothing_is_written(
     for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(DependencyError, match=rf"{package} .*pip install 'carlasc\[{extra}\]'"):
+    with pytest.raises(DependencyError, match=rf"{package} .*pip install .*\[{extra}\]'"):
         run(tmp_path / "out", count=1, sensors=1)
     assert not (tmp_path / "out").exists()
 
