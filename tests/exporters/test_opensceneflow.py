@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from carlasc_converters.exporters import opensceneflow
 from helpers.datasets.exported import files_and_bytes, read_index
 
 from carlasc.converting import export
@@ -18,7 +19,8 @@ h5py = pytest.importorskip("h5py")
 
 CARLA = dict(zip(KINDS, (0, 7, 1, 9, 5, 10, 10, 4, 4), strict=True))
 DRIVE = SimulatedDrive(frames=4, channels=10, columns=90)
-FIRST, LAST = "0", "300000000"
+TIMES = [str(10**18 + 10**8 * frame) for frame in range(4)]
+FIRST, LAST = TIMES[0], TIMES[-1]
 THINGS = dict(enumerate((thing for thing in DRIVE.things if thing.kind in MOVABLE), 1))
 
 
@@ -90,7 +92,7 @@ def test_flow_is_where_points_are_in_the_next_scan(tmp_path, axes, leave_out):
     assert (result.made, result.failures) == (4, ())
     assert result.sequences == {"Train/Street.1/cartesian": "train/Street_1.h5"}
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
-    assert sorted(log, key=int) == ["0", "100000000", "200000000", "300000000"]
+    assert sorted(log) == TIMES  # as text too, as the loader orders them
     for frame, time in enumerate(sorted(log, key=int)):
         scan, group = DRIVE.scan(frame), log[time]
         assert np.array_equal(group["lidar"], scan.deskewed[:, :3])
@@ -123,6 +125,7 @@ def test_a_scan_has_the_types_of_the_format(tmp_path):
         "pose": ("float64", (4,)),
         "flow": ("float32", (3,)),
         "flow_is_valid": ("bool", ()),
+        "eval_mask": ("bool", ()),
         "flow_category_indices": ("uint8", ()),
         "flow_instance_id": ("int16", ()),
         "ego_motion": ("float64", (4,)),
@@ -153,7 +156,7 @@ def test_flow_is_not_valid_where_a_box_vanishes(tmp_path):
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
     assert (DRIVE.scan(0).instances == 1).sum() > 3
     assert np.array_equal(log[FIRST]["flow_is_valid"], DRIVE.scan(0).instances != 1)
-    assert log["100000000"]["flow_is_valid"].all()
+    assert log[TIMES[1]]["flow_is_valid"].all()
 
 
 def test_nothing_is_known_of_scans_without_annotations_and_flow(tmp_path):
@@ -161,7 +164,7 @@ def test_nothing_is_known_of_scans_without_annotations_and_flow(tmp_path):
     (tmp_path / "in" / "Train/Street.1/cartesian/boxes/000001.bin").unlink()
     export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
-    valid = [log[time]["flow_is_valid"] for time in ("0", "100000000", "200000000")]
+    valid = [log[time]["flow_is_valid"] for time in TIMES[:3]]
     assert [bool(array.any()) for array in valid] == [False, False, True]
 
 
@@ -183,10 +186,29 @@ def test_the_index_lists_all_logs_of_a_folder(tmp_path):
     write_drive(tmp_path / "more", path="Train/Second/cartesian")
     export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     export("opensceneflow", tmp_path / "more", tmp_path / "out", run=Run(workers=1))
-    times = ["0", "100000000", "200000000", "300000000"]
     index = read_index(tmp_path / "out" / "train" / "index_total.pkl")
-    assert index == [[log, time] for log in ("Second", "Street_1") for time in times]
-    assert read_index(tmp_path / "out" / "val" / "index_total.pkl") == [["Other", time] for time in times]
+    assert index == [[log, time] for log in ("Second", "Street_1") for time in TIMES]
+    assert read_index(tmp_path / "out" / "val" / "index_total.pkl") == [["Other", time] for time in TIMES]
+    flows = read_index(tmp_path / "out" / "train" / "index_flow.pkl")
+    assert flows == [[log, time] for log in ("Second", "Street_1") for time in TIMES[:3]]  # the last scan has none
+    assert read_index(tmp_path / "out" / "train" / "index_eval.pkl") == [["Second", FIRST], ["Street_1", FIRST]]
+
+
+def test_every_fifth_scan_with_flow_is_evaluated_where_points_are_near_and_not_on_the_ground(tmp_path, monkeypatch):
+    monkeypatch.setattr(opensceneflow, "_EVALUATED", 2)
+    monkeypatch.setattr(opensceneflow, "_EVALUATED_M", 15.0)
+    write_drive(tmp_path / "in", drop=((1, 1),))
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    index = read_index(tmp_path / "out" / "train" / "index_eval.pkl")
+    assert index == [["Street_1", TIMES[0]], ["Street_1", TIMES[2]]]
+    total = read_index(tmp_path / "out" / "train" / "index_total.pkl")
+    assert all(
+        entry in total and total.index(entry) < len(total) - 1 for entry in index
+    )  # the loader reads the next scan too
+    group = read_log(tmp_path / "out" / "train" / "Street_1.h5")[FIRST]
+    near = (np.abs(group["lidar"][:, :2]) <= 15).all(axis=1)
+    assert np.array_equal(group["eval_mask"], near & ~group["ground_mask"] & group["flow_is_valid"])
+    assert 0 < group["eval_mask"].sum() < near.sum() < len(near)
 
 
 def test_an_interrupted_export_gives_the_same_bytes(tmp_path):

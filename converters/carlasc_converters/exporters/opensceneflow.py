@@ -1,6 +1,6 @@
-"""Sequences of the layout as the files of OpenSceneFlow: one HDF5 file per log, with a group per scan, and `index_total.pkl`.
+"""Sequences of the layout as the files of OpenSceneFlow: one HDF5 file per log, with a group per scan, and the indices of its loader.
 
-The pickled index is written, because the loader of the other project needs it. No pickle is ever read here.
+The pickled indices are written, because the loader of the other project needs them. No pickle is ever read here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ from carlasc.motion import ground_points
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 
-_INDEX = "index_total.pkl"
+_EVALUATED = 5  # every fifth scan with flow is evaluated, as by the project's own script
+_EVALUATED_M = 50.0  # points within this distance along x and y are evaluated, as in the challenge of Argoverse 2
+_FIRST_NS = (
+    10**18
+)  # name of the first scan's group: the loader orders names as text, so all need the same number of digits
 _PROTOCOL = 4  # of the pickle: fixed, so that the bytes do not depend on the version of Python
 
 # Argoverse 2's categories in alphabetical order, from 1; 0 is none.
@@ -49,7 +53,7 @@ CATEGORIES: Mapping[str, Mapping[int, int]] = {
 class OpenSceneFlowExporter(SequenceExporter):
     """Writes scans, poses and scene flow. Points have right-handed axes and their origin at the sensor."""
 
-    title = "OpenSceneFlow: SPLIT/LOG.h5 and SPLIT/index_total.pkl"
+    title = "OpenSceneFlow: SPLIT/LOG.h5 and SPLIT/index_total.pkl, index_flow.pkl, index_eval.pkl"
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:
         """Return the root for each name: the split is in the name of the file."""
@@ -88,16 +92,24 @@ class OpenSceneFlowExporter(SequenceExporter):
 
     def frames_in(self, path: Path, sequence: storage.Sequence) -> list[int]:
         """Return the frames that a file has a group for."""
-        groups = set(_timestamps_in(path))
+        groups = set(_scans_in(path))
         return [frame for frame, timestamp in self._timestamps(sequence).items() if timestamp in groups]
 
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
-        """Return the index of each folder that was written to, with the logs that were in it already."""
+        """Return the indices of each folder that was written to, with the logs that were in it already.
+
+        They list all scans, those with flow, and those that are evaluated.
+        """
         folders = {(root / self.file(part.sequence)).parent for part in exported}
         made: dict[str, bytes] = {}
         for folder in sorted(folders):
-            entries = [[path.stem, time] for path in sorted(folder.glob("*.h5")) for time in _timestamps_in(path)]
-            made[(folder / _INDEX).relative_to(root).as_posix()] = pickle.dumps(entries, _PROTOCOL)
+            logs = {path.stem: _scans_in(path) for path in sorted(folder.glob("*.h5"))}
+            flows = {log: [time for time, has_flow in scans.items() if has_flow] for log, scans in logs.items()}
+            chosen = {"total": logs, "flow": flows, "eval": {log: times[::_EVALUATED] for log, times in flows.items()}}
+            for name, scans in chosen.items():
+                entries = [[log, time] for log, times in scans.items() for time in times]
+                place = (folder / f"index_{name}.pkl").relative_to(root).as_posix()
+                made[place] = pickle.dumps(entries, _PROTOCOL)
         return made
 
     def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, NDArray[Any]]:
@@ -138,10 +150,12 @@ class OpenSceneFlowExporter(SequenceExporter):
                 invert(_pose(sequence, following)) @ pose, _seconds(sequence, following) - _seconds(sequence, frame)
             )
             made |= step.flow(points, velocity, read.get("instances"), now, later)
+            near = (np.abs(points[:, :2]) <= _EVALUATED_M).all(axis=1)
+            made["eval_mask"] = near & ~made["ground_mask"] & made["flow_is_valid"]
         return made
 
     def _timestamps(self, sequence: storage.Sequence) -> dict[int, str]:
-        """Return the name of each frame's group: nanoseconds since the first scan.
+        """Return the name of each frame's group: its time in nanoseconds, after that of the first scan, which is always the same.
 
         Raises:
             FormatError: times do not increase.
@@ -152,7 +166,7 @@ class OpenSceneFlowExporter(SequenceExporter):
             if after <= before:
                 where = f"{sequence.location}/{layout.TIMES}"
                 raise FormatError(where, expected="times that increase", found=f"{after / 1e9:g} s at frame {frame}")
-        return dict(zip(frames, map(str, times), strict=True))
+        return {frame: str(_FIRST_NS + time) for frame, time in zip(frames, times, strict=True)}
 
 
 class _Step:
@@ -235,10 +249,11 @@ def _owners(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.uint32]:
     return np.append(boxes.tracks, np.uint32(0))[rows]
 
 
-def _timestamps_in(path: Path) -> list[str]:
+def _scans_in(path: Path) -> dict[str, bool]:
+    """Return the names of the scans of a log in their order, and whether each has flow."""
     try:
         with import_extra("h5py", "hdf5").File(path, "r") as file:
-            return sorted(file, key=int)
+            return {name: "flow" in file[name] for name in sorted(file, key=int)}
     except (OSError, ValueError) as error:
         advice = "remove the file, or export again with `overwrite=True`"
         raise FormatError(path, expected="an HDF5 file of scans", found="something else", advice=advice) from error
