@@ -105,9 +105,10 @@ class OpenSceneFlowExporter(SequenceExporter):
         for folder in sorted(folders):
             logs = {path.stem: _scans_in(path) for path in sorted(folder.glob("*.h5"))}
             flows = {log: [time for time, has_flow in scans.items() if has_flow] for log, scans in logs.items()}
-            chosen = {"total": logs, "flow": flows, "eval": {log: times[::_EVALUATED] for log, times in flows.items()}}
-            for name, scans in chosen.items():
-                entries = [[log, time] for log, times in scans.items() for time in times]
+            total = {log: list(scans) for log, scans in logs.items()}
+            evaluated = {log: times[::_EVALUATED] for log, times in flows.items()}
+            for name, chosen in (("total", total), ("flow", flows), ("eval", evaluated)):
+                entries = [[log, time] for log, times in chosen.items() for time in times]
                 place = (folder / f"index_{name}.pkl").relative_to(root).as_posix()
                 made[place] = pickle.dumps(entries, _PROTOCOL)
         return made
