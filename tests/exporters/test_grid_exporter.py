@@ -1,6 +1,7 @@
 """Voxel grids as Occ3D, OpenOccupancy and SSCBench have them, read again by the facts of these formats."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -66,6 +67,27 @@ def test_occ3d_masks_what_no_voxel_of_the_source_knows(occ3d):
         for unknown in ((-7, 0, 0.1), (20, 0, 0.1), (1, 0, 5.3)):  # no votes, beside the grid, above it
             assert array["mask_lidar"][occ3d_cell(*unknown)] == 0
             assert array["semantics"][occ3d_cell(*unknown)] == 17
+
+
+def test_occ3d_says_that_the_mask_of_cameras_is_a_copy(occ3d):
+    annotations, _ = read_occ3d(occ3d[0], NAME)
+    assert annotations["carlasc"] == "mask_camera is a copy of mask_lidar, because no cameras are known"
+    assert sum(annotations["carlasc"] in note for note in occ3d[1].notes) == 1
+
+
+@pytest.mark.parametrize("name", GRID_FORMATS)
+def test_structure_without_a_class_of_its_own_is_said_to_become_something(tmp_path, name):
+    write_scene(tmp_path / "in", frames=1)
+    plain = export(name, tmp_path / "in", tmp_path / "plain", run=Run(workers=1))
+    assert not any("without a class of its own" in note for note in plain.notes)
+    (place,) = (tmp_path / "in").glob("**/small/000000.label")
+    labels = np.fromfile(place, np.uint32)
+    labels[np.flatnonzero(labels)[::3]] = 10
+    np.where((labels > 0) & (labels != 10), 3, labels).astype(np.uint32).tofile(place)
+    result = export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    (note,) = [note for note in result.notes if "without a class of its own" in note]
+    becomes = {"occ3d": "class 0 of occ3d", "openoccupancy": "class 0 of openoccupancy", "sscbench": "sscbench"}[name]
+    assert re.search(rf"small: 6\d% of the occupied voxels are Other, .* they become .*{becomes}$", note)
 
 
 def test_occ3d_names_scenes_frames_and_poses(occ3d):
@@ -227,7 +249,7 @@ def test_the_exact_grid_is_exported_voxel_for_voxel(tmp_path, name):
     writer.write("whole/labels", 0, labels)
     writer.write("whole/counts", 0, counts.astype(np.float32))
     result = export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    assert not result.notes
+    assert [note for note in result.notes if "mask_camera" not in note] == []
     mirrored, known = labels[:, ::-1], counts[:, ::-1]
     if name == "occ3d":
         (array,) = read_occ3d(tmp_path / "out", NAME)[1].values()

@@ -22,6 +22,7 @@ GridName = Annotated[
     "Grid that is exported. Default: the one with exactly the voxels of the other data set, else the one of the smallest voxels.",
 ]
 Predictions = Annotated[bool, "The grids are the output of a network, without counts: all of their voxels are known."]
+_MOSTLY = 0.5  # of the occupied voxels: a share above which structure has no class of its own
 _CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
 
 
@@ -68,7 +69,24 @@ class GridExporter(FrameExporter):
             notes.append(
                 f"`carlasc regrid SOURCE --observe scans --size {size} --bounds {bounds} --name {self.slug}` makes the exact grid"
             )
-        return notes
+        return notes + self._structure_without_class(sequence, name)
+
+    def _structure_without_class(self, sequence: storage.Sequence, name: str) -> list[str]:
+        """Return a note on what structure becomes, if the first frame shows that it has no class of its own, as where there were boxes only."""
+        table, frames = sequence.classes_of(name), sequence.frames(f"{name}/labels")
+        if not len(frames):
+            return []
+        occupied = np.asarray(sequence.read(f"{name}/labels", int(frames[0])))
+        occupied = occupied[occupied > 0]
+        share = np.mean(occupied == table.geometry_id) if occupied.size else 0.0
+        if share <= _MOSTLY:
+            return []
+        becomes = mapping_of(self.maps, self.kind, table, sequence.location)[table.geometry_id]
+        what = "unknown voxels" if becomes == IGNORED else f"class {becomes}"
+        return [
+            f"{sequence.location}/{name}: {share:.0%} of the occupied voxels are {table.names[table.geometry_id]}, structure without a class of its own:"
+            f" they become {what} of {self.slug}"
+        ]
 
     def frames(self, sequence: storage.Sequence) -> list[int]:
         """Return the frames that have the grid."""

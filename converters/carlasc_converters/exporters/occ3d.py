@@ -26,6 +26,7 @@ from carlasc.storage.files import parse_json
 from carlasc_converters.exporters.grid_exporter import GridExporter, GridName, Predictions, sensor_height
 
 _ANNOTATIONS = "annotations.json"
+_CAMERAS = "mask_camera is a copy of mask_lidar, because no cameras are known"
 _SPLITS = {"Train": "train_split", "Val": "val_split", "Test": "test_split"}
 
 
@@ -72,6 +73,8 @@ class Occ3dExporter(GridExporter):
             notes.append(f"the height of the sensor is not known, and taken to be {height:g} m: `height_m` sets it")
         if layout.POSES not in sequence.documents():
             notes.append(f"{sequence.location} has no poses: annotations.json has none either")
+        if not self.predictions:
+            notes.append(f"{_CAMERAS}: do not train or score with camera masks")
         return notes + super().check(sequence)
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:
@@ -103,7 +106,7 @@ class Occ3dExporter(GridExporter):
                     names.add(part.sequence.name)
             scenes[part.sequence.name] = self._scene(part)
         lists = {key: sorted(names) for key, names in splits.items() if names or key != "test_split"}
-        content = lists | {"scene_infos": {name: scenes[name] for name in sorted(scenes)}}
+        content = lists | {"carlasc": _CAMERAS, "scene_infos": {name: scenes[name] for name in sorted(scenes)}}
         return {_ANNOTATIONS: json.dumps(content, indent=1).encode()}
 
     def _scene(self, part: Exported) -> dict[str, Any]:
