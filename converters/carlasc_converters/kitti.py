@@ -35,7 +35,7 @@ from carlasc_converters.kitti_files import (
 )
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
-_STANDING = {  # class of moving actors -> class of the same actors when they stand
+STANDING = {  # class of moving actors -> class of the same actors when they stand
     moving: SEMANTICKITTI.id_of(SEMANTICKITTI.names[moving].removeprefix("moving-")) for moving in SEMANTICKITTI.moving
 }
 _TEST_FIRST, _VALIDATION = 11, 8
@@ -208,4 +208,6 @@ def _split_of(name: str) -> Split:
 
 
 _CLASS_PART = np.arange(1 << 16, dtype=np.uint32) << 16
-_CLASS_PART[list(_STANDING)] = _CLASS_PART[list(_STANDING.values())]
+_CLASS_PART[list(STANDING)] = _CLASS_PART[list(STANDING.values())]
+CLASS_PARTS = np.unique(_CLASS_PART[[label for label in SEMANTICKITTI.names if label]])
+"""What the classes of actors add to the numbers of SemanticKITTI."""

@@ -42,16 +42,15 @@ def test_scans_and_voxels_come_back_as_they_were(there_and_back, name, suffix):
     assert before == after
 
 
-def test_classes_come_back_as_they_were_and_instances_are_0(there_and_back):
+def test_classes_and_instances_come_back_as_they_were(there_and_back):
     before, after = (frame_files(folder, "labels", ".label") for folder in there_and_back)
-    assert before.keys() == after.keys()
-    for name in before:
-        assert np.array_equal(np.frombuffer(before[name], "<u4") & 0xFFFF, np.frombuffer(after[name], "<u4"))
+    assert before == after
+    assert sum((np.frombuffer(data, "<u4") >> 16).any() for data in before.values()) > 5
 
 
 def test_poses_come_back(there_and_back):
     before, after = (SemanticKitti(folder).sequences()[0].poses().world_T_vehicle for folder in there_and_back)
-    assert np.abs(np.linalg.inv(before[0]) @ before - after).max() < 1e-6
+    assert np.abs(np.linalg.inv(before[0]) @ before - after).max() < 1e-9
 
 
 def test_the_mirrored_frame_comes_back_too(simulated, tmp_path):
@@ -66,6 +65,7 @@ def test_the_mirrored_frame_comes_back_too(simulated, tmp_path):
     export("kitti", tmp_path / "middle", tmp_path / "back", run=Run(workers=1))
     before, after = simulated[1].folder, tmp_path / "back" / "sequences" / "00"
     assert frame_files(before, "velodyne", ".bin") == frame_files(after, "velodyne", ".bin")
+    assert frame_files(before, "labels", ".label") == frame_files(after, "labels", ".label")
     assert frame_files(before, "voxels", ".label") == frame_files(after, "voxels", ".label")
     poses = SemanticKitti(after).sequences()[0].poses().world_T_vehicle
     assert np.abs(simulated[1].poses - poses).max() < 1e-6

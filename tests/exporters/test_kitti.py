@@ -59,6 +59,46 @@ def test_a_grid_of_carlasc_gets_masks_by_the_rules(tmp_path):
     assert np.array_equal(bits["occluded"], occluded_voxels(expected > 0, SPEC))
 
 
+def write_points(root, labels, classes="carla", **fields):
+    writer = FolderSink(root).sequence("Val/Town07_Light/cartesian")
+    writer.write("points", 0, np.zeros((len(labels), 4), np.float32))
+    writer.write("labels", 0, np.array(labels, np.uint32))
+    for name, values in fields.items():
+        writer.write(name, 0, values)
+    writer.write_document("carlasc.json", to_json({"frame": "carlasc", "classes": classes}))
+
+
+def exported_labels(root, out, **options):
+    result = export("kitti", root, out, options=options, run=Run(workers=1))
+    return result, np.fromfile(out / "sequences/00/labels/000000.label", "<u4") if result.made else None
+
+
+def test_points_that_move_get_classes_that_move_and_actors_keep_their_numbers(tmp_path):
+    flow = np.array([[9.8, 0, 0], [0.3, 0, 0], [0, -1.2, 0], [5, 0, 0], [0, 0, 0]], np.float32)
+    instances = np.array([7, 8, 65535, 0, 0], np.uint32)
+    write_points(tmp_path / "in", [10, 10, 4, 1, 0], flow=flow, instances=instances)
+    _, both = exported_labels(tmp_path / "in", tmp_path / "out")
+    assert list(both & 0xFFFF) == [252, 10, 254, 50, 0]  # buildings have no class that moves
+    assert list(both >> 16) == instances.tolist()
+    _, both = exported_labels(tmp_path / "in", tmp_path / "moving", labels="moving")
+    assert list(both & 0xFFFF) == [251, 9, 251, 9, 0]
+
+
+def test_classes_that_move_are_kept_whatever_the_flow_says(tmp_path):
+    write_points(tmp_path / "in", [252, 10, 1], "semantickitti", flow=np.zeros((3, 3), np.float32) + [[0], [9], [0]])
+    assert list(exported_labels(tmp_path / "in", tmp_path / "out")[1]) == [252, 10, 1]
+    assert list(exported_labels(tmp_path / "in", tmp_path / "moving", labels="moving")[1]) == [251, 9, 0]
+
+
+def test_numbers_of_actors_that_do_not_fit_are_named(tmp_path):
+    write_points(tmp_path / "in", [10, 10], instances=np.array([1, 70_000], np.uint32))
+    result, _ = exported_labels(tmp_path / "in", tmp_path / "out")
+    (failure,) = result.failures
+    assert "instances of frame 0: expected numbers of at most 16 bits, found 70000" in failure.message
+    with pytest.raises(ArgumentError, match="labels: expected one of semantic, moving, found 'binary'"):
+        exported_labels(tmp_path / "in", tmp_path / "other", labels="binary")
+
+
 def test_right_handed_sequences_are_not_mirrored(tmp_path):
     _, labels, _ = write_carlasc(tmp_path / "in", "kitti")
     export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
@@ -120,7 +160,7 @@ def test_what_cannot_be_exported_is_named(tmp_path):
         export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
     with pytest.raises(ArgumentError, match="name: expected one of kitti, .*, found 'poss'"):
         export("poss", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    with pytest.raises(ArgumentError, match="options: expected one of grid, predictions, found every"):
+    with pytest.raises(ArgumentError, match="options: expected one of grid, predictions, labels, found every"):
         export("kitti", tmp_path / "in", tmp_path / "out", options={"every": 5}, run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 

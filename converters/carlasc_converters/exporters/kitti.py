@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,12 @@ from carlasc.converting import VOXEL_FILES, Files, FrameExporter
 from carlasc.core.axes import mirror_grid, mirror_poses, mirror_spec
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
-from carlasc.errors import MissingDataError
+from carlasc.errors import FormatError, MissingDataError, check_choice
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 from carlasc_converters.exporters.grid_exporter import choose_grid, number_folders, read_points, scan_occupancy
 from carlasc_converters.exporters.occlusion import occluded_voxels
+from carlasc_converters.kitti import CLASS_PARTS, STANDING
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 
 _NAMES_OF_11 = "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
@@ -42,6 +43,10 @@ TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
     for name, mapping in TO_RAW.items()
 }
 """Name of a class table -> id -> raw id in a prediction: only ids that the evaluator scores, and 0."""
+_STANDS, _MOVES = 9, 251  # the ids of moving-object segmentation; unlabelled points and outliers stay 0
+_MOVING_M_S = 0.5  # points that are faster than this move
+_TO_MOVING = np.arange(max(SEMANTICKITTI.names) + 1)
+_TO_MOVING[list(STANDING.values())] = list(STANDING)
 _CALIBRATION = "".join(
     f"{name}: {' '.join(f'{value:.12e}' for value in np.eye(4)[:3].ravel())}\n"
     for name in ("P0", "P1", "P2", "P3", "Tr")
@@ -60,8 +65,13 @@ class KittiExporter(FrameExporter):
         predictions: Annotated[
             bool, "Grids are the output of a network. They go to predictions/, and nothing else is written."
         ] = False,
+        labels: Annotated[
+            Literal["semantic", "moving"],
+            "moving: the labels of moving-object segmentation, 9 for what stands, 251 for what moves.",
+        ] = "semantic",
     ) -> None:
-        self.grid, self.predictions = grid, predictions
+        check_choice("labels", labels, ("semantic", "moving"))
+        self.grid, self.predictions, self.labels = grid, predictions, labels
 
     @property
     def product(self) -> str:
@@ -119,14 +129,28 @@ class KittiExporter(FrameExporter):
         if f"velodyne/{frame:06d}.bin" in wanted:
             made[f"velodyne/{frame:06d}.bin"] = points.astype("<f4").tobytes()
         if f"labels/{frame:06d}.label" in wanted:
-            where = f"{sequence.location}: labels of frame {frame}"
-            labels = self._raw_ids(sequence.metadata.classes, sequence.read("labels", frame), where)
-            made[f"labels/{frame:06d}.label"] = labels.astype("<u4").tobytes()
+            labels = self._point_labels(sequence, frame)
+            both = labels.astype("<u4") | _instances(sequence, frame, len(labels)) << 16
+            made[f"labels/{frame:06d}.label"] = both.tobytes()
         if f"predictions/{frame:06d}.label" in wanted:
             made[f"predictions/{frame:06d}.label"] = self._labels(sequence, frame).astype("<u2").tobytes()
         if f"voxels/{frame:06d}.label" in wanted:
             made |= self._voxels(sequence, frame, points)
         return made
+
+    def _point_labels(self, sequence: storage.Sequence, frame: int) -> NDArray[np.integer]:
+        """Return (N,) ids of SemanticKITTI: those of moving actors where the class or the flow of a point says that it moves."""
+        table, where = sequence.metadata.classes, f"{sequence.location}: labels of frame {frame}"
+        labels = self._raw_ids(table, sequence.read("labels", frame), where)
+        if not table.moving and frame in sequence.frames("flow"):  # without classes of their own for actors that move
+            flow = np.asarray(sequence.read("flow", frame))
+            if len(flow) != len(labels):
+                where = f"{sequence.location}: flow of frame {frame}"
+                raise FormatError(where, expected=f"{len(labels)} rows, as labels", found=str(len(flow)))
+            labels = np.where(np.linalg.norm(flow, axis=1) > _MOVING_M_S, _TO_MOVING[labels], labels)
+        if self.labels == "moving":
+            labels = np.select([np.isin(labels, sorted(SEMANTICKITTI.moving)), labels > 1], [_MOVES, _STANDS], 0)
+        return labels
 
     def _voxels(self, sequence: storage.Sequence, frame: int, points: NDArray[np.float32]) -> Mapping[str, bytes]:
         """Return the original voxel files if they were kept, else files made from the grid."""
@@ -186,6 +210,35 @@ class KittiExporter(FrameExporter):
             FormatError: an id is not in the table, or nothing maps the table to SemanticKITTI's classes.
         """
         return classes_of(labels, lookup_of(self._mapping(classes, where)), classes, where)
+
+
+def _instances(sequence: storage.Sequence, frame: int, count: int) -> NDArray[np.uint32]:
+    """Return the (count,) numbers of actors in a frame as SemanticKITTI's files hold them, 0 for none.
+
+    Numbers that `convert` made of SemanticKITTI's own have the class in their upper half. The lower half is what they were.
+
+    Raises:
+        FormatError: a number needs more than 16 bits, or there are not as many as labels.
+    """
+    if frame not in sequence.frames("instances"):
+        return np.zeros(count, np.uint32)
+    instances, where = (
+        np.asarray(sequence.read("instances", frame), np.uint32),
+        f"{sequence.location}: instances of frame {frame}",
+    )
+    if len(instances) != count:
+        raise FormatError(where, expected=f"{count} rows, as labels", found=str(len(instances)))
+    numbered = instances[instances > 0]
+    if np.isin(numbered >> 16, CLASS_PARTS >> 16).all():
+        return (instances & 0xFFFF).astype(np.uint32)
+    if numbered.max(initial=0) > np.iinfo(np.uint16).max:
+        raise FormatError(
+            where,
+            expected="numbers of at most 16 bits",
+            found=str(numbered.max()),
+            advice="number the actors from 1 before exporting",
+        )
+    return instances
 
 
 def _kept_files(sequence: storage.Sequence, frame: int) -> dict[str, bytes]:
