@@ -181,6 +181,9 @@ sample: Sample = part[0]
 occupancy: NDArray[np.uint8] = sample["occupancy"]
 name: str = sample["sequence"]
 carlasc.regrid(source, carlasc.GridSpec.published("fine"), frames=range(0, 10))
+lowest: float = float(points[:, 2].min()) + float(sequence.grid("evaluation", 0).known.mean())
+rows: int = len(carlasc.info(source).to_pandas()) + len(carlasc.stats(source).to_pandas())
+best = carlasc.scores(["a.json"]).to_pandas().sort_values("mIoU")
 reveal_type(sample["known"])
 sample["nothing"]
 """
@@ -219,6 +222,7 @@ def test_a_table_of_nothing_has_no_rows_and_missing_pandas_is_one_line(tmp_path,
 @pytest.mark.slow
 def test_editors_know_the_fields_of_a_sample(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
+    (tmp_path / "mypy.ini").write_text("[mypy]\n[mypy-pandas.*]\nignore_missing_imports = true\n")
     command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "script.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
     assert 'has no key "nothing"' in found and found.count(": error:") == 1, found
