@@ -33,8 +33,9 @@ class LayoutFlags(Flags):
         str,
         typer.Option(
             help="carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: keep its ids."
+            " auto: keep those of SemanticKITTI, and else CarlaSC's."
         ),
-    ] = "carla"
+    ] = "auto"
     axes: Annotated[
         Axes,
         typer.Option(

@@ -24,7 +24,8 @@ class LayoutOptions:
     """How a conversion writes sequences.
 
     Attributes:
-        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids.
+        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids; "auto"
+            keeps those of SemanticKITTI, whose programs know no others, and maps those of other data sets.
         axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
         flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
             the actor's points, if they are numbered; "none" writes no flow.
@@ -34,7 +35,7 @@ class LayoutOptions:
         ArgumentError: unknown axes, or an unknown source of flow.
     """
 
-    classes: str = "carla"
+    classes: str = "auto"
     axes: Axes = "left"
     flow: FlowSource = "auto"
     allow_unknown: bool = False
@@ -47,10 +48,12 @@ class LayoutOptions:
         """Return the axes and the classes in which the data of a converter are written.
 
         Raises:
-            ArgumentError: `classes` is neither "carla" nor the name of the converter's class table.
+            ArgumentError: `classes` is neither "auto", "carla" nor the name of the converter's class table.
         """
-        check_choice("classes", self.classes, ("carla", converter.classes.name))
-        if self.classes == converter.classes.name:
+        own = converter.classes.name
+        check_choice("classes", self.classes, ("auto", "carla", own))
+        usual = own if converter.keeps_classes else "carla"
+        if (usual if self.classes == "auto" else self.classes) == own:
             return AxesAndClasses(converter.classes, None, self.axes == "left", self.allow_unknown)
         if converter.to_carla is None:
             raise ArgumentError(

@@ -265,6 +265,7 @@ class Converter(ABC):
         title: what it reads, in a few words.
         classes: the data set's class table.
         to_carla: maps its ids to CarlaSC's; None if nothing does, or if they are CarlaSC's: sequences keep their ids.
+        keeps_classes: whether sequences keep the data set's ids unless CarlaSC's are asked for.
         sensor: the sensor that took the scans.
         min_range_m: nearer points are left out of grids: they belong to the vehicle that carries the sensor.
         max_range_m: farther points are left out of grids: they are too sparse to tell free space from occupied space.
@@ -276,6 +277,7 @@ class Converter(ABC):
     title: ClassVar[str]
     classes: ClassTable
     to_carla: Remap | None
+    keeps_classes: bool = False
     sensor: str | None = None
     min_range_m: float | None = None
     max_range_m: float | None = None

@@ -274,6 +274,13 @@ def remap_named(name: str) -> Remap:
     return REMAPS[name]
 
 
+def benchmark_remap(classes: ClassTable) -> Remap | None:
+    """Return the remap to the classes that are usually trained and scored on: carlasc11, semantickitti19, or None for other tables."""
+    return next(
+        (r for r in REMAPS.values() if r.source == classes and r.name in ("carlasc11", "semantickitti19")), None
+    )
+
+
 def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
     """Return the remaps to apply, in order, to convert ids of one table to another: none, one, or two by way of the table CARLA.
 

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import VoxelFlag, is_confident
-from carlasc.core.tables import remap_named
+from carlasc.core.tables import benchmark_remap, remap_named
 from carlasc.dataset.fields import Values
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import Sequence, layout
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
-"""What a `remap` argument takes: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids; None keeps the ids."""
+"""What a `remap` argument takes: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids, "auto"; None keeps the ids."""
 
 _GREY = (128, 128, 128)
 
@@ -33,6 +33,8 @@ class LabelMap:
 
     def __init__(self, remap: RemapLike, classes: ClassTable) -> None:
         """Prepare the lookup table; `classes` is the table of the data."""
+        if isinstance(remap, str) and remap == "auto":
+            remap = benchmark_remap(classes)
         self._remap = None if remap is None else _as_remap(remap, classes)
         self.name = self._remap.name if self._remap else "none"
         self.source = self._remap.source if self._remap else classes

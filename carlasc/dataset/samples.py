@@ -100,7 +100,7 @@ class Dataset(_MapStyle):
         grid: str | GridSpec = layout.EVALUATION,
         grids_source: str | os.PathLike[str] | Source | None = None,
         fields: Iterable[str] = ("occupancy", "labels", "known"),
-        remap: RemapLike = "carlasc11",
+        remap: RemapLike = "auto",
         align: bool = True,
         inferred: bool = True,
         min_confidence: float = 0.0,
@@ -119,8 +119,9 @@ class Dataset(_MapStyle):
             grids_source: where grids are read from, if not from `source`, as for eval_fine.zip and eval_cylindrical.zip. Its
                 sequences are matched to those of `source` by split and name.
             fields: the fields of a sample, any of those above.
-            remap: how `labels` and `point_labels` are mapped: a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a
-                table of new ids by old id; None keeps the ids of the data.
+            remap: how `labels` and `point_labels` are mapped: "auto" to the classes that are usually trained on (carlasc11, or
+                semantickitti19; other tables keep their ids), a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table
+                of new ids by old id; None keeps the ids of the data.
             align: move past scans into the frame's sensor frame by their poses; False stacks them without moving them.
             inferred: False leaves voxels that no scan saw, but that were completed, out of `known` and `posterior`.
             min_confidence: leaves voxels that are neither free nor occupied with at least this probability out of `known` and

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.notebook import data_frame
-from carlasc.core.tables import REMAPS, remap_named, remaps_between, to_table
+from carlasc.core.tables import benchmark_remap, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
@@ -303,9 +303,7 @@ def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | Non
     if remap is None:
         return None
     if remap == "auto":
-        return next(
-            (r for r in REMAPS.values() if r.source == classes and r.name in ("carlasc11", "semantickitti19")), None
-        )
+        return benchmark_remap(classes)
     chosen = remap_named(remap) if isinstance(remap, str) else remap
     if chosen.source.name != classes.name:
         raise FormatError(f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=classes.name)

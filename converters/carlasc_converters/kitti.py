@@ -50,6 +50,7 @@ class SemanticKitti(KittiConverter):
         "Autonomous Driving?, CVPR 2012"
     )
     classes = SEMANTICKITTI
+    keeps_classes = True
     to_carla = REMAPS["semantickitti_to_carla"]
 
     def sequences(self) -> list[Recording]:

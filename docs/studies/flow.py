@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import carlasc
 from carlasc.captures import TownDrive
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.core.tables import CARLA
 from carlasc.running import Run
 
@@ -40,7 +40,7 @@ def compare(seed: int) -> NDArray[np.float64]:
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         truth = write_kitti(root / "in", drive, FRAMES, voxels_every=0)
-        convert("kitti", root / "in", root / "out", grids=None, run=Run(workers=2))
+        convert("kitti", root / "in", root / "out", layout=LayoutOptions("carla"), grids=None, run=Run(workers=2))
         (sequence,) = carlasc.open(root / "out").sequences().values()
         for number in truth.frames:
             scan, flow = sequence.scan(number), truth.flow[number] * MIRROR

@@ -89,7 +89,7 @@ def main(out: Path) -> None:
                 "kitti",
                 Path(place) / "in",
                 Path(place) / flow,
-                layout=LayoutOptions(flow=flow),
+                layout=LayoutOptions("carla", flow=flow),
                 grids=None,
                 run=Run(workers=2),
             )

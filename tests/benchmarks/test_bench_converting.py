@@ -46,7 +46,7 @@ def test_bench_convert(benchmark, source, tmp_path):
             "kitti",
             source,
             tmp_path / "out",
-            layout=LayoutOptions(flow="none"),
+            layout=LayoutOptions("carla", flow="none"),
             poses=PoseOptions(force=True),
             grids=None,
             run=Run(workers=1),

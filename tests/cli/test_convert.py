@@ -69,7 +69,7 @@ def test_failed_frames_are_listed_and_the_exit_code_is_1(source, tmp_path):
             2,
             "--grids: expected scans, because options of the grid are given, found none",
         ),
-        (("--classes", "poss"), 2, "--classes: expected one of carla, semantickitti"),
+        (("--classes", "poss"), 2, "--classes: expected one of auto, carla, semantickitti"),
         (("--sequences", "05"), 1, "expected the sequences 05, found only 00"),
         (("--color", "red"), 2, "no such option: --color"),
         (("--preset", "coarse", "--res", "0.2"), 2, "expected one of --res, --size and --preset"),

@@ -23,7 +23,9 @@ PLAIN = {"grids": None, "layout": LayoutOptions(flow="none"), "run": Run(workers
 def converted(simulated, tmp_path_factory):
     """The simulated sequence in CarlaSC's frame and classes, with SemanticKITTI's voxels."""
     out = tmp_path_factory.mktemp("converted")
-    result = convert("kitti", simulated[0], out, layout=LayoutOptions(flow="none"), grids="voxels", run=Run(workers=2))
+    result = convert(
+        "kitti", simulated[0], out, layout=LayoutOptions("carla", flow="none"), grids="voxels", run=Run(workers=2)
+    )
     assert (result.made, result.skipped, result.failures) == (24, 0, ())
     return out
 
