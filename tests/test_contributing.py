@@ -17,7 +17,7 @@ from carlasc.converting.scan_stage import make_fields
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans
-from carlasc.storage import FolderSink, FolderSource, layout
+from carlasc.storage import FolderSink, FolderSource, field_files, layout
 
 PAGE = Path(__file__).parents[1] / "docs/contributing.md"
 PATH = "Train/Town01_Light/cartesian"
@@ -30,7 +30,7 @@ def added_lines(file: str) -> str:
 
 
 @pytest.fixture
-def rings(monkeypatch: pytest.MonkeyPatch) -> layout.Field:
+def rings(monkeypatch: pytest.MonkeyPatch) -> field_files.Field:
     """Add the field of the recipe to the layout's table."""
     (field,) = eval(f"[{added_lines('carlasc/storage/layout.py')}]", vars(layout))
     monkeypatch.setitem(layout.SCAN_FIELDS, field.name, field)
@@ -38,7 +38,7 @@ def rings(monkeypatch: pytest.MonkeyPatch) -> layout.Field:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, rings: layout.Field) -> Path:
+def folder(tmp_path: Path, rings: field_files.Field) -> Path:
     """Three scans with rings, the last one with numbers that need 16 bits."""
     rng = np.random.default_rng(0)
     with FolderSink(tmp_path / "data") as sink, sink.sequence(PATH) as writer:

@@ -24,7 +24,7 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
-from carlasc.storage.naming import identity_of
+from carlasc.storage.layout import identity_of
 
 Place = str | os.PathLike[str] | Source
 

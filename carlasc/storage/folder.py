@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.storage import layout
+from carlasc.storage import field_files, layout
 from carlasc.storage.files import parse_json, remove_stale
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence, PublishedSource
@@ -222,7 +222,7 @@ class WholeFiles:
         """Forget the size of a grid that is replaced."""
         self._cells.pop(grid, None)
 
-    def _size(self, entry: layout.Field, frame: int) -> int | None:
+    def _size(self, entry: field_files.Field, frame: int) -> int | None:
         try:
             return os.stat(f"{self._folder}/{entry.file(frame)}").st_size
         except (FileNotFoundError, NotADirectoryError):
@@ -245,5 +245,5 @@ class WholeFiles:
         return self._cells[grid]
 
 
-def _row(entry: layout.Field) -> int:
+def _row(entry: field_files.Field) -> int:
     return np.dtype(entry.dtype).itemsize * (entry.columns or 1)

@@ -7,17 +7,18 @@ Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from pathlib import PurePosixPath
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import BOXES_DTYPE
+from carlasc.core.choices import Coordinates
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
+from carlasc.storage.field_files import Field
 
 SPLITS = ("Train", "Val", "Test")
 COORDINATES = ("cartesian", "cylindrical")
@@ -31,136 +32,9 @@ REPORT = "carlasc-report.json"
 DERIVED = ".carlasc"  # the folder of what is derived of a sequence: no field, never packed, safe to delete
 
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
-VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
-WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
-# Level 6, zlib's own, takes 6 times as long, and saves 3 %: voxels are in order, so what repeats is always four bytes back.
-_VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
-_MOST_CLASSES = 256
 CERTAIN = (
     65535  # the number that means a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
 )
-
-
-Per = Literal["point", "voxel", "vote", "box", "scan"]
-Kind = Literal[
-    "position", "vector", "class", "pairs", "id", "value", "count", "probability", "flags", "votes", "boxes", "picture"
-]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Field:
-    """The content of one file per frame.
-
-    Stores, packing, converting, `info` and `validate` use `per` and `kind` to decide how to handle a field, not its name.
-
-    Attributes:
-        name: name of the field in a Source and a Sink.
-        folder: folder under `<coordinates>/`.
-        suffix: ending of the file name.
-        per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
-            "vote" (one row per vote), "box" (one row per box), or "scan" (the whole file belongs to the scan).
-        kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (of a class
-            and its probability), "id" (unsigned whole numbers, such as actors), "value" (any number), "count", "probability" (0 to 1),
-            "flags" (bits), "votes" and "boxes" (tables), "picture" (the bytes of a file).
-        dtype: NumPy type on disk, little-endian; "" for tables, whose columns have types of their own.
-        names: name of each value of a row.
-        unit: unit of the values.
-        meaning: one line for the documentation.
-        published: whether the published download contains the field.
-    """
-
-    name: str
-    folder: str
-    suffix: str
-    per: Per
-    kind: Kind
-    dtype: str
-    names: tuple[str, ...]
-    unit: str
-    meaning: str
-    published: bool = True
-
-    @property
-    def columns(self) -> int | None:
-        """Number of values per row; None for a flat array."""
-        return len(self.names) if self.kind in ("position", "vector", "pairs") else None
-
-    def file(self, frame: int) -> str:
-        """Return the path of a frame's file under `<coordinates>/`."""
-        return f"{self.folder}/{frame:06d}{self.suffix}"
-
-    def decode(self, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
-        """Return the content of a file as an array, without a copy if the type allows it.
-
-        Args:
-            data: the whole file.
-            where: the file, for errors.
-            shape: shape of the grid, for its fields; None computes the number of rows from the size of the file.
-
-        Raises:
-            FormatError: the size of the file does not match.
-        """
-        if self.kind == "votes":
-            return _decode_votes(data, where, shape)
-        if self.kind == "boxes":
-            return _decode_boxes(data, where)
-        dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
-        size = len(data)
-        if shape is not None and size != self.size_of(shape):
-            expected = f"{self.size_of(shape)} bytes ({' x '.join(map(str, shape))} {dtype.name})"
-            raise FormatError(
-                where, expected=expected, found=str(size), advice="the file is cut short, or belongs to another grid"
-            )
-        if size % row:
-            raise FormatError(
-                where,
-                expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} per row)",
-                found=str(size),
-                advice="the file may be cut short",
-            )
-        array = np.frombuffer(data, dtype)
-        if shape is not None:
-            return array.reshape(shape)
-        return array if self.columns is None else array.reshape(-1, self.columns)
-
-    def size_of(self, shape: tuple[int, ...] | None) -> int | None:
-        """Return the bytes of a file of a grid of some shape; None where they are not known before it is read."""
-        return None if shape is None or self.per != "voxel" else np.dtype(self.dtype).itemsize * math.prod(shape)
-
-    def encode(self, array: NDArray[Any], where: str) -> bytes | memoryview:
-        """Return the bytes of a frame's file.
-
-        Raises:
-            FormatError: the shape or the type of the array does not match the field.
-        """
-        self.check(array, where)
-        if self.kind == "votes":
-            return _encode_votes(array)
-        if self.kind == "boxes":
-            return array.tobytes()
-        return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
-
-    def check(self, array: NDArray[Any], where: str) -> None:
-        """Check that an array has the shape and the type of a frame of the field.
-
-        Raises:
-            FormatError: the shape or the type does not match; the message names the file `where`.
-        """
-        if self.kind == "votes":
-            if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
-                raise FormatError(where, expected="a table of voxel, label and votes", found=str(array.dtype))
-            return
-        if self.kind == "boxes":
-            if array.dtype != BOXES_DTYPE or array.ndim != 1:
-                raise FormatError(where, expected="a table of boxes", found=f"{array.dtype}, shape {array.shape}")
-            return
-        if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
-            raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
-        dtype = np.dtype(self.dtype)
-        if dtype.kind == "u" and array.dtype.kind not in "ub":
-            raise FormatError(where, expected="unsigned integers", found=str(array.dtype))
-        if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
-            raise FormatError(where, expected=f"at most {dtype.name}", found=str(array.dtype))
 
 
 SCAN_FIELDS: dict[str, Field] = {
@@ -263,6 +137,19 @@ _GRID_FIELDS: dict[str, Field] = {
 GRID_FIELDS = tuple(_GRID_FIELDS)
 EVIDENCE_FIELDS = ("occupied", "classes", "flags", "views")  # what `carlasc regrid --keep-evidence` adds to a grid
 LINE_FIELDS = ("poses", "times")
+
+
+def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
+    """Return the split, the name and the coordinates of a sequence from its path.
+
+    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be missing. If the last part is not the
+    name of coordinates, it is the name of the sequence, whose coordinates are then Cartesian.
+    """
+    parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("/", ".")]
+    coordinates = parts.pop() if parts and parts[-1] in COORDINATES else "cartesian"
+    name = parts.pop() if parts else ""
+    split = next((split for split in SPLITS if parts and parts[-1].lower() == split.lower()), None)
+    return split, name, cast(Coordinates, coordinates)
 
 
 def field_named(name: str) -> Field:
@@ -371,30 +258,3 @@ def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
         if len(row) != columns:
             raise FormatError(where, expected=f"{columns} numbers per line", found=f"{len(row)} in line {number}")
     return np.array(rows, np.float64).reshape(-1, columns)
-
-
-def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
-    # A voxel has at most one row for each class; as many for every voxel of a grid are more than any data set has classes.
-    most = None if shape is None else _MOST_CLASSES * math.prod(shape)
-    with open_npz(data, where) as archive:
-        labels = archive.read("label", ArrayFormat(("u1", "<u2"), (None,), most))
-        votes = np.empty(len(labels), VOTES_DTYPE if labels.itemsize == 1 else WIDE_VOTES_DTYPE)
-        votes["label"] = labels
-        for name in ("voxel", "votes"):
-            votes[name] = archive.read(name, ArrayFormat((VOTES_DTYPE[name].str,), labels.shape))
-    return votes
-
-
-def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
-    if len(data) % BOXES_DTYPE.itemsize:
-        raise FormatError(
-            where,
-            expected=f"a multiple of {BOXES_DTYPE.itemsize} bytes (a box each)",
-            found=str(len(data)),
-            advice="the file may be cut short",
-        )
-    return np.frombuffer(data, BOXES_DTYPE)
-
-
-def _encode_votes(votes: NDArray[Any]) -> bytes:
-    return npz_bytes({name: (votes[name], level) for name, level in _VOTES_LEVELS.items()})

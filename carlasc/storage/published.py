@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from carlasc.core.frames import compact, expand
 from carlasc.errors import MissingDataError
-from carlasc.storage import layout
-from carlasc.storage.naming import identity_of
+from carlasc.storage import field_files, layout
+from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.transport.trees import Tree
 
@@ -69,7 +69,7 @@ class PublishedSequence(Sequence):
         return self.location
 
     @cached_property
-    def _listing(self) -> dict[str, layout.Field]:
+    def _listing(self) -> dict[str, field_files.Field]:
         """The fields whose folders exist: lists the sequence's folder, and asks for one file in each grid's."""
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
         fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
@@ -127,14 +127,14 @@ class PublishedSequence(Sequence):
         """Return the file of each frame."""
         return [self._prefix + self._entry(field).file(frame) for frame in frames]
 
-    def _entry(self, field: str) -> layout.Field:
+    def _entry(self, field: str) -> field_files.Field:
         if field not in self._listing:
             raise MissingDataError(
                 self.location, expected=f"the field {field}", found=", ".join(sorted(self.fields())) or "none"
             )
         return self._listing[field]
 
-    def _shape(self, entry: layout.Field) -> tuple[int, int, int] | None:
+    def _shape(self, entry: field_files.Field) -> tuple[int, int, int] | None:
         return self.grids[entry.folder].size if entry.per in ("voxel", "vote") else None
 
     def documents(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
-from carlasc.storage import layout
+from carlasc.storage import field_files, layout
 from carlasc.storage.folder import FolderSink
 
 FRAMES = (0, 1, 2, 5)
@@ -66,7 +66,7 @@ def grid(rng: np.random.Generator, size: tuple[int, int, int], whole: bool = Tru
 def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = False) -> dict[str, NDArray[Any]]:
     """Return the fields of a random grid that say how certain it is; `wide` class ids have two bytes."""
     voxels = int(np.prod(size))
-    classes = np.zeros(2 * voxels, layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)
+    classes = np.zeros(2 * voxels, field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE)
     classes["voxel"], classes["label"] = np.repeat(np.arange(voxels), 2), np.tile([1, 10], voxels)
     shares = rng.integers(1, layout.CERTAIN, voxels)
     classes["votes"] = np.column_stack([shares, layout.CERTAIN - shares]).reshape(-1)
@@ -128,7 +128,7 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
     for frame in (3, 4):
         for part, array in grid(rng, SIZE).items():
             grids.write(f"evaluation/{part}", frame, array)
-    votes = np.zeros(5, layout.VOTES_DTYPE)
+    votes = np.zeros(5, field_files.VOTES_DTYPE)
     votes["voxel"], votes["label"], votes["votes"] = [0, 1, 7, 20, 47], [1, 2, 3, 22, 0], [1, 300, 65535, 2, 1]
     grids.write("evaluation/votes", 4, votes)
     for part, array in evidence(rng, SIZE).items():

@@ -11,7 +11,7 @@ from carlasc.core.tables import CARLA, REMAPS
 from carlasc.dataset import EVIDENCE_FIELDS
 from carlasc.dataset.transforms import flip
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.storage import FolderSink, layout
+from carlasc.storage import FolderSink, field_files, layout
 
 SPEC = GridSpec("cartesian", (6, 4, 2), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 CLASSES = (1, 6, 7, 13, 20)  # 6 and 7, 13 and 20 are one class of the eleven
@@ -28,7 +28,7 @@ def write_evidence(folder, frames, seed=0):
             shares = rng.dirichlet(np.ones(4))[: len(labels)]
             rows += [(voxel, label, int(share * layout.CERTAIN)) for label, share in zip(labels, shares, strict=True)]
         writer.write("evaluation/occupied", frame, rng.random(SPEC.size).astype(np.float16))
-        writer.write("evaluation/classes", frame, np.array(rows, layout.VOTES_DTYPE))
+        writer.write("evaluation/classes", frame, np.array(rows, field_files.VOTES_DTYPE))
         writer.write("evaluation/flags", frame, rng.integers(0, 16, SPEC.size).astype(np.uint8))
         writer.write("evaluation/views", frame, rng.integers(0, 500, SPEC.size).astype(np.uint16))
     return writer
@@ -76,7 +76,7 @@ def test_certain_voxels_have_soft_labels_that_are_exactly_their_labels(tmp_path)
     writer = FolderSink(folder.parent).sequence("cartesian")
     labels = FolderSink(folder.parent).sequence("cartesian").read("evaluation/labels", 0)
     voxel = np.flatnonzero(labels)
-    classes = np.zeros(len(voxel), layout.VOTES_DTYPE)
+    classes = np.zeros(len(voxel), field_files.VOTES_DTYPE)
     classes["voxel"], classes["label"], classes["votes"] = voxel, labels[voxel], layout.CERTAIN
     writer.write("evaluation/occupied", 0, (labels > 0).astype(np.float16).reshape(SPEC.size))
     writer.write("evaluation/classes", 0, classes)
@@ -89,7 +89,7 @@ def test_a_grid_in_which_nothing_is_occupied_is_free(tmp_path):
     folder = write_drive(tmp_path / "A/cartesian", [0], spec=SPEC)
     writer = FolderSink(folder.parent).sequence("cartesian")
     writer.write("evaluation/occupied", 0, np.zeros(SPEC.size))
-    writer.write("evaluation/classes", 0, np.zeros(0, layout.VOTES_DTYPE))
+    writer.write("evaluation/classes", 0, np.zeros(0, field_files.VOTES_DTYPE))
     sample = Dataset(tmp_path, fields=("posterior", "known"))[0]
     np.testing.assert_array_equal(sample["posterior"][0], sample["known"])
     assert not sample["posterior"][1:].any()
@@ -168,7 +168,7 @@ def test_options_that_nothing_depends_on_ask_for_nothing(world):
 def test_voxels_outside_of_the_grid_are_named(tmp_path, row, message):
     folder = write_drive(tmp_path / "A/cartesian", [0], spec=SPEC)
     writer = write_evidence(folder, [0])
-    writer.write("evaluation/classes", 0, np.array([(0, 7, 1), row], layout.VOTES_DTYPE))
+    writer.write("evaluation/classes", 0, np.array([(0, 7, 1), row], field_files.VOTES_DTYPE))
     with pytest.raises(FormatError, match=f"evaluation/classes of frame 0: expected.*{message}"):
         Dataset(tmp_path, fields=("posterior",))[0]
 
@@ -176,7 +176,7 @@ def test_voxels_outside_of_the_grid_are_named(tmp_path, row, message):
 def test_class_ids_without_a_target_are_named(tmp_path):
     folder = write_drive(tmp_path / "A/cartesian", [0], spec=SPEC)
     writer = write_evidence(folder, [0])
-    writer.write("evaluation/classes", 0, np.array([(0, 200, 1)], layout.VOTES_DTYPE))
+    writer.write("evaluation/classes", 0, np.array([(0, 200, 1)], field_files.VOTES_DTYPE))
     with pytest.raises(FormatError, match="evaluation/classes of frame 0: expected class ids of carla, found 200"):
         Dataset(tmp_path, fields=("posterior",))[0]
 

@@ -15,7 +15,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE, Ballot, Observation, Votes, count_votes
-from carlasc.storage.layout import VOTES_DTYPE
+from carlasc.storage.field_files import VOTES_DTYPE
 
 POINTS, LABELS, POSE = np.ones((4, 3), np.float32), np.full(4, 7, np.uint8), np.eye(4)
 

@@ -18,13 +18,13 @@ from carlasc.groundtruth import VoxelCertainty
 from carlasc.groundtruth.from_scans.sequences import ScanFrame
 from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE
 from carlasc.groundtruth.voting.certainty import class_shares
-from carlasc.storage import FolderSink, layout
+from carlasc.storage import FolderSink, field_files, layout
 
 SPEC = GridSpec.published().with_size((8, 8, 4))
 GRID = "cartesian/evaluation_8x8x4"
 EVIDENCE = VoxelCertainty(
     np.linspace(0, 1, SPEC.num_voxels).reshape(SPEC.size),
-    np.array([(3, 7, 65535), (9, 1, 20000)], layout.VOTES_DTYPE),
+    np.array([(3, 7, 65535), (9, 1, 20000)], field_files.VOTES_DTYPE),
     np.full(SPEC.size, 5, np.uint8),
     np.full(SPEC.size, 61, np.uint16),
 )
@@ -157,7 +157,9 @@ def test_fields_of_different_shapes_are_refused():
         replace(EVIDENCE, views=np.zeros((8, 8), np.uint16))
 
 
-@pytest.mark.parametrize("classes, dtype", [(CARLA, layout.VOTES_DTYPE), (SEMANTICKITTI, layout.WIDE_VOTES_DTYPE)])
+@pytest.mark.parametrize(
+    "classes, dtype", [(CARLA, field_files.VOTES_DTYPE), (SEMANTICKITTI, field_files.WIDE_VOTES_DTYPE)]
+)
 def test_the_probability_of_a_class_is_its_share_of_the_votes(classes, dtype):
     rng = np.random.default_rng(0)
     labels = [label for label in classes.names if label]

@@ -8,13 +8,13 @@ import pytest
 import carlasc
 from carlasc.core import GridSpec, VoxelFlag
 from carlasc.inspection.contents import check_frames, check_values
-from carlasc.storage import FolderSink, FolderSource, layout
+from carlasc.storage import FolderSink, FolderSource, field_files, layout
 
 SPEC = GridSpec("cartesian", (2, 2, 2), (-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))
 
 
 def table(*rows: tuple[int, int, int]) -> np.ndarray:
-    return np.array(list(rows), layout.VOTES_DTYPE)
+    return np.array(list(rows), field_files.VOTES_DTYPE)
 
 
 @pytest.fixture

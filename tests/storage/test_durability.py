@@ -10,7 +10,7 @@ import pytest
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, StorageError
-from carlasc.storage import durability, layout
+from carlasc.storage import durability, field_files, layout
 from carlasc.storage.files import to_json, write_atomic, write_many
 from carlasc.storage.folder import FolderWriter
 
@@ -129,7 +129,7 @@ def _write_frame(folder: Path) -> FolderWriter:
         "grid/occupied": np.zeros(SPEC.size, np.float16),
         "grid/flags": np.zeros(SPEC.size, np.uint8),
         "grid/views": np.zeros(SPEC.size, np.uint16),
-        "grid/votes": np.ones(3, layout.VOTES_DTYPE),
+        "grid/votes": np.ones(3, field_files.VOTES_DTYPE),
         "bev": np.ones(9, np.uint8),
     }.items():
         writer.write(name, 0, array)

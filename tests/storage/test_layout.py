@@ -7,7 +7,7 @@ from hypothesis.extra.numpy import arrays
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.storage import FolderSource, layout
+from carlasc.storage import FolderSource, field_files, layout
 from carlasc.testing import write_dataset
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -69,7 +69,7 @@ def test_flags_and_views_that_do_not_fit_are_refused():
 
 def test_votes_come_back():
     field = layout.field_named("evaluation/votes")
-    for dtype in (layout.VOTES_DTYPE, layout.WIDE_VOTES_DTYPE):
+    for dtype in (field_files.VOTES_DTYPE, field_files.WIDE_VOTES_DTYPE):
         votes = np.array([(3, 7, 2), (3, 0, 1), (9, 10, 65535)], dtype)
         back = field.decode(bytes(field.encode(votes, "x")), "x")
         assert back.dtype == dtype

@@ -10,7 +10,7 @@ from helpers.datasets.sequences import FRAMES
 
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.storage import FolderSource, Sink, Source, layout
+from carlasc.storage import FolderSource, Sink, Source, field_files
 from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.packing import pack
 from carlasc.storage.parquet.parquet_sink import ParquetSink
@@ -189,9 +189,9 @@ def test_statistics_leave_points_out_that_are_not_finite(tmp_path: Path) -> None
 
 def test_votes_of_another_width_than_the_first_frame_are_refused(tmp_path: Path) -> None:
     with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
-        writer.write("fine/votes", 0, np.zeros(2, layout.VOTES_DTYPE))
+        writer.write("fine/votes", 0, np.zeros(2, field_files.VOTES_DTYPE))
         with pytest.raises(FormatError, match="frame 1: its labels: expected 1 bytes each"):
-            writer.write("fine/votes", 1, np.zeros(2, layout.WIDE_VOTES_DTYPE))
+            writer.write("fine/votes", 1, np.zeros(2, field_files.WIDE_VOTES_DTYPE))
 
 
 def test_a_table_of_another_size_than_the_grid_is_one_clear_error(store: Path) -> None:

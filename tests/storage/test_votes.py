@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from carlasc.storage import layout
+from carlasc.storage import field_files, layout
 from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 
 FIELD = layout.field_named("evaluation/votes")
@@ -26,14 +26,14 @@ def votes_of_a_street(seed=0):
     rng = np.random.default_rng(seed)
     free = np.flatnonzero(np.repeat(rng.random(20_000) < 0.6, 30) & (np.arange(600_000) % 30 > rng.integers(3, 12)))
     hit = rng.choice(600_000, len(free) // 7, replace=False)
-    votes = np.empty(len(free) + len(hit), layout.VOTES_DTYPE)
+    votes = np.empty(len(free) + len(hit), field_files.VOTES_DTYPE)
     votes["voxel"] = np.concatenate([free, hit])
     votes["label"] = np.concatenate([np.zeros(len(free)), rng.choice([1, 6, 7, 9], len(hit), p=(0.3, 0.1, 0.5, 0.1))])
     votes["votes"] = np.minimum(rng.geometric(0.5, len(votes)), 20)
     return votes[np.lexsort((votes["label"], votes["voxel"]))]
 
 
-@pytest.mark.parametrize("dtype", [layout.VOTES_DTYPE, layout.WIDE_VOTES_DTYPE])
+@pytest.mark.parametrize("dtype", [field_files.VOTES_DTYPE, field_files.WIDE_VOTES_DTYPE])
 @pytest.mark.parametrize("count", [0, 1, 5000])
 def test_numpy_reads_the_columns_and_their_types(dtype, count):
     votes = votes_of_a_street()[:count].astype(dtype)

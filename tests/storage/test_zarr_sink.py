@@ -10,7 +10,7 @@ from helpers.datasets.sequences import files_of, scan
 
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
-from carlasc.storage import FolderSource, Sink, Source, layout
+from carlasc.storage import FolderSource, Sink, Source, field_files
 from carlasc.storage.packed.stores import PackOptions
 from carlasc.storage.packing import pack
 from carlasc.storage.zarr.zarr_sink import ZarrSink
@@ -301,10 +301,10 @@ def test_senseless_quantisation_is_refused(millimetres: float) -> None:
 
 
 def test_votes_keep_the_width_of_their_labels(tmp_path: Path) -> None:
-    wide = np.zeros(2, layout.WIDE_VOTES_DTYPE)
+    wide = np.zeros(2, field_files.WIDE_VOTES_DTYPE)
     wide["label"] = [3, 300]
     with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(SCANS) as writer:
         writer.write("evaluation/votes", 0, wide)
     votes = carlasc.open(tmp_path / "x.zarr").sequences()[SCANS].read("evaluation/votes", 0)
-    assert votes.dtype == layout.WIDE_VOTES_DTYPE
+    assert votes.dtype == field_files.WIDE_VOTES_DTYPE
     assert np.array_equal(votes, wide)

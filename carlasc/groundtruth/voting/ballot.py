@@ -21,7 +21,7 @@ from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE
+from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 _ALL_SURE = np.empty(0, np.float32)
@@ -287,7 +287,7 @@ class Votes:
         More votes than the layout can hold are stored as the most that it can.
 
         Returns:
-            (M,) `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
+            (M,) `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
         """
         from carlasc.groundtruth.voting import kernel
 

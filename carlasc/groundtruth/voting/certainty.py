@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.storage import layout
+from carlasc.storage import field_files, layout
 
 # Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see docs/ground-truth.md.
 GROUND_PER_M = 0.05  # roads, pavements and other ground, which most rays graze
@@ -141,7 +141,7 @@ class VoxelCertainty:
 
     Attributes:
         occupied: (X, Y, Z) floating, probability that the voxel is occupied; 0.5 where nothing is known.
-        classes: (M,) `layout.VOTES_DTYPE` or `layout.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class
+        classes: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class
             if the voxel is occupied, in 1/65535, in the column `votes`; only non-zero ones.
         flags: (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`.
         views: (X, Y, Z) uint16, number of scans that saw the voxel.
@@ -172,7 +172,7 @@ def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
         classes: class table of the labels.
 
     Returns:
-        (N,) `VoxelCertainty.classes`: `layout.VOTES_DTYPE`, or `layout.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
+        (N,) `VoxelCertainty.classes`: `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
     """
     pairs, place = np.unique(
         votes["voxel"].astype(np.int64) * classes.num_channels + votes["label"], return_inverse=True
@@ -180,7 +180,9 @@ def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
     voxel, label = np.divmod(pairs, classes.num_channels)
     of_pair = np.bincount(place, votes["votes"], len(pairs))
     of_voxel = np.bincount(voxel, of_pair)
-    shares = np.zeros(len(pairs), layout.VOTES_DTYPE if classes.dtype == np.uint8 else layout.WIDE_VOTES_DTYPE)
+    shares = np.zeros(
+        len(pairs), field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE
+    )
     shares["voxel"], shares["label"] = voxel, label
     shares["votes"] = np.floor(of_pair / of_voxel[voxel] * layout.CERTAIN)
     return shares[shares["votes"] > 0]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
-from carlasc.storage import layout
+from carlasc.storage import field_files, layout
 
 # Chosen on simulated drives whose labels were made wrong: see docs/ground-truth.md.
 _JUDGES = 4.0  # scans that must have hit a voxel for it to show how often labels are wrong
@@ -59,7 +59,7 @@ class ClassConsensus:
 
     Attributes:
         labels: (V,) class of each voxel; 0 without votes.
-        shares: (M,) `layout.VOTES_DTYPE` or `layout.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class if the
+        shares: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class if the
             voxel is occupied, as `VoxelCertainty.classes` has them.
         wrong: share of the votes that are estimated to be wrong.
     """
@@ -78,7 +78,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
         classes: class table of the labels.
     """
     labels = np.zeros(spec.num_voxels, classes.dtype)
-    dtype = layout.VOTES_DTYPE if classes.dtype == np.uint8 else layout.WIDE_VOTES_DTYPE
+    dtype = field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE
     if not len(votes):
         return ClassConsensus(labels, np.empty(0, dtype), 0.0)
     present, own = np.unique(votes["label"], return_inverse=True)

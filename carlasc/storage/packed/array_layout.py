@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.storage import layout
+from carlasc.storage import field_files, layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
@@ -210,7 +210,7 @@ class FieldLayout:
 
 
 def typical_size(
-    entry: layout.Field,
+    entry: field_files.Field,
     arrays: list[NDArray[Any]],
     rows: Mapping[str, int],
     read_document: Callable[[str], bytes | None],

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
-from carlasc.storage import layout
+from carlasc.storage import field_files
 from carlasc.storage.packed.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
 from carlasc.storage.packed.stores import PackOptions
 
@@ -76,7 +76,7 @@ class Packing(ABC):
     kind: ClassVar[str]
     columns: tuple[Column, ...]
 
-    def __init__(self, entry: layout.Field, options: PackOptions, attributes: Mapping[str, Any]) -> None:
+    def __init__(self, entry: field_files.Field, options: PackOptions, attributes: Mapping[str, Any]) -> None:
         self.entry = entry
         self.attributes = attributes
         self.columns = self._columns(options)
@@ -252,7 +252,7 @@ class VotesPacking(Packing):
         """Return the bytes of tables with this many rows."""
         wide = counts.get(f"label{WIDE}", 0)
         narrow_rows = counts.get("voxel", 0) - wide
-        return narrow_rows * layout.VOTES_DTYPE.itemsize + wide * layout.WIDE_VOTES_DTYPE.itemsize
+        return narrow_rows * field_files.VOTES_DTYPE.itemsize + wide * field_files.WIDE_VOTES_DTYPE.itemsize
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Return the columns of the table."""
@@ -261,7 +261,7 @@ class VotesPacking(Packing):
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return the table."""
         wide = columns["label"].dtype.itemsize > 1
-        votes = np.empty(len(columns["voxel"]), layout.WIDE_VOTES_DTYPE if wide else layout.VOTES_DTYPE)
+        votes = np.empty(len(columns["voxel"]), field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE)
         for name, column in columns.items():
             votes[name] = column
         return votes
@@ -297,7 +297,7 @@ class BoxesPacking(Packing):
 
 
 def packing_of(
-    entry: layout.Field, options: PackOptions | None = None, attributes: Mapping[str, Any] | None = None
+    entry: field_files.Field, options: PackOptions | None = None, attributes: Mapping[str, Any] | None = None
 ) -> Packing:
     """Return how a field is packed: by `options` when it is written, by the store's `attributes` when it is read."""
     options = options or PackOptions()
@@ -307,7 +307,7 @@ def packing_of(
     return kind(entry, options, attributes)
 
 
-_BY_KIND: dict[layout.Kind, Callable[..., Packing]] = {
+_BY_KIND: dict[field_files.Kind, Callable[..., Packing]] = {
     "position": PointsPacking,
     "vector": FlowPacking,
     "pairs": PairsPacking,

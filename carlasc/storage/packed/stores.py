@@ -14,7 +14,7 @@ from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.files import leads_outside
-from carlasc.storage.naming import identity_of
+from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.output import unfinished_error
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter, Sink

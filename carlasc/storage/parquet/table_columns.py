@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
-from carlasc.storage.layout import VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
+from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
 from carlasc.storage.packed.columns import narrow, quantise
 
 AXES = frozenset("xyz")

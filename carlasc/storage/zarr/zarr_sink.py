@@ -16,7 +16,7 @@ from carlasc.core.grids import Coordinates
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.naming import identity_of
+from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.array_layout import SEQUENCE, document_node, field_node, typical_size
 from carlasc.storage.packed.chunks import in_threads
 from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from carlasc import GridSpec
-from carlasc.storage import FolderSink, layout
+from carlasc.storage import FolderSink, field_files, layout
 
 SPEC = GridSpec("cartesian", (16, 16, 8), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 CLASSES = (1, 7, 8, 10)  # CARLA: building, road, sidewalk, vehicle
@@ -46,7 +46,7 @@ def write_split(
             writer.write("labels", frame, labels.reshape(-1)[SPEC.flat_index(points)])
             writer.write("evaluation/counts", frame, (rng.random(SPEC.size) < 0.8).astype(np.float32))
             if certainty is not None:
-                shares = np.zeros(occupied.size, layout.VOTES_DTYPE)
+                shares = np.zeros(occupied.size, field_files.VOTES_DTYPE)
                 shares["voxel"], shares["votes"] = np.arange(occupied.size), layout.CERTAIN
                 shares["label"] = np.where(labels, labels, classes[0]).reshape(-1)
                 writer.write("evaluation/occupied", frame, np.where(occupied, certainty, 1 - certainty))

@@ -15,7 +15,7 @@ from carlasc import Run
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import CARLA
-from carlasc.storage import FolderSink, layout
+from carlasc.storage import FolderSink, field_files, layout
 from carlasc.testing.data import GRIDS, SCANS, SIZE, WHOLE, evidence, grid, lines, params, scan
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -56,7 +56,7 @@ def write_folder(root: Path) -> Path:
     grids.write_document("evaluation/params.json", json.dumps(record).encode())
     for part, array in (grid(rng, SIZE) | evidence(rng, SIZE)).items():
         grids.write(f"evaluation/{part}", 3, array)
-    votes = np.zeros(3, layout.VOTES_DTYPE)
+    votes = np.zeros(3, field_files.VOTES_DTYPE)
     votes["voxel"], votes["label"], votes["votes"] = [0, 1, 47], [1, 22, 3], [1, 300, 65535]
     grids.write("evaluation/votes", 3, votes)
     return root
