@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, get_args
 
 from carlasc.core.choices import Preset, TrafficLevel
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ConflictError, import_extra
+from carlasc.errors import ConflictError, DependencyError, import_extra
 from carlasc.running.spreading import Run
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ Step = Callable[[str], AbstractContextManager[Progress]]
 TRAIN, VAL = Path("Train", "Demo_Heavy"), Path("Val", "Demo_Light")
 """The simulated sequences, relative to the folder of the demonstration."""
 _MODULES = ("trimesh", "embreex", "PIL", "imageio_ffmpeg")  # what it needs, apart from what every installation has
+_EXTRA_MB = 240  # what the extra `demo` adds, as docs/studies/sizes.py measures it
 _VAL_SHARE = 5  # of the LiDARs, one in so many records the drive for validation
 
 
@@ -90,8 +91,7 @@ def demonstrate(
     from carlasc.inspection.validation import validate
     from carlasc.viewing import Scene, render, view
 
-    for module in _MODULES:
-        import_extra(module, "demo")
+    _check_packages()
     start, out, step = time.perf_counter(), Path(out), step or _without_progress
     train, val = out / TRAIN, out / VAL
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not train.is_dir())):
@@ -144,6 +144,15 @@ def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path,
         (out / "birdseye.png", fine, "grid", CameraOptions(view="bev")),
         (out / "scan.png", coarse, "scan", CameraOptions()),
     ]
+
+
+def _check_packages() -> None:
+    """Raise DependencyError for what is not installed, with the size of what brings it."""
+    try:
+        for module in _MODULES:
+            import_extra(module, "demo")
+    except DependencyError as error:
+        raise DependencyError(f"{error} (about {_EXTRA_MB} MB)") from error
 
 
 @contextmanager

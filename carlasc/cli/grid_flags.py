@@ -239,13 +239,14 @@ class ScanFlags(WindowFlags):
         Complete | None,
         typer.Option(
             help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown; mirror: a side is taken from the"
-            " other side (default); body: and what is still missing from the usual shape of vehicles."
+            " other side; body: what is still missing comes from similar vehicles (default)."
         ),
     ] = None
     no_own_path: Annotated[
         bool,
         typer.Option(
-            "--no-own-path", help="What the recording vehicle itself drove through is not taken for free space."
+            "--no-own-path",
+            help="Do not count the space that the recording vehicle drove through as free. By default it is free, which removes ghost trails there.",
         ),
     ] = False
     min_range_m: Annotated[float | None, typer.Option(help="Leave out nearer points, in metres.")] = None

@@ -1,6 +1,8 @@
 """Options that stand in groups, or that a converter declares, are options like any other."""
 
 import inspect
+import re
+from typing import get_type_hints
 
 import pytest
 from typer.testing import CliRunner
@@ -9,6 +11,7 @@ from carlasc.cli import app, convert
 from carlasc.cli.flags import DeclaredOptions, OneWorkerFlags, flatten
 from carlasc.cli.grid_flags import GroundTruthFlags, ScanFlags, VoteFlags
 from carlasc.cli.regrid import regrid
+from carlasc.groundtruth import FromScans
 from carlasc.motion import MotionOptions, PoseOptions
 
 
@@ -89,3 +92,15 @@ def test_declared_options_that_are_not_given_are_left_to_the_library():
     flat(**dict.fromkeys(names))
     flat(**dict.fromkeys(names) | {names[-1]: False})
     assert seen[0] == {} and list(seen[1].values()) == [False]
+
+
+def test_the_default_that_a_help_text_names_is_that_of_the_library():
+    """The text of `--complete` named the default of an earlier version."""
+    named = {}
+    for name, annotation in get_type_hints(ScanFlags, include_extras=True).items():
+        for option in getattr(annotation, "__metadata__", ()):
+            word = re.search(r"(?:^|[;.] )(\w+): [^;]*\(default\)", option.help)
+            named |= {name: word[1]} if word else {}
+    assert named.keys() == {"dynamic", "motion", "complete"}
+    library = FromScans()
+    assert named == {"dynamic": library.dynamic, "motion": library.motion.source, "complete": library.complete}
