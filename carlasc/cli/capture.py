@@ -11,6 +11,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json, progress_bar
 from carlasc.cli.flags import Flags
+from carlasc.core import wording
 from carlasc.core.choices import TrafficLevel
 
 OutArgument = Annotated[
@@ -78,7 +79,7 @@ def capture(
         print_json(result)
         return
     echo(
-        f"{result.out}: {result.written} frames of {result.sensors} LiDARs written,"
+        f"{result.out}: {wording.count(result.written, 'frame')} of {wording.count(result.sensors, 'LiDAR')} written,"
         f" {result.count - result.written} existed already"
         f" (CARLA {result.server_version}, {result.vehicles} vehicles, {result.walkers} pedestrians)"
     )

@@ -11,6 +11,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, report_failures
 from carlasc.cli.flags import Flags, OneWorkerFlags
+from carlasc.core.wording import count
 from carlasc.errors import MissingDataError
 
 
@@ -85,8 +86,8 @@ def card(
     else:
         for note in result.notes:
             echo(note)
-        sequences = "1 sequence" if result.sequences == 1 else f"{result.sequences} sequences"
-        echo(f"{result.frames} frames in {sequences}, licence {', '.join(result.licenses)}")
+        size = f"{count(result.frames, 'frame')} in {count(result.sequences, 'sequence')}"
+        echo(f"{size}, licence {', '.join(result.licenses)}")
         for file in result.files:
             echo(file)
     report_failures(list(result.failures), result.frames, "files")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from carlasc.core.wording import count
 from carlasc.errors import ArgumentError, printable
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
             echo(place)
         what, _, verb = done.rpartition(": ")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        echo(f"{what}{what and ': '}{result.made} frames {verb}{skipped} in {result.elapsed_s:.1f} s")
+        echo(f"{what}{what and ': '}{count(result.made, 'frame')} {verb}{skipped} in {result.elapsed_s:.1f} s")
     failures = [(failure.frame, failure.message) for failure in result.failures]
     report_failures(failures, result.made + result.skipped + len(failures))
 

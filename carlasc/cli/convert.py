@@ -22,6 +22,7 @@ from carlasc.cli.common import (
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
 from carlasc.core.choices import Axes, FlowSource, SplitName
+from carlasc.core.wording import count
 from carlasc.errors import ArgumentError
 
 
@@ -73,7 +74,7 @@ def _print_preview(found: tuple[carlasc.converting.RecordingPreview, ...], out: 
     """Print what a conversion would read and write."""
     for one in found:
         rate = "no times" if one.rate_hz is None else f"{one.rate_hz:g} Hz"
-        echo(f"{one.location}: {one.frames} scans, {rate}, of {', '.join(one.sensors)}")
+        echo(f"{one.location}: {count(one.frames, 'scan')}, {rate}, of {', '.join(one.sensors)}")
         bounds = " ".join(
             f"{axis} {low:g}..{high:g}" for axis, low, high in zip("xyz", one.lower, one.upper, strict=True)
         )

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from carlasc.cli.common import Json, echo, file_argument, print_json, progress_bar
+from carlasc.core.wording import count
 
 
 def download(
@@ -46,5 +47,5 @@ def download(
         print_json(result)
         return
     for archive in result.archives:
-        place = archive.path if archive.folder is None else f"{archive.files} files in {archive.folder}"
+        place = archive.path if archive.folder is None else f"{count(archive.files, 'file')} in {archive.folder}"
         echo(f"{archive.name}: {archive.fetched / 1e9:.2f} GB fetched: {place}")

@@ -24,6 +24,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
 from carlasc.core.choices import Voxels
+from carlasc.core.wording import count
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation
@@ -196,12 +197,12 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
 
     out = console()
     for table in result.tables():
-        title = f"{table.title} (percent, {result.frames} frames, voxels: {result.voxels})"
+        title = f"{table.title} (percent, {count(result.frames, 'frame')}, voxels: {result.voxels})"
         print_table(out, table.header, table.texts(), title=title)
     if (interval := result.interval()) is not None:
         out.print(
             line(
-                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to {100 * interval.high:.2f} ({len(result.sequences)} sequences)"
+                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to {100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
             )
         )
     if comparison is not None and other is not None:
@@ -209,7 +210,7 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
         out.print(
             line(
                 f"mIoU less that of {other.name}: {100 * found.value:+.2f}, 95 % interval {100 * found.low:+.2f} to {100 * found.high:+.2f},"
-                f" p = {comparison.p_value:.3g} ({len(comparison.sequences)} sequences)"
+                f" p = {comparison.p_value:.3g} ({count(len(comparison.sequences), 'sequence')})"
             )
         )
     for note in result.notes:

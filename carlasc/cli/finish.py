@@ -8,6 +8,7 @@ import typer
 
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json
+from carlasc.core.wording import count
 
 
 def finish(
@@ -30,4 +31,4 @@ def finish(
         echo(f"{path or '.'}: {listed or 'no frames'}")
     missing = sum(sum(fields.values()) for fields in result.missing.values())
     left_out = f", without {missing} files that are missing" if missing else ""
-    echo(f"{result.location}: {len(result.sequences)} sequences{left_out}")
+    echo(f"{result.location}: {count(len(result.sequences), 'sequence')}{left_out}")

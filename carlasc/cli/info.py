@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import carlasc
 from carlasc.cli.common import Json, console, line, place_argument, print_json
+from carlasc.core.wording import count
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview
@@ -27,7 +28,6 @@ def info(
 
 def _print(overview: Overview) -> None:
     from carlasc.cli.tables import print_table
-    from carlasc.core.notebook import count
 
     out = console()
     splits = ", ".join(f"{name} {number}" for name, number in overview.splits.items())
@@ -45,7 +45,7 @@ def _print(overview: Overview) -> None:
         print_table(out, header, [_grid_row(grids) for grids in kinds])
     for capture in overview.captures:
         span = f"{capture.first}..{capture.last}" + (f" with {capture.gaps} gaps" if capture.gaps else "")
-        text = f"raw capture {capture.path or '.'}: {capture.sensors} sensors, {capture.frames} frames ({span})"
+        text = f"raw capture {capture.path or '.'}: {count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')} ({span})"
         out.print(line(text))
 
 

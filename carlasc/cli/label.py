@@ -9,6 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
 from carlasc.cli.flags import RunFlags
+from carlasc.core.wording import count
 
 
 def label(
@@ -51,5 +52,7 @@ def label(
         return
     if result.left_out:
         echo(f"note: without {', '.join(result.left_out)}, of other labels or classes")
-    files = f"{result.linked} files linked, {result.files} written"
-    echo(f"{result.out}: labels of {result.frames} frames predicted by {result.by} ({result.classes}); {files}")
+    files = f"{count(result.linked, 'file')} linked, {result.files} written"
+    echo(
+        f"{result.out}: labels of {count(result.frames, 'frame')} predicted by {result.by} ({result.classes}); {files}"
+    )

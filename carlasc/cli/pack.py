@@ -9,6 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, console, echo, line, place_argument, print_json
 from carlasc.cli.flags import RunFlags
+from carlasc.core.wording import count
 
 
 def pack(
@@ -42,7 +43,7 @@ def pack(
 def _print(result: carlasc.storage.packing.PackResult) -> None:
     from rich.table import Table
 
-    echo(f"{result.out}: {len(result.sequences)} sequences, {result.frames} frames")
+    echo(f"{result.out}: {count(len(result.sequences), 'sequence')}, {count(result.frames, 'frame')}")
     table = Table()
     for heading in ("field", "published bytes", "packed bytes", "share"):
         table.add_column(heading, justify="left" if heading == "field" else "right")

@@ -10,6 +10,7 @@ import carlasc
 from carlasc.cli.common import Json, echo, place_argument, place_option, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import PoseFlags
+from carlasc.core.wording import count
 
 
 def refine(
@@ -34,5 +35,5 @@ def refine(
         echo(note)
     if result.left_out:
         echo(f"note: without {', '.join(result.left_out)}, made with other poses")
-    files = f"{result.linked} files linked, {result.files} written"
+    files = f"{count(result.linked, 'file')} linked, {result.files} written"
     echo(f"{result.out}: poses of {len(result.refined)} of {len(result.sequences)} sequences refined; {files}")

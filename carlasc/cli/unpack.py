@@ -9,6 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json
 from carlasc.cli.flags import RunFlags
+from carlasc.core.wording import count
 
 
 def unpack(
@@ -30,4 +31,4 @@ def unpack(
         print_json(result)
     else:
         kept = f" ({result.kept} were written by an earlier run)" if result.kept else ""
-        echo(f"{result.out}: {len(result.sequences)} sequences, {result.files} files written{kept}")
+        echo(f"{result.out}: {count(len(result.sequences), 'sequence')}, {count(result.files, 'file')} written{kept}")

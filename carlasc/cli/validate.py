@@ -19,6 +19,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
 from carlasc.cli.grid_flags import GridFlags, WindowFlags
+from carlasc.core.wording import count
 from carlasc.errors import ArgumentError
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
                 f"scans agree within {100 * report.disagreement_m:.1f} cm ({100 * report.refined_m:.1f} cm with refined poses)"
             )
         name = report.path or result.location
-        text = f"{name}: {report.frames} frames, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
+        text = f"{name}: {count(report.frames, 'frame')}, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
         out.print(line(text), soft_wrap=True)
         if report.mounting:
             mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
@@ -143,7 +144,7 @@ def print_held_out(result: HoldoutResult) -> None:
     parts = result.sequences if total is None else {result.location: total}
     for name, scores in parts.items():
         _print_scores(
-            f"{name or result.location}: held-out rays, {result.spec}, {scores.frames} scans left out", scores
+            f"{name or result.location}: held-out rays, {result.spec}, {count(scores.frames, 'scan')} left out", scores
         )
     for name, scores in result.given_poses.items():
         shares = scores.all

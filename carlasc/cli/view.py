@@ -21,6 +21,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import Flags
 from carlasc.core.choices import PaletteName
+from carlasc.core.wording import count
 from carlasc.errors import ArgumentError
 
 
@@ -56,7 +57,7 @@ class SceneFlags(Flags):
 
 def describe_frames(frames: tuple[int, ...]) -> str:
     """Return "frame 3" or "12 frames"."""
-    return f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames"
+    return f"frame {frames[0]}" if len(frames) == 1 else count(len(frames), "frame")
 
 
 def view(

@@ -46,17 +46,6 @@ def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataF
     return table if table.empty else table.set_index(index)
 
 
-def count(number: int, noun: str, plural: str = "") -> str:
-    """Return "1 frame", "2 frames"."""
-    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
-
-
-def first_names(names: Iterable[str], most: int = 8) -> str:
-    """Return names separated by commas, without those after the first few."""
-    names = list(names)
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def _png(rgb: NDArray[np.uint8]) -> str:
     """Return an (H, W, 3) picture as a PNG file in base64: Pillow is an extra, and a picture this small needs no filter."""
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.grids import GridSpec
-from carlasc.core.notebook import count, describe
+from carlasc.core.notebook import describe
+from carlasc.core.wording import count
 from carlasc.errors import FormatError
 
 

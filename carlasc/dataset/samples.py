@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
-from carlasc.core.notebook import count, describe
+from carlasc.core.notebook import describe
+from carlasc.core.wording import count
 from carlasc.dataset.fields import ALWAYS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.selection import (

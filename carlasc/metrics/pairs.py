@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
-from carlasc.core.notebook import first_names
 from carlasc.core.tables import SEMANTICKITTI
+from carlasc.core.wording import first_names
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
 from carlasc.storage import Sequence, Source, as_source, layout

@@ -21,9 +21,10 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
-from carlasc.core.notebook import describe, first_names
+from carlasc.core.notebook import describe
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
+from carlasc.core.wording import first_names
 from carlasc.errors import FormatError, MissingDataError, MissingKeyError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
