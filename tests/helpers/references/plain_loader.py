@@ -1,6 +1,6 @@
-"""A plain NumPy loader, with which `carlasc.Dataset` must agree and whose speed it is compared with.
+"""A loader in NumPy alone, with which `carlasc.Dataset` must agree and whose speed it is compared with.
 
-Written from the format page (docs/format.md#training-samples), on (N, 3) float64 rows. It reads the published layout from the folder.
+Written from the format page (docs/format.md#training-samples), to be as fast as NumPy allows: contiguous columns, one flat index per point, `bincount` for densities, and tables of the types that samples have. It reads the published layout from the folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class PlainLoader:
         rows = np.loadtxt(folder / "poses.txt", ndmin=2).reshape(-1, 3, 4)
         self.poses = np.tile(np.eye(4), (len(rows), 1, 1))
         self.poses[:, :3] = rows
-        self.remap = REMAPS["carlasc11"].table
+        self.to_current = np.linalg.inv(self.poses)
+        self.remap = REMAPS["carlasc11"].table.astype(np.uint8)
 
     def __len__(self) -> int:
         return len(list((self.folder / "velodyne").iterdir()))
@@ -38,26 +39,29 @@ class PlainLoader:
         stack = np.zeros((self.history, *self.size), dtype)
         for back in range(min(self.history, frame + 1)):
             points = np.fromfile(self.folder / "velodyne" / f"{frame - back:06d}.bin", np.float32)
-            rows = points.reshape(-1, 4)[:, :3].astype(np.float64)
+            columns = points.reshape(-1, 4)[:, :3].T.astype(np.float64, order="C")
             if back:
-                current_T_past = np.linalg.inv(self.poses[frame]) @ self.poses[frame - back]
-                rows = rows @ current_T_past[:3, :3].T + current_T_past[:3, 3]
-            self.bin(rows, stack[self.history - 1 - back])
+                current_T_past = self.to_current[frame] @ self.poses[frame - back]
+                columns = current_T_past[:3, :3] @ columns + current_T_past[:3, 3:]
+            self.bin(columns, stack[self.history - 1 - back])
         labels = np.fromfile(self.folder / "evaluation" / f"{frame:06d}.label", np.uint32).reshape(self.size)
         counts = np.fromfile(self.folder / "evaluation" / f"{frame:06d}.bin", np.float32).reshape(self.size)
         name = "density" if self.density else "occupancy"
-        return {name: stack, "labels": self.remap[labels].astype(np.uint8), "known": counts > 0}
+        return {name: stack, "labels": self.remap[labels], "known": counts > 0}
 
-    def bin(self, rows: NDArray[np.float64], grid: NDArray[Any]) -> None:
-        """Mark or count the voxels of (N, 3) rows in `grid`."""
+    def bin(self, columns: NDArray[np.float64], grid: NDArray[Any]) -> None:
+        """Mark or count the voxels of points, (3, N), in `grid`."""
         if self.cylindrical:
-            radius = np.sqrt(rows[:, 0] ** 2 + rows[:, 1] ** 2)
-            rows = np.stack([radius, np.arctan2(rows[:, 1], rows[:, 0]), rows[:, 2]], axis=1)
-        rows = rows[np.all((rows >= self.lower) & (rows < self.upper), axis=1)]
-        cells = np.floor((rows - self.lower) / self.voxel).astype(int)
-        cells = np.clip(cells, 0, self.size - 1)
+            x, y, z = columns
+            columns = np.stack([np.sqrt(x * x + y * y), np.arctan2(y, x), z])
+        inside = np.ones(columns.shape[1], bool)
+        for column, lower, upper in zip(columns, self.lower, self.upper, strict=True):
+            inside &= (column >= lower) & (column < upper)
+        flat = np.zeros(int(inside.sum()), np.int64)
+        for column, lower, voxel, size in zip(columns, self.lower, self.voxel, self.size, strict=True):
+            cell = ((column[inside] - lower) / voxel).astype(np.int64)  # not negative: truncation is floor
+            flat = flat * size + np.minimum(cell, size - 1)
         if self.density:
-            cells, counts = np.unique(cells, axis=0, return_counts=True)
-            grid[cells[:, 0], cells[:, 1], cells[:, 2]] = counts
+            grid[:] = np.bincount(flat, minlength=grid.size).reshape(grid.shape)
         else:
-            grid[cells[:, 0], cells[:, 1], cells[:, 2]] = 1
+            grid.reshape(-1)[flat] = 1
