@@ -1,4 +1,4 @@
-"""`carlasc pack`: one store instead of a million files."""
+"""`carlasc pack`: one store instead of a quarter of a million files."""
 
 from __future__ import annotations
 
