@@ -10,6 +10,7 @@ import importlib.util
 import inspect
 import logging
 import re
+import sys
 from collections.abc import Callable, Iterator
 from enum import Enum
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 from carlasc_converters.exporters.kitti import TO_PREDICTED, TO_RAW
 from carlasc_converters.exporters.opensceneflow import CATEGORIES
+from mkdocs.structure.files import File
 from typer.models import ArgumentInfo, ParameterInfo
 
 from carlasc import cli
@@ -30,6 +32,9 @@ from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI
 from carlasc.metrics import CONVENTIONS
 from carlasc.storage import layout
 
+sys.path.insert(0, str(Path(__file__).parent))
+import tutorials
+
 LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
 _MARKER = re.compile(r"<!-- generated: ([a-z-]+) -->")
 
@@ -41,9 +46,11 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Leave scripts out of the site."""
+    """Leave scripts out of the site, and add the notebooks."""
     for file in [file for file in files if file.src_uri.endswith(".py")]:
         files.remove(file)
+    for path, content in tutorials.pages():
+        files.append(File.generated(config, path, content=content))
     return files
 
 

@@ -59,7 +59,9 @@ def rows(frames: int, found: dict[str, dict[str, int]]) -> list[str]:
     lines.append(f"| **together** | {' | '.join(f'**{total:,.0f}**' for total in totals.values())} |")
     shares = (f"**{total / totals['published']:.1%}**" for total in totals.values())
     lines.append(f"| **share** | {' | '.join(shares)} |")
-    lines.append(f"| all {ALL_FRAMES:,} frames | {' | '.join(f'{t * ALL_FRAMES / 1e9:.0f} GB' for t in totals.values())} |")
+    lines.append(
+        f"| all {ALL_FRAMES:,} frames | {' | '.join(f'{t * ALL_FRAMES / 1e9:.0f} GB' for t in totals.values())} |"
+    )
     others = sorted({field for sizes in found.values() for field in sizes} - set(FIELDS))
     for field in others:
         what = "not in the download" if field in SCAN_FIELDS and not SCAN_FIELDS[field].published else "not counted"

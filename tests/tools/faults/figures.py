@@ -118,5 +118,7 @@ def line(rows: dict[str, dict[str, Any]]) -> str:
     result = f"{found} faults found" if found else "no torn file, no lost frame"
     kills = rows.get("kills", {}).get("tried", 0)
     # None of n independent tries failed: with a confidence of 95 %, fewer than 3 / n of all do.
-    bound = f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)" if kills and not found else ""
+    bound = (
+        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)" if kills and not found else ""
+    )
     return f"**Reliability**, tried on small data of two frames: {listed}, {result}{bound}. [Figures and promises](docs/reliability.md)."
