@@ -1,4 +1,4 @@
-"""Study: how well is the ground found without labels? `python docs/studies/ground.py [SEED ...]` prints the table of docs/ground-truth.md.
+"""Study: how well is the ground found without labels? `python docs/studies/ground.py [SEED ...]` prints the table of docs/studies/ground.md.
 
 The scans are those of simulated towns with heavy traffic, whose labels are the truth: roads, pavements, markings and terrain are ground. If
 the package `pypatchworkpp` (BSD-2-Clause) is installed, the same scans are given to Patchwork++, with its defaults and the height of the sensor.

@@ -1,4 +1,4 @@
-"""What wrong labels do to ground truth from scans: `python docs/studies/labels.py [WORK]` prints the tables of docs/ground-truth.md as rows finish.
+"""What wrong labels do to ground truth from scans: `python docs/studies/labels.py [WORK]` prints the tables of docs/studies/wrong-labels.md as rows finish.
 
 The labels of the drives of `movers.py` are made wrong in several ways, and their grids are compared with what 40 other sensors saw at the same instant.
 WORK keeps drives and references, as that of `movers.py` does.

@@ -1,4 +1,4 @@
-"""What wrong poses cost, and what refining them wins back: `python docs/studies/poses.py [WORK]` prints the tables of docs/ground-truth.md.
+"""What wrong poses cost, and what refining them wins back: `python docs/studies/poses.py [WORK]` prints the tables of docs/studies/poses.md.
 
 Simulated drives are recorded by one LiDAR, and their poses are made wrong in several ways. Grids are made from 61 scans with the drive's exact flow, under
 the wrong poses and under the refined ones, and compared with what 40 other sensors saw at the same instant. WORK keeps drives, references and results, and a run

@@ -23,7 +23,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
 
-# Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see docs/ground-truth.md.
+# Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see docs/studies/movers.md.
 GROUND_PER_M = 0.05  # roads, pavements and other ground, which most rays graze
 SOLID_PER_M = 0.15  # everything else that stands, and actors within their bodies
 MOVABLE_PER_M = 0.5  # classes that may have left, or come, during the window

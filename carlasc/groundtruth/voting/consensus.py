@@ -19,7 +19,7 @@ from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
 from carlasc.storage import field_files, layout
 
-# Chosen on simulated drives whose labels were made wrong: see docs/ground-truth.md.
+# Chosen on simulated drives whose labels were made wrong: see docs/studies/wrong-labels.md.
 _JUDGES = 4.0  # scans that must have hit a voxel for it to show how often labels are wrong
 _SMOOTHING = 20.0  # votes that each row of the confusion starts with
 _LEAST_WRONG = 1e-3  # no labels are better
