@@ -1,4 +1,4 @@
-"""Where the frames of a field are in a store of arrays, zarr or HDF5. See `docs/storage.md#arrays`.
+"""Where the frames of a field are in a store of arrays, zarr or HDF5. See `docs/packed-format.md#arrays`.
 
 A frame has a place that depends on its number alone: frame i of a column is entry i of its array. So any block of frames can be
 written without knowing the others, and found without a table of places.
