@@ -146,6 +146,10 @@ class VoteFlags(Flags):
             help="Also write how certain each voxel is: probabilities, flags and number of scans (for scans only).",
         ),
     ] = False
+    keep_actors: Annotated[
+        bool,
+        typer.Option("--keep-actors", help="Also write which actor each voxel belongs to, and how fast it moves."),
+    ] = False
     min_confidence: Annotated[
         float,
         typer.Option(
@@ -155,7 +159,9 @@ class VoteFlags(Flags):
 
     def voting(self) -> carlasc.Voting:
         """Return how votes are counted."""
-        return carlasc.Voting(self.rule, self.free_step_m, self.keep, self.keep_evidence, self.min_confidence)
+        return carlasc.Voting(
+            self.rule, self.free_step_m, self.keep, self.keep_evidence, self.min_confidence, self.keep_actors
+        )
 
 
 @dataclass(frozen=True)

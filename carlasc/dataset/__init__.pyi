@@ -1,3 +1,4 @@
+from .fields import ACTOR_FIELDS as ACTOR_FIELDS
 from .fields import EVIDENCE_FIELDS as EVIDENCE_FIELDS
 from .fields import FIELDS as FIELDS
 from .fields import Sample as Sample

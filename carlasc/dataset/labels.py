@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -85,6 +86,8 @@ _PARTS = {  # field of a sample -> fields of the grid
     "occupied": ("occupied",),
     "flags": ("flags",),
     "views": ("views",),
+    "instances": ("instance",),
+    "voxel_flow": ("velocity",),
 }
 OF_GRID = frozenset(_PARTS)
 """The fields of a sample that come from a grid."""
@@ -92,6 +95,7 @@ _PLAIN: dict[str, type[np.generic]] = {
     "occupied": np.float32,
     "flags": np.uint8,
     "views": np.uint16,
+    "instances": np.int64,
 }  # types in samples
 
 
@@ -140,7 +144,9 @@ class GridFields:
         def where(part: str) -> str:
             return f"{grids.location}: {grid}/{part} of frame {frame}"
 
-        sample: Values = {name: np.array(read(name), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
+        sample: Values = {name: np.array(read(*_PARTS[name]), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
+        if "voxel_flow" in self.fields:
+            sample["voxel_flow"] = dense_velocity(read("velocity"), grids.grids[grid].size, where("velocity"))
         if "labels" in self.fields:
             sample["labels"] = label_map(read("labels"), where("labels"))
         if "counts" in self.fields:
@@ -161,6 +167,28 @@ class GridFields:
     @property
     def _needs_known(self) -> bool:
         return not self.fields.isdisjoint(("known", "posterior"))
+
+
+def dense_velocity(velocity: NDArray[Any], size: tuple[int, ...], where: str) -> NDArray[np.float32]:
+    """Return (X, Y, Z, 3) the velocity of each voxel, m/s, zero where nothing moves.
+
+    Args:
+        velocity: (M,), the field `<grid>/velocity`.
+        size: shape of the grid.
+        where: the field, for errors.
+
+    Raises:
+        FormatError: a voxel is not in the grid, or a velocity is not finite.
+    """
+    voxel, count = velocity["voxel"], math.prod(size)
+    if len(voxel) and not 0 <= int(voxel.min()) <= int(voxel.max()) < count:
+        outside = voxel[(voxel < 0) | (voxel >= count)]
+        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
+    if not np.isfinite(velocity["velocity"]).all():
+        raise FormatError(where, expected="finite velocities", found="NaN or infinity")
+    dense = np.zeros((count, 3), np.float32)
+    dense[voxel] = velocity["velocity"]
+    return dense.reshape(*size, 3)
 
 
 def soft_labels(

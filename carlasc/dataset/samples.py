@@ -21,7 +21,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.wording import count
-from carlasc.dataset.fields import ALWAYS, EVIDENCE_FIELDS, FIELDS, Sample, Values
+from carlasc.dataset.fields import ACTOR_FIELDS, ALWAYS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.selection import (
     RecentScans,
@@ -69,6 +69,8 @@ class Dataset(_MapStyle):
         occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where nothing is known
         flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
         views         (X, Y, Z) uint16, number of scans that saw the voxel
+        instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none; the same in all frames of a sequence
+        voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of what is in the voxel, sensor frame; zero where nothing moves
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
@@ -80,7 +82,7 @@ class Dataset(_MapStyle):
 
     The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are empty, and their `valid` is
     False. Frames that lack a field that was asked for are left out. Only grids made with `carlasc.Voting(keep_evidence=True)` have
-    `posterior`, `occupied`, `flags` and `views`. Points nearer than `min_range_m` or farther than `max_range_m`
+    `posterior`, `occupied`, `flags` and `views`, only those made with `keep_actors=True` `instances` and `voxel_flow`. Points nearer than `min_range_m` or farther than `max_range_m`
     of carlasc.json are in no grid. Arrays are in the sequences' own axes: right-handed data are not mirrored, and are not mixed
     with left-handed data.
 
@@ -383,13 +385,12 @@ class Dataset(_MapStyle):
 
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([fields] if isinstance(fields, str) else fields))
-    unknown = [name for name in names if name not in (*FIELDS, *EVIDENCE_FIELDS, *ALWAYS)]
+    known = (*FIELDS, *EVIDENCE_FIELDS, *ACTOR_FIELDS)
+    unknown = [name for name in names if name not in (*known, *ALWAYS)]
     if unknown:
-        expected = f"any of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}"
+        expected = f"any of {', '.join(known)}"
         raise ArgumentError("fields", expected=expected, found=", ".join(map(repr, unknown)))
     chosen = tuple(name for name in names if name not in ALWAYS)
     if not chosen:
-        raise ArgumentError(
-            "fields", expected=f"at least one of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}", found="none"
-        )
+        raise ArgumentError("fields", expected=f"at least one of {', '.join(known)}", found="none")
     return chosen

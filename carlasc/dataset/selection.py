@@ -22,7 +22,7 @@ from carlasc.storage.protocol import Sequence, Source
 _T = TypeVar("_T")
 
 _ADVICE = "leave the sequence out with `split`, a list of names, or do not ask for the field"
-_ADVICE_EVIDENCE = "regrid with `voting=Voting(keep_evidence=True)`, or do not ask for the field"
+_ADVICE_KEEP = "regrid with `voting=Voting(keep_{}=True)`, or do not ask for the field"
 _RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
 
 
@@ -180,10 +180,16 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
                 sequence.location,
                 expected=f"the field {field}",
                 found="no frame that has it",
-                advice=_ADVICE_EVIDENCE if field.rpartition("/")[2] in layout.EVIDENCE_FIELDS else _ADVICE,
+                advice=_advice(field.rpartition("/")[2]),
             )
         common = frames if common is None else np.intersect1d(common, frames, assume_unique=True)
     return np.empty(0, np.int64) if common is None else common
+
+
+def _advice(part: str) -> str:
+    """Return what to do if a field, or part of a grid, does not exist."""
+    kept = {"evidence": layout.EVIDENCE_FIELDS, "actors": layout.ACTOR_FIELDS}
+    return next((_ADVICE_KEEP.format(name) for name, parts in kept.items() if part in parts), _ADVICE)
 
 
 def common_value(values: Mapping[str, _T], what: str) -> _T:

@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError
 _DIRECTIONS = ("x", "y")
 _TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, which is off by 9e-8
 _FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "visibility": 1, "posterior": 1} | dict.fromkeys(
-    ("labels", "known", "counts", "occupied", "flags", "views"), 0
+    ("labels", "known", "counts", "occupied", "flags", "views", "instances", "voxel_flow"), 0
 )
 
 
@@ -110,6 +110,9 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
     for name in {"points", "flow"} & given.keys():
         flipped[name] = given[name].copy()
         flipped[name][:, column] *= -1
+    if "voxel_flow" in flipped:
+        flipped["voxel_flow"] = flipped["voxel_flow"].copy()
+        flipped["voxel_flow"][..., column] *= -1
     if "poses" in sample:
         mirror = np.eye(4)
         mirror[column, column] = -1

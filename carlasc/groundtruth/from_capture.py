@@ -15,6 +15,7 @@ from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput, choose_frames
 from carlasc.groundtruth.voting.ballot import Observation, count_votes
+from carlasc.groundtruth.voxel_actors import ActorPoints
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Source
@@ -50,13 +51,18 @@ class CaptureFrame(FrameInput):
         if picture is not None:
             fields["bev"] = np.frombuffer(picture, np.uint8)
         step = plan.voting.free_step_m
-        votes = count_votes(self._observations(ego), plan.spec, self.capture.classes, rule=plan.rule, free_step_m=step)
-        return FrameData(fields, votes.to_grid(), votes)
+        who = ActorPoints(plan.spec) if plan.voting.keep_actors else None
+        seen = self._observations(ego, who)
+        votes = count_votes(seen, plan.spec, self.capture.classes, rule=plan.rule, free_step_m=step)
+        grid = votes.to_grid()
+        return FrameData(fields, grid, votes, actors=None if who is None else who.of(grid.labels))
 
-    def _observations(self, ego: SensorRecording) -> Iterator[Observation]:
+    def _observations(self, ego: SensorRecording, who: ActorPoints | None) -> Iterator[Observation]:
         for sensor in self.sensors:
             recording = ego if sensor == self.sensors[0] else self.capture.read(sensor, self.source_frame)
             ego_T_sensor = relative_to(ego.world_T_sensor, recording.world_T_sensor)
+            if who is not None:
+                who.add(recording, ego_T_sensor)
             yield Observation(recording.scan.points, _present(recording.scan.labels), ego_T_sensor)
 
 

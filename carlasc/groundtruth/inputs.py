@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
-from carlasc.groundtruth.options import FromScans, Observe, Voting
+from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
+from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.metadata import Metadata
@@ -43,7 +44,7 @@ class GridPlan:
         frames: frame numbers of the source.
 
     Raises:
-        ArgumentError: `observe` is of another type, or cannot say how certain voxels are although `voting` asks for it.
+        ArgumentError: `observe` is of another type, or cannot say how certain voxels are, or who is in them, although `voting` asks for it.
     """
 
     spec: GridSpec
@@ -66,6 +67,14 @@ class GridPlan:
                 found=f"observe={kind}, rule={self.rule}",
                 advice=f"make the grid from scans, or leave out `{name}`",
             )
+        dynamic = self.observe.dynamic if isinstance(self.observe, FromScans) else "align"
+        if self.voting.keep_actors and (isinstance(self.observe, FromGrid) or dynamic != "align"):
+            raise ArgumentError(
+                "keep_actors",
+                expected='grids from a capture, or from scans with dynamic "align", which know the bodies of actors',
+                found=f'dynamic "{dynamic}"' if isinstance(self.observe, FromScans) else "a finer grid",
+                advice="make the grid from scans, or leave out `keep_actors`",
+            )
 
     @property
     def rule(self) -> VoteRule:
@@ -81,7 +90,8 @@ class GridPlan:
         """Return the names of the grid's fields."""
         votes = ("votes",) if self.voting.keep else ()
         evidence = layout.EVIDENCE_FIELDS if self.voting.keep_evidence else ()
-        return tuple(f"{self.grid}/{part}" for part in ("labels", "counts", *votes, *evidence))
+        actors = layout.ACTOR_FIELDS if self.voting.keep_actors else ()
+        return tuple(f"{self.grid}/{part}" for part in ("labels", "counts", *votes, *evidence, *actors))
 
 
 @dataclass(frozen=True)
@@ -93,12 +103,14 @@ class FrameData:
         grid: the grid.
         votes: the votes that decided the grid; None for a resampled grid.
         evidence: how certain each voxel is; None unless the plan needs it (`GridPlan.needs_evidence`).
+        actors: who is in each voxel; None unless the plan asks for it.
     """
 
     fields: Mapping[str, NDArray[Any]]
     grid: Grid
     votes: Votes | None
     evidence: VoxelCertainty | None = None
+    actors: VoxelActors | None = None
 
 
 class RunProgress:

@@ -106,6 +106,8 @@ class Voting:
         keep: also write the votes of every class.
         keep_evidence: also write how certain each voxel is: the fields `occupied`, `classes`, `flags` and `views` of the grid. For scans
             with the rule "ray" only.
+        keep_actors: also write which actor each voxel belongs to, and how it moves: the fields `instance` and `velocity` of the grid. Not
+            for grids from a finer grid; of scans with `dynamic="align"` only.
         min_confidence: voxels that are neither free nor occupied with at least this probability become unknown; 0 to 0.5 keeps all.
             For scans with the rule "ray" only.
 
@@ -118,6 +120,7 @@ class Voting:
     keep: bool = False
     keep_evidence: bool = False
     min_confidence: float = 0.0
+    keep_actors: bool = False
 
     def __post_init__(self) -> None:
         check_rule(self.rule or "sensor", self.free_step_m)

@@ -203,6 +203,9 @@ def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, G
         outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
     if plan.voting.keep_evidence and evidence is not None:
         outputs |= {f"{plan.grid}/{part}": getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
+    if plan.voting.keep_actors and data.actors is not None:
+        actors = data.actors if labels is data.grid.labels else data.actors.within(labels > 0)
+        outputs |= {f"{plan.grid}/{part}": getattr(actors, part) for part in layout.ACTOR_FIELDS}
     return outputs, Grid(plan.spec, labels, counts)
 
 

@@ -18,13 +18,13 @@ from carlasc.storage import layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence
 
-_ADVICE = "make the grid again with `carlasc regrid --keep-evidence`"
+_ADVICE = "make the grid again with `carlasc regrid --keep-{}`"
 
 
 def check_evidence(
     sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]], classes: ClassTable | None
 ) -> Iterator[Finding]:
-    """Check the values of the fields of a grid that say how certain it is.
+    """Check the values of the fields of a grid that say how certain it is, and who is in it.
 
     Args:
         sequence: the sequence.
@@ -33,13 +33,17 @@ def check_evidence(
         arrays: the fields of the frame that could be read, by name.
         classes: class table of the grid; None if it is not known.
     """
-    for part in layout.EVIDENCE_FIELDS:
+    for part in (*layout.EVIDENCE_FIELDS, *layout.ACTOR_FIELDS):
         name = f"{grid}/{part}"
         if name not in arrays:
             continue
+        check, kept = ("evidence", "evidence") if part in layout.EVIDENCE_FIELDS else (part, "actors")
+        where, advice = f"{sequence.location}/{layout.field_named(name).file(frame)}", _ADVICE.format(kept)
         for expected, found in _mistakes(part, arrays[name], sequence.grids[grid].num_voxels, classes):
-            where = f"{sequence.location}/{layout.field_named(name).file(frame)}"
-            yield Finding("error", "evidence", sequence.path, where, expected, found, _ADVICE)
+            yield Finding("error", check, sequence.path, where, expected, found, advice)
+        labels = arrays.get(f"{grid}/labels")
+        if part == "instance" and labels is not None and (lost := np.count_nonzero((labels == 0) & (arrays[name] > 0))):
+            yield Finding("error", check, sequence.path, where, "actors in occupied voxels", f"{lost} others", advice)
 
 
 def _mistakes(part: str, array: NDArray[Any], num_voxels: int, classes: ClassTable | None) -> Iterator[tuple[str, str]]:
@@ -54,6 +58,16 @@ def _mistakes(part: str, array: NDArray[Any], num_voxels: int, classes: ClassTab
             yield f"flags of 0 to {sum(VoxelFlag)}", f"{wrong[0]}, and {wrong.size - 1} other such values"
     elif part == "classes":
         yield from _mistakes_of_classes(array, num_voxels, classes)
+    elif part == "velocity":
+        yield from _mistakes_of_velocity(array, num_voxels)
+
+
+def _mistakes_of_velocity(table: NDArray[Any], num_voxels: int) -> Iterator[tuple[str, str]]:
+    voxels, finite = table["voxel"].astype(np.int64), np.isfinite(table["velocity"]).all(axis=1)
+    if len(voxels) and not (voxels[0] >= 0 and voxels[-1] < num_voxels and (np.diff(voxels) > 0).all()):
+        yield f"rising voxels from 0 to {num_voxels - 1}", "others"
+    if not finite.all():
+        yield "finite velocities", f"NaN or infinity in {np.count_nonzero(~finite)} voxels"
 
 
 def _mistakes_of_classes(table: NDArray[Any], num_voxels: int, classes: ClassTable | None) -> Iterator[tuple[str, str]]:

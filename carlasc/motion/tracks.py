@@ -230,12 +230,14 @@ class MovingActors:
         moving: (M,) indices of the points of a scan that move and belong to no track, by frame.
         summary: what was found of every actor, standing ones too, as plain values.
         own: (6,) lower and upper corners, metres, sensor frame, of the places of points that move with the sensor: the recording vehicle.
+        numbers: number of each actor over the whole sequence, by the number of its track; empty if they are not needed.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
     moving: Mapping[int, NDArray[np.integer]] = field(default_factory=dict)
     summary: tuple[Mapping[str, Any], ...] = ()
     own: tuple[NDArray[np.float64], ...] = ()
+    numbers: Mapping[int, int] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -257,7 +259,8 @@ class MovingActors:
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
         tracks = {number: track for number, track in near.items() if track.members or len(track.world_T_actor)}
         moving = {frame: members for frame, members in self.moving.items() if first <= frame <= last}
-        return MovingActors(tracks, moving, own=self.own)
+        numbers = {number: self.numbers[number] for number in tracks} if self.numbers else {}
+        return MovingActors(tracks, moving, own=self.own, numbers=numbers)
 
     def is_own(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
+from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.body_regions import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
@@ -29,6 +30,7 @@ from carlasc.groundtruth.voting.certainty import (
 )
 from carlasc.groundtruth.voting.consensus import ClassConsensus, agree
 from carlasc.groundtruth.voting.kernel import mark
+from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.motion.tracks import MovingActors
 
 # The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
@@ -51,11 +53,13 @@ class MergedFrame:
         grid: the grid.
         votes: the votes that decided it, without what completes actors.
         evidence: how certain each voxel is; None unless the plan asks for it.
+        actors: who is in each voxel; None unless the plan asks for it.
     """
 
     grid: Grid
     votes: Votes
     evidence: VoxelCertainty | None = None
+    actors: VoxelActors | None = None
 
 
 def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int, window: list[int]) -> MergedFrame:
@@ -77,7 +81,8 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
     del ballot  # its memory is needed by the next ones
     if plan.rule != "ray":
-        return MergedFrame(votes.to_grid(), votes)
+        whole = votes.to_grid()
+        return MergedFrame(whole, votes, actors=steps.actors(whole.labels.reshape(-1)))
     consensus = None if options.dynamic == "tube" else agree(votes.occupied, plan.spec, classes)
     made = steps.decide_seen(votes, consensus)
 
@@ -103,15 +108,17 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
         made.set_probability(driven, _OWN_PROBABILITY)
     if consensus is not None:
         steps.keep_returns(made, votes, consensus)
+    who = steps.actors(made.labels)
     if feed.finds_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
     if made.occupied is None or views is None:
-        return MergedFrame(grid, votes)
+        return MergedFrame(grid, votes, actors=who)
     inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
     flags, shares = steps.flags(inferred, contested), _join_shares(votes, consensus, completed, classes)
-    return MergedFrame(grid, votes, VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views))
+    evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views)
+    return MergedFrame(grid, votes, evidence, who)
 
 
 def _join_shares(
@@ -247,6 +254,13 @@ class _FrameSteps:
         made.counts[found.voxels] = found.counts
         made.set_probability(found.voxels, self._probability(found))
         return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
+
+    def actors(self, labels: NDArray[np.integer]) -> VoxelActors | None:
+        """Return who is in the voxels of (V,) classes, if the plan asks for it."""
+        if not self.plan.voting.keep_actors:
+            return None
+        merger = self.merger
+        return find_voxels(self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels)
 
     def flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return (V,) the flags of each voxel."""

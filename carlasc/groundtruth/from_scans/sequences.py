@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import check_rigid, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import (
@@ -83,7 +84,7 @@ class ScanFrame(FrameInput):
         feed = self.inputs.feed
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec))
-        return FrameData(fields, merged.grid, merged.votes, merged.evidence)
+        return FrameData(fields, merged.grid, merged.votes, merged.evidence, merged.actors)
 
     def thinned(self, plan: GridPlan) -> Grid:
         """Return the grid without every tenth of the scans of other frames."""
@@ -165,6 +166,8 @@ class ScanSequence(StoredSequence):
         self.refine(writer, run, steps)
         if self.feed.needs_actors:
             self.actors = read_or_find_actors(self.feed, writer, run, steps)
+        if self.plan.voting.keep_actors:
+            self.actors = with_numbers(self.actors, self.feed)
 
     @property
     def refines(self) -> bool:

@@ -1,0 +1,157 @@
+"""Which actor each voxel of a frame from merged scans belongs to: of what moves by its body, of what stands by the numbers that the data have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import invert, multiply, rotate_vectors, transform_points
+from carlasc.core.grids import GridSpec
+from carlasc.groundtruth.from_scans.body_regions import BodyRegions
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.merging import STATIC, Instant
+from carlasc.groundtruth.voxel_actors import VoxelActors
+from carlasc.motion.numbering import number_actors
+from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
+
+_TURN_FRAMES = 3  # frames before and after, between which the turning of an actor is measured
+Numbered = tuple[NDArray[np.float32], NDArray[np.int64]]
+_NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = (
+    WeakKeyDictionary()
+)  # the numbered points of scans, for the frames that follow
+
+
+def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
+    """Return the actors with their numbers over the whole sequence."""
+    highest = max((int(actor["instance"]) for actor in actors.summary), default=0)
+    numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_MOVER]
+    if "instances" in feed.sequence.fields() and len(numbered) < len(actors.tracks):
+        frames = feed.sequence.frames("instances").tolist()
+        highest = max([highest, *(int(feed.sequence.read("instances", frame).max(initial=0)) for frame in frames)])
+    return replace(actors, numbers=number_actors(actors.tracks, highest))
+
+
+def find_voxels(
+    spec: GridSpec,
+    feed: ScanFeed,
+    actors: MovingActors,
+    now: Instant,
+    regions: BodyRegions,
+    window: list[int],
+    labels: NDArray[np.integer],
+) -> VoxelActors:
+    """Return the actors of the voxels of a frame.
+
+    Args:
+        spec: the grid.
+        feed: the scans.
+        actors: what moves, with numbers.
+        now: the frame.
+        regions: the voxels of their bodies.
+        window: frames whose scans were merged.
+        labels: (V,) the classes of the grid, ground by its classes.
+    """
+    classes, instance = feed.classes, np.zeros(spec.num_voxels, np.uint32)
+    solid = (labels > 0) & ~np.isin(labels, sorted(classes.ground))
+    movable = solid & np.isin(labels, sorted(classes.movable)) if feed.has_labels else solid
+    voxels, velocities = [np.empty(0, np.int64)], [np.empty((0, 3))]
+    bodies = np.flatnonzero((regions.of_voxel != STATIC) & solid)
+    centers = transform_points(now.world_T_grid, _centers(spec, bodies))
+    for region, number in regions.actors.items():
+        track = actors.tracks[number]
+        own = (regions.of_voxel[bodies] == region) & (movable[bodies] | (labels[bodies] == track.label))
+        instance[bodies[own]] = actors.numbers[number]
+        voxels.append(bodies[own])
+        velocities.append(rotate_vectors(now.grid_T_world, _velocity(track, now.frame, centers[own], feed)))
+    free = movable & (instance == 0)
+    _number_points(spec, feed, actors, now, window, free, instance)
+    _number_boxes(spec, feed, actors, now, free & (instance == 0), instance)
+    return VoxelActors.of(spec, instance, np.concatenate(voxels), np.concatenate(velocities))
+
+
+def _centers(spec: GridSpec, voxels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return (N, 3) the centres of voxels, metres, grid frame."""
+    index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
+    return spec.from_axes(np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)).astype(np.float64)
+
+
+def _velocity(track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed) -> NDArray[np.float64]:
+    """Return (N, 3) m/s, world, of places of an actor, (N, 3) metres, world: it moves, and turns about the vertical."""
+    row, known = frame - track.first, feed.frames
+    near = np.clip([frame - _TURN_FRAMES, frame + _TURN_FRAMES], known[0], known[-1]) - track.first
+    before, after = np.clip(near, 0, len(track.world_T_actor) - 1).tolist()
+    turn = multiply(track.world_T_actor[after], invert(track.world_T_actor[before]))
+    begin, end = np.interp([track.first + before, track.first + after], known, list(feed.times.values()))
+    rate = float(np.arctan2(turn[1, 0], turn[0, 0])) / (end - begin) if end > begin and track.rigid else 0.0
+    arm = places - track.world_T_actor[row, :3, 3]
+    return track.velocity[row] + rate * np.column_stack([-arm[:, 1], arm[:, 0], np.zeros(len(arm))])
+
+
+def _number_points(
+    spec: GridSpec,
+    feed: ScanFeed,
+    actors: MovingActors,
+    now: Instant,
+    window: list[int],
+    free: NDArray[np.bool_],
+    instance: NDArray[np.uint32],
+) -> None:
+    """Give voxels without an actor the number that most points in them have, of those that do not move."""
+    if "instances" not in feed.sequence.fields():
+        return
+    moving = {track.instance for track in actors.tracks.values()}
+    kept = _NUMBERED.setdefault(feed, {})
+    for old in [frame for frame in kept if frame < now.frame + feed.options.window[0]]:
+        del kept[old]
+    pairs = [np.empty(0, np.int64)]
+    for frame in window:
+        if frame not in kept:
+            kept[frame] = _numbered(feed, frame)
+        points, numbers = kept[frame]
+        standing = ~np.isin(numbers, list(moving))
+        points, numbers = points[standing], numbers[standing]
+        found = spec.flat_index(transform_points(now.grid_T_world, points))
+        used = found >= 0
+        used[used] = free[found[used]]
+        pairs.append(found[used].astype(np.int64) << 32 | numbers[used])
+    keys, counts = np.unique(np.concatenate(pairs), return_counts=True)
+    order = np.argsort(counts, kind="stable")  # the number of most points is written last
+    instance[keys[order] >> 32] = (keys[order] & 0xFFFFFFFF).astype(np.uint32)
+
+
+def _numbered(feed: ScanFeed, frame: int) -> Numbered:
+    """Return the points of a scan that have numbers, (M, 3) metres, world, and their numbers."""
+    scan = feed.sequence.scan(frame, ("instances",))
+    if scan.instances is None:
+        return np.empty((0, 3), np.float32), np.empty(0, np.int64)
+    own = (scan.instances > 0) & np.isfinite(scan.points).all(axis=1)
+    return transform_points(feed.pose(frame), scan.points[own]).astype(np.float32), scan.instances[own].astype(np.int64)
+
+
+def _number_boxes(
+    spec: GridSpec,
+    feed: ScanFeed,
+    actors: MovingActors,
+    now: Instant,
+    free: NDArray[np.bool_],
+    instance: NDArray[np.uint32],
+) -> None:
+    """Give voxels without an actor the number of the frame's box that they are in, the smallest one."""
+    boxes = feed.sequence.boxes(now.frame) if "boxes" in feed.sequence.fields() else None
+    if boxes is None or not len(boxes):
+        return
+    moving = {track.instance for track in actors.tracks.values()}
+    voxels = np.flatnonzero(free)
+    centers, half = (
+        _centers(spec, voxels),
+        np.asarray(spec.voxel_size if spec.coordinates == "cartesian" else (0, 0, 0)) / 2,
+    )
+    for row in np.argsort(-boxes.sizes.prod(axis=1), kind="stable").tolist():
+        if int(boxes.tracks[row]) not in moving:
+            box_T_grid = invert(boxes.sensor_T_box[row])
+            slack = np.abs(box_T_grid[:3, :3]) @ half
+            inside = (np.abs(transform_points(box_T_grid, centers)) < boxes.sizes[row] / 2 + slack).all(axis=1)
+            instance[voxels[inside]] = boxes.tracks[row]

@@ -1,0 +1,100 @@
+"""Which actor each voxel of a grid belongs to, and how it moves; and how both follow from the points of recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.captures.raw import SensorRecording
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
+from carlasc.core.grids import GridSpec
+from carlasc.motion.segments import MIN_SPEED_M_S
+from carlasc.storage.field_files import VELOCITY_DTYPE
+
+_POINTS_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("actor", np.uint32), ("points", np.int64)])
+
+
+@dataclass(frozen=True)
+class VoxelActors:
+    """Who is in the voxels of a grid, and how fast.
+
+    Attributes:
+        instance: (X, Y, Z) uint32, number of the actor that each voxel belongs to over the whole sequence; 0 for none.
+        velocity: (M,) `field_files.VELOCITY_DTYPE`, sorted by voxel: the voxels that move, m/s, axes of the frame's sensor, ego motion removed.
+    """
+
+    instance: NDArray[np.uint32]
+    velocity: NDArray[np.void]
+
+    @classmethod
+    def of(
+        cls, spec: GridSpec, instance: NDArray[np.uint32], voxels: NDArray[np.int64], velocity: NDArray[np.floating]
+    ) -> Self:
+        """Return the actors of a grid.
+
+        Args:
+            spec: the grid.
+            instance: (V,) number of the actor of each voxel.
+            voxels: (M,) flat indices of voxels that may move.
+            velocity: (M, 3) their velocities, m/s; slow ones are left out.
+        """
+        fast = np.flatnonzero(np.square(velocity).sum(axis=1) > MIN_SPEED_M_S**2)
+        fast = fast[np.argsort(voxels[fast], kind="stable")]
+        table = np.empty(len(fast), VELOCITY_DTYPE)
+        table["voxel"], table["velocity"] = voxels[fast], velocity[fast]
+        return cls(instance.reshape(spec.size), table)
+
+    def within(self, occupied: NDArray[np.bool_]) -> Self:
+        """Return the actors in the voxels that are occupied, (X, Y, Z)."""
+        kept = occupied.reshape(-1)[self.velocity["voxel"]]
+        return replace(self, instance=self.instance * occupied, velocity=self.velocity[kept])
+
+
+class ActorPoints:
+    """Counts the points of each actor in each voxel; memory does not grow with the number of sensors."""
+
+    def __init__(self, spec: GridSpec) -> None:
+        self.spec = spec
+        self._counts = np.empty(0, _POINTS_DTYPE)
+        self._velocity: dict[int, NDArray[np.float64]] = {}
+
+    def add(self, recording: SensorRecording, grid_T_sensor: Transform) -> None:
+        """Add the points of a recording; numbers of actors are those of the whole recording."""
+        scan = recording.scan
+        if scan.labels is None or scan.instances is None:
+            return
+        voxels = self.spec.flat_index(transform_points(grid_T_sensor, scan.points))
+        used = (voxels >= 0) & (scan.labels > 0)
+        points = np.empty(np.count_nonzero(used), _POINTS_DTYPE)
+        points["voxel"], points["label"], points["actor"] = voxels[used], scan.labels[used], scan.instances[used]
+        points["points"] = 1
+        self._counts = _sum(np.concatenate([self._counts, _sum(points)]))
+        velocity = rotate_vectors(grid_T_sensor, recording.velocities[:, 1:])
+        for actor, own in zip(recording.velocities[:, 0].astype(np.int64).tolist(), velocity, strict=True):
+            self._velocity.setdefault(actor, own)
+
+    def of(self, labels: NDArray[np.unsignedinteger]) -> VoxelActors:
+        """Return the actors of a grid with these labels, (X, Y, Z): of the points of a voxel's class, the number that most have; ties go to the lowest."""
+        counts = self._counts
+        counts = counts[counts["label"] == labels.reshape(-1)[counts["voxel"]]]
+        best = counts[np.lexsort((counts["actor"], -counts["points"], counts["voxel"]))]
+        best = best[np.flatnonzero(np.diff(best["voxel"], prepend=-1))]
+        instance = np.zeros(self.spec.num_voxels, np.uint32)
+        instance[best["voxel"]] = best["actor"]
+        known = best[np.isin(best["actor"], list(self._velocity)) & (best["actor"] > 0)]
+        velocity = np.array([self._velocity[actor] for actor in known["actor"].tolist()]).reshape(-1, 3)
+        return VoxelActors.of(self.spec, instance, known["voxel"].astype(np.int64), velocity)
+
+
+def _sum(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """Return one row for each voxel, class and actor, with the sum of its points."""
+    order = np.lexsort((rows["actor"], rows["label"], rows["voxel"]))
+    rows = rows[order]
+    keys = np.stack([rows["voxel"].astype(np.int64), rows["label"].astype(np.int64) << 32 | rows["actor"]])
+    first = np.flatnonzero((np.diff(keys, axis=1, prepend=-1) != 0).any(axis=0))
+    found = rows[first]
+    found["points"] = np.add.reduceat(rows["points"], first) if len(first) else 0
+    return found

@@ -1,0 +1,211 @@
+"""Who is in each voxel, and how fast: `python docs/studies/per_voxel.py [WORK]` prints the table of docs/ground-truth.md.
+
+The simulated drives of `movers.py` are merged with the fields that a row names, on the coarse grid, with 32 channels. What 40 sensors saw at
+the same instant is the truth: the class of each voxel, and the actor whose box it is in; how fast it moves there follows from the actor's
+exact poses. Voxels known to both count. WORK keeps the drives; the default is a temporary folder.
+
+    --size tiny     one short part of one drive
+
+- PQ: panoptic quality of vehicles and people that move faster than 1 m/s, the mean of both classes; "of the truth" counts what the grid does
+  not know as free.
+- one number: of the movers that half of all scans or more see with 50 points or more, the share that has one number in all of these scans.
+- velocity: mean length of the difference over the voxels that move in both, m/s; beside it the share of the moving voxels that have one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from actors import Bare
+from movers_drives import GRIDS, KINDS, MOVES_M_S, Recorded, Reference, record, reference
+from movers_rows import Changed, noisy_boxes
+from numpy.typing import NDArray
+
+from carlasc import GridSpec
+from carlasc.captures import Lidar
+from carlasc.core.frames import FrameRange
+from carlasc.core.geometry import invert, transform_points
+from carlasc.core.tables import CARLA
+from carlasc.groundtruth import FromScans, Voting
+from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.voxel_actors import VoxelActors
+from carlasc.metrics import PanopticQuality
+from carlasc.motion import MotionOptions
+from carlasc.motion.tracks import MovingActors
+from carlasc.storage import Sequence
+
+SEEDS = {"town": range(61, 66), "street": range(261, 266)}
+MANY_POINTS, SEEN = 50, 0.5
+THINGS = frozenset({CARLA.id_of("Vehicle"), CARLA.id_of("Pedestrian")})
+
+
+class Only(Changed):
+    """A sequence with some of its fields only."""
+
+    def __init__(self, sequence: Sequence, names: set[str]) -> None:
+        super().__init__(sequence)
+        self._names = frozenset(names)
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields that are kept."""
+        return self._sequence.fields() & (self._names | {"points", "labels"})
+
+
+ROWS = ("instances", "flow", "exact boxes", "boxes", "evidence", "evidence, no labels")
+
+
+def merged_from(drive: Recorded, row: str) -> tuple[Sequence, FromScans]:
+    """Return what a row merges, and how."""
+    source = "boxes" if "boxes" in row else row.partition(",")[0]
+    observe = FromScans(own_path=False, motion=MotionOptions(source))  # type: ignore[arg-type]
+    if row == "evidence, no labels":
+        return Bare(drive.sequence), observe
+    return Only(noisy_boxes(drive, 0) if row == "boxes" else drive.sequence, {source}), observe
+
+
+@dataclass
+class Scores:
+    """What is added up over frames and drives."""
+
+    both: PanopticQuality = field(default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS))
+    truth: PanopticQuality = field(default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS))
+    one: list[bool] = field(default_factory=list)
+    errors: list[NDArray[np.float64]] = field(default_factory=list)
+    moving: int = 0
+
+    def add(
+        self, found: tuple[NDArray[np.integer], NDArray[np.bool_], VoxelActors], seen: Reference, truth: Truth
+    ) -> None:
+        """Add a frame: the classes of the grid, what it knows, and its actors."""
+        labels, known, actors = found
+        is_mover = np.isin(seen.labels, sorted(THINGS)) & (seen.owner > 0)
+        own = np.isin(labels, sorted(THINGS)) & (actors.instance > 0)
+        pair = (np.where(own, labels, 0), actors.instance), (np.where(is_mover, seen.labels, 0), seen.owner)
+        self.both.update(*pair, mask=seen.judged & known)
+        self.truth.update(*pair, mask=seen.judged)
+        wanted = is_mover & seen.judged & known & (labels > 0)
+        velocity = np.full((labels.size, 3), np.nan)
+        velocity[actors.velocity["voxel"]] = actors.velocity["velocity"]
+        voxels = np.flatnonzero(wanted)
+        errors = np.linalg.norm(velocity[voxels] - truth.velocity(voxels, seen.owner.reshape(-1)[voxels]), axis=1)
+        self.moving += len(voxels)
+        self.errors.append(errors[~np.isnan(errors)])
+
+    def row(self, name: str) -> str:
+        """Return a row of the table."""
+        ids = sorted(THINGS)
+        pq, whole = (score.compute().pq[ids] for score in (self.both, self.truth))
+        errors = np.concatenate(self.errors)
+        cells = [np.nanmean(pq), *pq, np.nanmean(whole), np.mean(self.one), errors.mean(), len(errors) / self.moving]
+        return f"| {name} | {' | '.join(f'{cell:.2f}' for cell in cells)} |"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The exact motion of the actors at a frame.
+
+    Attributes:
+        spec: the grid.
+        poses: (4, 4) grid_T_actor one frame before and one after, both in the grid of the frame itself, and at the frame, by actor.
+    """
+
+    spec: GridSpec
+    poses: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]
+
+    @classmethod
+    def of(cls, drive: Recorded, frame: int) -> Truth:
+        """Make the drive again, and take the poses of its actors."""
+        made = KINDS[drive.setting.kind].make(drive.setting.seed, Lidar())
+        grid_T_world = invert(made.sensor_poses(frame, 1)[0])
+        at = [{a.id: grid_T_world @ a.world_T_actor for a in made.actors(f)} for f in (frame - 1, frame, frame + 1)]
+        return cls(GRIDS["coarse"], {a: (at[0][a], at[1][a], at[2][a]) for a in at[1] if a in at[0] and a in at[2]})
+
+    def velocity(self, voxels: NDArray[np.int64], owners: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return (N, 3) m/s of the centres of voxels in actors."""
+        spec, found = self.spec, np.full((len(voxels), 3), np.nan)
+        centers = np.stack(np.unravel_index(voxels, spec.size), axis=-1) * spec.voxel_size + spec.lower
+        centers = centers + np.array(spec.voxel_size) / 2
+        for actor in np.unique(owners).tolist():
+            if actor in self.poses:
+                before, now, after = self.poses[actor]
+                own = owners == actor
+                local = transform_points(invert(now), centers[own])
+                found[own] = (transform_points(after, local) - transform_points(before, local)) / 0.2
+        return found
+
+
+def numbers_seen(drive: Recorded, actors: MovingActors) -> list[bool]:
+    """Return of each mover that is seen throughout whether it has one number in all scans that see it."""
+    frames = drive.sequence.frames("points").tolist()
+    found: dict[int, list[int]] = {}
+    speeds: dict[int, float] = {}
+    for frame in frames:
+        owners = drive.sequence.read("instances", frame).astype(np.int64)
+        speed = np.linalg.norm(drive.sequence.read("flow", frame), axis=1)
+        own = np.zeros(len(owners), np.int64)
+        for number, track in actors.tracks.items():
+            own[track.members.get(frame, [])] = actors.numbers[number]
+        for owner, count in zip(*np.unique(owners[owners > 0], return_counts=True), strict=True):
+            mine = own[owners == owner]
+            speeds[int(owner)] = max(speeds.get(int(owner), 0.0), float(speed[owners == owner].max()))
+            if count >= MANY_POINTS:
+                found.setdefault(int(owner), []).append(int(np.bincount(mine).argmax()))
+    # scans in which nothing shows a mover (it stands, or is hidden) have no number, and are another figure
+    return [
+        len(set(seen) - {0}) == 1
+        for owner, seen in found.items()
+        if speeds[owner] > MOVES_M_S and len(seen) >= SEEN * len(frames)
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", nargs="?", type=Path)
+    parser.add_argument("--size", choices=("tiny", "whole"), default="whole")
+    parser.add_argument("--rows", nargs="*", default=ROWS)
+    for kind, seeds in SEEDS.items():
+        parser.add_argument(f"--{kind}", nargs="*", type=int, default=seeds)
+    given = parser.parse_args()
+    tiny = given.size == "tiny"
+    drives = [(kind, seed) for kind in SEEDS for seed in getattr(given, kind)][: 1 if tiny else None]
+    scores = {row: Scores() for row in given.rows}
+    with tempfile.TemporaryDirectory() as temporary:
+        work = given.work or Path(temporary)
+        for kind, seed in drives:
+            (drive,) = record(kind, seed, [32], work)
+            seen = {frame: one for (grid, frame), one in reference(kind, seed, work).items() if grid == "coarse"}
+            truths = {frame: Truth.of(drive, frame) for frame in list(seen)[: 1 if tiny else None]}
+            for row, score in scores.items():
+                sequence, observe = merged_from(drive, row)
+                feed = ScanFeed(sequence, observe)
+                plan = GridPlan(GRIDS["coarse"], "grid", observe, Voting(keep_actors=True), FrameRange())
+                actors = with_numbers(find_actors(feed), feed)
+                score.one += numbers_seen(drive, actors)
+                for frame, truth in truths.items():
+                    merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+                    labels = merged.grid.labels
+                    if row.endswith("no labels"):  # the class is not known: that of the truth, where both are occupied
+                        own = np.isin(seen[frame].labels, sorted(THINGS)) | (labels == 0)
+                        usual = np.where(own, seen[frame].labels, min(THINGS))
+                        labels = np.where(labels > 0, usual, 0)
+                    score.add((labels, merged.grid.known, merged.actors), seen[frame], truth)
+                print(kind, seed, score.row(row), flush=True)
+    print(
+        "\n| from | PQ | people | vehicles | PQ of the truth | one number | velocity, m/s | with velocity |\n|---|---:|---:|---:|---:|---:|---:|---:|"
+    )
+    for row, score in scores.items():
+        print(score.row(row))
+
+
+if __name__ == "__main__":
+    main()
