@@ -69,7 +69,16 @@ def observe(merging, frame=15, window=FRAMES):
     """Return the observations of the static scene and of the actor."""
     now = instant(frame)
     seen = list(merging.observations(now, window, BodyRegions.at(merging, now, window, SPEC).actors))
-    return seen[: len(window)], seen[len(window) :]
+    return seen[: len(window)], each_voter(seen[len(window) :])
+
+
+def each_voter(observations):
+    """Return the observations of each voter apart."""
+    return [
+        replace(one, points=one.points[a:b], labels=one.labels[a:b], hits=one.hits[a:b], grid_T_sensor=pose, ends=None)
+        for one in observations
+        for pose, a, b in zip(one.grid_T_sensor, [0, *one.ends[:-1]], one.ends, strict=True)
+    ]
 
 
 def test_a_persons_shape_is_used_for_eight_frames_and_a_vehicles_for_all():
@@ -192,7 +201,9 @@ def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
     merging.scan_of(20).points[1] += np.float32([0.0, 0.3, 0.1])
     now = instant(15)
     for mirrored, plain in zip(
-        list(merging.mirrored(now, [20], regions_of(merging).actors)), observe(merging, window=[20])[1], strict=True
+        each_voter(merging.mirrored(now, [20], regions_of(merging).actors)),
+        observe(merging, window=[20])[1],
+        strict=True,
     ):
         actor_T_grid = invert(invert(sensor_pose(15)) @ actor_pose(15))
         one = transform_points(actor_T_grid @ plain.grid_T_sensor, plain.points)

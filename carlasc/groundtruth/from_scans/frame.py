@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,11 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     # The static scene votes everywhere, and each moving actor in the voxels of its body.
     regions = BodyRegions.at(merger, now, window, plan.spec)
     steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
-    ballot = steps.vote(merger.observations(now, window, bodies), plan.needs_evidence)
+    recent = merger.recent(now, window)  # first, so that what they saw is known apart from what others did
+    ballot = steps.vote(merger.observations(now, recent, {}), count_views=plan.needs_evidence)
+    seen_now = ballot.seen()
+    others = merger.observations(now, (other for other in window if other not in recent), {})
+    steps.vote(chain(others, merger.in_bodies(now, window, bodies)), ballot)
     votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
     del ballot  # its memory is needed by the next ones
     if plan.rule != "ray":
@@ -88,7 +93,7 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
 
     # What rays beside a body, or of other times, saw as free says nothing of these voxels.
     contested = steps.contested()
-    doubtful = np.concatenate([regions.hidden, steps.unseen_now(contested)])
+    doubtful = np.concatenate([regions.hidden, steps.unseen_now(contested[~seen_now[contested]], recent)])
     made.forget(doubtful[made.labels[doubtful] == 0])
 
     # Actors are completed by their mirror images, then by the usual shapes of vehicles.
@@ -276,15 +281,16 @@ class _FrameSteps:
             flags[where] |= np.uint8(flag)
         return flags
 
-    def vote(self, observations: Iterable[Observation], count_views: bool = False) -> Ballot:
-        """Return the votes of observations, each in its region."""
-        regions, step = self.regions.of_voxel, self.plan.voting.free_step_m
-        ballot = Ballot(
+    def vote(
+        self, observations: Iterable[Observation], ballot: Ballot | None = None, count_views: bool = False
+    ) -> Ballot:
+        """Return the votes of observations, each in its region: a ballot that is given, with them, or a new one."""
+        ballot = ballot or Ballot(
             self.plan.spec,
             self.feed.classes,
             rule=self.plan.rule,
-            free_step_m=step,
-            regions=regions,
+            free_step_m=self.plan.voting.free_step_m,
+            regions=self.regions.of_voxel,
             count_views=count_views,
         )
         for observation in observations:
@@ -319,11 +325,9 @@ class _FrameSteps:
             return _NO_VOXELS
         return np.flatnonzero(self.vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body)
 
-    def unseen_now(self, voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return those of some voxels that the scans just before and after the frame did not see."""
-        if not len(voxels):
-            return voxels
-        return voxels[~self.vote(self.merger.recent(self.now, self.window)).seen(voxels)]
+    def unseen_now(self, voxels: NDArray[np.int64], recent: list[int]) -> NDArray[np.int64]:
+        """Return those of some voxels in which recent scans have no moving points either."""
+        return voxels[~self.vote(self.merger.moving(self.now, recent)).hit[voxels]] if len(voxels) else voxels
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels occupied in which the frame's own scan has returns, whatever other scans say, unless these are outliers."""

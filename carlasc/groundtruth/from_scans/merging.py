@@ -8,7 +8,9 @@ time of the frame. Free space that other scans saw of the static scene does not 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +28,8 @@ _DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
 _RECENT_S = 0.25  # what scans saw within this time before and after a frame is so at the frame
 # What is so near to an actor's body may be a part of it that its path puts elsewhere: metres along, across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
+_TURN = 65_000  # steps of azimuth, of 0.1 mrad: they fit 16 bits
 
 
 @dataclass(frozen=True)
@@ -58,21 +61,21 @@ class RaysFromPlace:
         sensor_T_place: (4, 4), from the place where they began, in the axes of the sensor, to the sensor's frame.
         points: (M, 3) float32, the same points seen from there, metres.
         order: (M,) int32, indices of `points` by increasing azimuth.
-        azimuth: (M,) float32, radians, in this order.
+        azimuth: (M,) uint16, their azimuths in this order, in steps of which `_TURN` are a full circle, from -pi.
     """
 
     part: slice
     sensor_T_place: Transform
     points: NDArray[np.float32]
     order: NDArray[np.int32]
-    azimuth: NDArray[np.float32]
+    azimuth: NDArray[np.uint16]
 
     @classmethod
     def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> RaysFromPlace:
-        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan."""
-        own = points[part] - origin.astype(np.float32) if origin.any() else points[part]
-        azimuth = np.arctan2(own[:, 1], own[:, 0])
-        order = np.argsort(azimuth, kind="stable").astype(np.int32)
+        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan, which are given as seen from there."""
+        own = points[part]
+        azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
+        order = np.argsort(azimuth, kind="stable").astype(np.int32)  # of 16 bits: by their digits
         return cls(part, translation(origin), own, order, azimuth[order])
 
     def through(
@@ -109,12 +112,11 @@ class RaysFromPlace:
         half = np.abs((angles - middle + np.pi) % (2 * np.pi) - np.pi).max() + 1e-6
         if half > np.pi / 2:  # the corners surround the sensor
             return self.order
-        first, last = np.searchsorted(self.azimuth, [middle - half, middle + half])
-        parts = [self.order[first:last]]
-        if middle - half < -np.pi:
-            parts.append(self.order[np.searchsorted(self.azimuth, middle - half + 2 * np.pi) :])
-        if middle + half > np.pi:
-            parts.append(self.order[: np.searchsorted(self.azimuth, middle + half - 2 * np.pi)])
+        low, high = np.floor(_steps(middle - half)) - 1, np.ceil(_steps(middle + half)) + 1
+        parts = [
+            self.order[slice(*np.searchsorted(self.azimuth, np.clip([low + turn, high + turn + 1], 0, _TURN + 1)))]
+            for turn in (0, _TURN, -_TURN)
+        ]
         return np.concatenate(parts)
 
 
@@ -131,6 +133,7 @@ class PreparedScan:
         seconds: time of the scan.
         moving: (M,) indices of the points that move by their flow or their class, on a track or not.
         sure: (N,) float32, probability of each label, as a network gave it; None: 1.
+        ends: (N, 3) float32, the points seen from where their rays began, metres: `points` themselves if that is the sensor.
         rays: the rays to the points, by where they began: at one place, unless there are several sensors, or the vehicle moved.
     """
 
@@ -141,6 +144,7 @@ class PreparedScan:
     reach_m: float
     seconds: float
     moving: NDArray[np.int64]
+    ends: NDArray[np.float32]
     rays: tuple[RaysFromPlace, ...]
     sure: NDArray[np.float32] | None = None
 
@@ -175,18 +179,25 @@ class PreparedScan:
         if probabilities is not None:  # labels that it does not name first were found by carlasc
             likely = probabilities[:, 1] / np.float32(layout.CERTAIN)
             sure = np.where(probabilities[:, 0] == labels, likely, np.float32(1)).astype(np.float32)
-        rays = tuple(RaysFromPlace.of(points, part, origin) for part, origin in runs_of_origins(origins, len(points)))
-        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, rays, sure)
+        ends = points if origins is None or not origins.any() else points - origins
+        rays = tuple(RaysFromPlace.of(ends, part, origin) for part, origin in runs_of_origins(origins, len(points)))
+        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, ends, rays, sure)
 
-    def observations(
+    @cached_property
+    def world_T_places(self) -> NDArray[np.float64]:
+        """(4, 4) pose of the sensor, or (K, 4, 4) those of the places where rays began."""
+        places = np.stack([rays.sensor_T_place for rays in self.rays])
+        return self.world_T_sensor @ places if len(places) > 1 or places[0, :3, 3].any() else self.world_T_sensor
+
+    def observation(
         self,
         grid_T_world: Transform,
         hits: NDArray[np.bool_] | None = None,
         *,
         labels: NDArray[np.uint16] | None = None,
         free_region: int | None = None,
-    ) -> Iterator[Observation]:
-        """Yield the votes of the scan: one observation for each place where rays began.
+    ) -> Observation:
+        """Return the votes of the scan: those of a voter for each place where rays began.
 
         Args:
             grid_T_world: (4, 4).
@@ -194,17 +205,15 @@ class PreparedScan:
             labels: (N,) the classes that they vote for; None: their own.
             free_region: region of the grid in which rays vote; None for the whole grid.
         """
-        labels = self.labels if labels is None else labels
-        for rays in self.rays:
-            pose = grid_T_world @ self.world_T_sensor
-            yield Observation(
-                rays.points,
-                labels[rays.part],
-                pose if len(self.rays) == 1 and not rays.sensor_T_place[:3, 3].any() else pose @ rays.sensor_T_place,
-                None if hits is None else hits[rays.part],
-                free_region=free_region,
-                sure=None if self.sure is None else self.sure[rays.part],
-            )
+        return Observation(
+            self.ends,
+            self.labels if labels is None else labels,
+            grid_T_world @ self.world_T_places,
+            hits,
+            free_region=free_region,
+            sure=self.sure,
+            ends=None if self.world_T_places.ndim == 2 else np.array([rays.part.stop for rays in self.rays]),
+        )
 
     def through(
         self, world_T_box: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
@@ -238,11 +247,13 @@ class Merger:
         self._static: dict[int, NDArray[np.bool_]] = {}
         self._labels: dict[int, NDArray[np.uint16]] = {}
         self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
+        self._moving: dict[int, tuple[NDArray[np.float32], NDArray[np.uint16]]] = {}
 
     def forget_before(self, frame: int) -> None:
         """Remove what is kept of scans before a frame."""
-        self._static = {key: value for key, value in self._static.items() if key >= frame}
-        self._labels = {key: value for key, value in self._labels.items() if key >= frame}
+        for kept in (self._static, self._labels, self._moving):
+            for other in [key for key in kept if key < frame]:
+                del kept[other]
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
     def observations(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
@@ -263,58 +274,65 @@ class Merger:
             hits = None if everything else self.static(other)
             if everything and self.actors.own:  # the recording vehicle is no part of the scene
                 hits = ~self.actors.is_own(scan.points)
-            yield from scan.observations(
-                grid_T_world, hits, labels=self.labels(other), free_region=None if own else STATIC
-            )
+            yield scan.observation(grid_T_world, hits, labels=self.labels(other), free_region=None if own else STATIC)
+        yield from self.in_bodies(now, window, bodies)
+
+    def in_bodies(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
+        """Yield the second part of `observations`."""
+        window = list(window)
         for region, number in bodies.items():
             pose = self.actors.tracks[number].pose(now.frame)
-            if pose is None:
-                continue
-            for other in window:
-                for carried in self._carry(number, other, now) if other != now.frame else ():
-                    yield replace(
-                        carried,
-                        grid_T_sensor=grid_T_world @ pose @ carried.grid_T_sensor,
-                        free_region=region,
-                        hit_region=region,
-                    )
+            if pose is not None:
+                yield from self._in_body(number, region, [other for other in window if other != now.frame], now, pose)
 
     def mirrored(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield what the scans of actors would have seen if they had looked at the actors' other side.
 
         Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body, if that is known.
         """
-        window, grid_T_world = list(window), now.grid_T_world
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            if not track.rigid or pose is None or not any(track.extent.known):
-                continue
-            for other in window:
-                for carried in self._carry(number, other, now):
-                    yield replace(
-                        carried,
-                        points=carried.points * np.array([1, -1, 1], np.float32),
-                        grid_T_sensor=grid_T_world @ pose @ _MIRROR @ carried.grid_T_sensor @ _MIRROR,
-                        free_region=region,
-                        hit_region=region,
-                    )
+            if track.rigid and pose is not None and any(track.extent.known):
+                yield from self._in_body(number, region, window, now, pose, mirror=True)
+
+    def _in_body(
+        self, number: int, region: int, window: Iterable[int], now: Instant, pose: Transform, mirror: bool = False
+    ) -> Iterator[Observation]:
+        """Yield what the scans of a window saw in an actor's body, if they did: one observation, with a voter for each place where rays began."""
+        seen = [carried for other in window for carried in self._carry(number, other, now)]
+        if seen:
+            points = np.concatenate([carried.points for carried in seen])
+            places = np.stack([carried.grid_T_sensor for carried in seen])
+            grid_T_actor = now.grid_T_world @ pose
+            yield Observation(
+                points * _MIRRORED if mirror else points,
+                np.concatenate([carried.labels for carried in seen]),
+                grid_T_actor @ _MIRROR @ places @ _MIRROR if mirror else grid_T_actor @ places,
+                np.concatenate([carried.hits for carried in seen if carried.hits is not None]),
+                hit_region=region,
+                free_region=region,
+                ends=np.cumsum([len(carried) for carried in seen]),
+            )
 
     def passing(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
         """Yield the moving points of each scan where that scan saw them. No ray votes for free space."""
-        for other in window:
-            scan = self.scan_of(other)
-            moving = ~self.static(other)
-            if other != now.frame and moving.any():
-                pose = now.grid_T_world @ scan.world_T_sensor
-                yield Observation(scan.points[moving], self.labels(other)[moving], pose, free_region=NOWHERE)
+        yield from self.moving(now, (other for other in window if other != now.frame))
 
-    def recent(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the scans of the instant: those just before and after the frame."""
+    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the same of all scans, that of the frame too."""
         for other in window:
             scan = self.scan_of(other)
-            if abs(scan.seconds - now.seconds) <= _RECENT_S:
-                yield from scan.observations(now.grid_T_world)
+            if other not in self._moving:
+                moving = np.flatnonzero(~self.static(other))
+                self._moving[other] = scan.points[moving], self.labels(other)[moving]
+            points, labels = self._moving[other]
+            if len(points):
+                yield Observation(points, labels, now.grid_T_world @ scan.world_T_sensor, free_region=NOWHERE)
+
+    def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
+        """Return the scans of the instant: those just before and after the frame."""
+        return [other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S]
 
     def shells(self, now: Instant, bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield the surface of each vehicle as it usually is, for what no scan saw of it. No ray votes for free space."""
@@ -369,6 +387,11 @@ class Merger:
                     labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
                     found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
         return self._carried.setdefault((number, other), tuple(found))
+
+
+def _steps(azimuth_rad: Any) -> Any:
+    """Return azimuths in steps, counted from -pi, not rounded."""
+    return (azimuth_rad + np.pi) * (_TURN / (2 * np.pi))
 
 
 def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:

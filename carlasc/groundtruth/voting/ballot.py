@@ -24,7 +24,8 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
-_ALL_SURE = np.empty(0, np.float32)
+_ALL, _ALL_SURE, _NONE = np.empty(0, np.bool_), np.empty(0, np.float32), np.empty(0, np.int64)
+_FEW = 8  # so many times fewer voxels are few
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
 OCCUPIED_DTYPE = np.dtype(
@@ -36,15 +37,18 @@ OCCUPIED_DTYPE = np.dtype(
 class Observation:
     """One voter: the scan of one sensor at one instant. Its points vote for their classes, its rays for free space.
 
+    A sensor that moves while it turns, or several sensors, are one observation of K voters: one for each place where rays began.
+
     Attributes:
-        points: (N, 3) float32, metres, in the sensor's frame. The rounding to float32 is part of the rule: see the format page,
+        points: (N, 3) float32, metres, in the sensor's frame; of K voters those of each after those of the one before. The rounding to float32 is part of the rule: see the format page,
             `docs/format.md#votes`.
         labels: (N,) unsigned integer class ids. Points labelled 0 and their rays do not vote.
-        grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's.
+        grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's; or (K, 4, 4).
         hits: (N,) bool, points that vote for their class; of the other points only the rays vote. None: all points.
         hit_region: region of the grid in which the points vote; None for the whole grid.
         free_region: region of the grid in which the rays vote; None for the whole grid.
         sure: (N,) float32, probability of the class of each point; None: 1.
+        ends: (K,) int64, behind the last point of each voter; None: there is one.
 
     Raises:
         FormatError: points and labels differ in length, have another shape or type, or the transform is not rigid.
@@ -57,6 +61,7 @@ class Observation:
     hit_region: int | None = None
     free_region: int | None = None
     sure: NDArray[np.float32] | None = None
+    ends: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -70,6 +75,11 @@ class Observation:
         if self.hits is not None and self.hits.shape != self.labels.shape:
             raise FormatError("observation hits", expected=f"shape ({len(self.points)},)", found=str(self.hits.shape))
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
+        voters, ends = np.shape(self.grid_T_sensor)[:-2], np.array([len(self)]) if self.ends is None else self.ends
+        if (voters or (1,)) != ends.shape or [*ends[-1:]] != [len(self)] * len(ends[-1:]) or (np.diff(ends) < 0).any():
+            raise FormatError(
+                "observation ends", expected=f"shape {voters or (1,)}, rising to {len(self)}", found=str(ends)
+            )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -152,7 +162,7 @@ class Ballot:
         self.num_observations = 0
         once = rule == "sensor"
         viewed = spec.num_voxels + 1 if count_views else 0
-        self._cells = Cells.of(spec)
+        self._cells, self._outside = Cells.of(spec), dict[int, NDArray[np.int64]]()
         self._tally = kernel.Tally(
             once,
             free=np.zeros(spec.num_voxels + 1, np.uint32),
@@ -172,7 +182,6 @@ class Ballot:
             FormatError: a label is not below the class table's number of channels; no vote was added.
             ArgumentError: it votes in a region, and the ballot has none.
         """
-        from carlasc.core.cells import as_pose
         from carlasc.groundtruth.voting import kernel
 
         self.classes.check(observation.labels, "observation labels")
@@ -182,22 +191,34 @@ class Ballot:
             raise ArgumentError(
                 "observation", expected="no region, as the ballot has none", found="one that votes in a region"
             )
-        labels = np.require(observation.labels, np.uint16, ["C", "A", "W"])
+        ends = np.array([len(observation)]) if observation.ends is None else observation.ends
         self._make_room(len(observation))
         kernel.vote(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
-            labels,
-            labels if observation.hits is None else np.where(observation.hits, labels, np.uint16(0)),
+            np.require(observation.labels, np.uint16, ["C", "A", "W"]),
+            _ALL if observation.hits is None else np.require(observation.hits, np.bool_, ["C", "A", "W"]),
             _ALL_SURE if observation.sure is None else np.require(observation.sure, np.float32, ["C", "A", "W"]),
-            as_pose(observation.grid_T_sensor),
+            np.ascontiguousarray(observation.grid_T_sensor, np.float64).reshape(-1, 16)[:, :12].copy(),
+            ends,
             self._cells,
             self.free_step_m,
             self.num_observations,
             hit_region,
             kernel.NOT_AT_ALL if free_region == NOWHERE else free_region,
+            self._apart(free_region),
             self._tally,
         )
-        self.num_observations += 1
+        self.num_observations += len(ends)
+
+    def _apart(self, region: int) -> NDArray[np.int64]:
+        """Return the voxels that are not in a region, if these are few and each sample counts; otherwise none."""
+        if region < 0 or region == NOWHERE or self._tally.once:
+            return _NONE
+        if region not in self._outside:
+            outside = self._tally.regions != region
+            few = np.count_nonzero(outside) * _FEW < len(outside)
+            self._outside[region] = np.flatnonzero(outside) if few else _NONE
+        return self._outside[region]
 
     @property
     def views(self) -> NDArray[np.uint16]:

@@ -96,27 +96,33 @@ def count_view(voxel: int, voter: int, tally: Tally) -> None:
 def vote_occupied(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
+    hits: NDArray[np.bool_],
     sure: NDArray[np.float32],
     rays: RayBlock,
-    hits: NDArray[np.int32],
+    voxels: NDArray[np.int32],
     pose: Pose,
     cells: Cells,
     voter: int,
     region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of a block's points for their classes, in the voxels of a region. Points labelled 0 have none."""
+    """Add the votes of a block's points for their classes, in the voxels of a region; if `hits` is not empty, of those that it names."""
+    entry, last, label = 0, NONE, np.uint16(0)
     for i in range(len(labels)):
-        if rays.state[i] == DROPPED or labels[i] == 0:
+        if rays.state[i] == DROPPED or (len(hits) and not hits[i]):
             continue
-        voxel = hits[i]
+        voxel = voxels[i]
         if voxel == DOUBTFUL or rays.state[i] == UNSURE:
             _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
         if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
-            entry = vote_for(voxel, labels[i], voter, tally)
+            if voxel != last or labels[i] != label:
+                last, label = voxel, labels[i]
+                entry = vote_for(voxel, label, voter, tally)
+                count_view(voxel, voter, tally)
+            elif not tally.once:  # neighbours are often in one voxel
+                tally.candidates[entry].votes += 1
             if len(sure):
                 tally.candidates[entry].doubt += np.float32(1) - sure[i]
-            count_view(voxel, voter, tally)
 
 
 @inlined
@@ -155,17 +161,18 @@ def vote_free(
     free_step_m: float,
     voter: int,
     region: int,
+    counted: int,
     tally: Tally,
 ) -> None:
     """Add the votes of a block's free samples, which lie between the sensor and the points.
 
-    If each sample counts, only those in `region` are added; otherwise all are marked in `passed`.
+    If each sample counts, those in the region `counted` are added; otherwise all are marked in `passed`. Views count in `region`.
     """
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
         if rays.state[i] == UNSURE:
             vote_free_by_rule(
-                points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, region, tally
+                points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, counted, tally
             )
         if rays.state[i] != SURE:
             continue
@@ -193,12 +200,12 @@ def vote_free(
             if tally.once:
                 for j in range(number):
                     tally.passed[np.uint32(voxels[j])] = 1
-            elif region == ANYWHERE:
+            elif counted == ANYWHERE:
                 for j in range(number):
                     tally.free[np.uint32(voxels[j])] += 1
             else:
                 for j in range(number):
-                    tally.free[np.uint32(voxels[j])] += tally.regions[np.uint32(voxels[j])] == region
+                    tally.free[np.uint32(voxels[j])] += tally.regions[np.uint32(voxels[j])] == counted
             if len(tally.views):
                 for j in range(number):
                     if region == ANYWHERE or tally.regions[voxels[j]] == region:
@@ -243,48 +250,79 @@ def vote_free_by_rule(
 def vote(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
-    hit_labels: NDArray[np.uint16],
+    hits: NDArray[np.bool_],
     sure: NDArray[np.float32],
-    pose: Pose,
+    poses: NDArray[np.float64],
+    ends: NDArray[np.int64],
     cells: Cells,
     free_step_m: float,
     voter: int,
     hit_region: int,
     free_region: int,
+    apart: NDArray[np.int64],
     tally: Tally,
 ) -> None:
     """Add the votes of one observation.
 
     Args:
-        points: (3 N,) float32, metres, x, y, z of each point in the sensor's frame.
+        points: (3 N,) float32, metres, x, y, z of each point, from where its ray began, on the axes of the sensor.
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
-        hit_labels: (N,) uint16, the classes that the points vote for; 0 where only the ray votes.
+        hits: (N,) which points vote for their class; empty if all do.
         sure: (N,) float32, probability of these classes; empty if all are 1.
-        pose: grid_T_sensor.
+        poses: (K, 12) grid_T_place of the places where rays began, each of which is a voter.
+        ends: (K,) behind the last point of each place.
         cells: the cells of the grid.
         free_step_m: distance between two free samples, metres.
-        voter: number of the observation.
+        voter: number of the first voter.
         hit_region: region in which points vote, or ANYWHERE.
         free_region: region in which rays vote, ANYWHERE, or NOT_AT_ALL.
+        apart: (A,) voxels outside of `free_region`, if they are so few that their votes are better put back than not counted; or empty.
         tally: the votes so far, with room for N more candidates.
     """
-    view, rays, hits = view_from(pose, cells), empty_rays(BLOCK), np.empty(BLOCK, np.int32)
-    for begin in range(0, len(labels), BLOCK):
-        block = labels[begin : begin + BLOCK]
-        corner = points[3 * begin : 3 * (begin + len(block))]
-        clip(corner, block, free_step_m, view, rays)
-        place_points(rays, view, hits)
-        own = hit_labels[begin : begin + BLOCK]
-        vote_occupied(corner, own, sure[begin : begin + BLOCK], rays, hits, pose, cells, voter, hit_region, tally)
-        if free_region != NOT_AT_ALL:
-            vote_free(corner, block, rays, pose, view, cells, free_step_m, voter, free_region, tally)
-    if tally.once:
-        if free_region != ANYWHERE:
-            for v in range(len(tally.passed)):
-                tally.passed[v] &= np.uint8(tally.regions[v] == free_region)
+    rays, found, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
+    kept = tally.free[apart]
+    for place in range(len(ends)):
+        p = poses[place]
+        pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        view = view_from(pose, cells)
+        while begin < ends[place]:
+            end = min(begin + BLOCK, ends[place])
+            corner, block = points[3 * begin : 3 * end], labels[begin:end]
+            clip(corner, block, free_step_m, view, rays)
+            place_points(rays, view, found[: end - begin])
+            own, likely = hits[begin:end], sure[begin:end]
+            vote_occupied(corner, block, own, likely, rays, found, pose, cells, voter + place, hit_region, tally)
+            if free_region != NOT_AT_ALL:
+                counted = ANYWHERE if len(apart) else free_region
+                vote_free(
+                    corner,
+                    block,
+                    rays,
+                    pose,
+                    view,
+                    cells,
+                    free_step_m,
+                    voter + place,
+                    free_region,
+                    counted,
+                    tally,
+                )
+            begin = end
+        if tally.once:
+            count_passed(free_region, tally)
+    for i in range(len(apart)):
+        tally.free[apart[i]] = kept[i]
+
+
+@jit
+def count_passed(region: int, tally: Tally) -> None:
+    """Add one vote for free space to each voxel of a region that an observation saw free."""
+    if region != ANYWHERE:
         for v in range(len(tally.passed)):
-            tally.free[v] += tally.passed[v]
-            tally.passed[v] = 0
+            tally.passed[v] &= np.uint8(tally.regions[v] == region)
+    for v in range(len(tally.passed)):
+        tally.free[v] += tally.passed[v]
+        tally.passed[v] = 0
 
 
 @cached
