@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -73,11 +74,18 @@ class ScoringFlags(Flags):
         bool, typer.Option("--rays", help="Also score what rays meet first: RayIoU. Needs poses and a Cartesian grid.")
     ] = False
 
+    actors: Annotated[
+        bool,
+        typer.Option(
+            "--actors", help="Also score who is in each voxel, over time too, and how fast: PQ, LSTQ, velocity."
+        ),
+    ] = False
+
     def options(self) -> carlasc.Scoring:
         """Return what is scored."""
         whole = (self.near_m, self.far_m, self.fov) == (0.0, None, 360.0)
         region = None if whole else _Region(self.near_m, self.far_m, self.fov)
-        return carlasc.Scoring(self.voxels, region, self.by or (), self.rays)
+        return carlasc.Scoring(self.voxels, region, self.by or (), self.rays, self.actors)
 
 
 @dataclass(frozen=True)
@@ -150,7 +158,7 @@ def evaluate(
         result = carlasc.evaluate(source, truth, scoring=scoring.options(), name=name, run=run, **common)
     other = None
     if compare is not None:
-        whole = replace(scoring, by=None, rays=False).options()
+        whole = replace(scoring, by=None, rays=False, actors=False).options()
         with work.spread("Scoring the other", usual=1) as run:
             other = carlasc.evaluate(compare, truth, scoring=whole, name=Path(compare).name, run=run, **common)
     if output.per_frame is not None:
@@ -213,6 +221,10 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
                 f" p = {comparison.p_value:.3g} ({count(len(comparison.sequences), 'sequence')})"
             )
         )
+    if result.actors is not None and not math.isnan(result.actors.velocity_m_s):
+        speeds = result.actors.velocity_by_speed.items()
+        bands = ", ".join(f"from {low:g} m/s {value:.2f}" for low, value in speeds if not math.isnan(value))
+        out.print(line(f"velocity of moving voxels: off by {result.actors.velocity_m_s:.2f} m/s in the mean ({bands})"))
     for note in result.notes:
         echo(f"note: {note}", err=True)
 

@@ -10,6 +10,7 @@ import carlasc
 from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.core.wording import count
+from carlasc.errors import ArgumentError
 
 
 def label(
@@ -18,8 +19,16 @@ def label(
     out: Annotated[str, place_option("-o", "--out", text="Folder of the labelled data set.")],
     predictions: Annotated[
         str,
-        typer.Option("--from", metavar="FILES", help="Folder of the predictions: a file for each frame, by sequence."),
+        typer.Option(
+            "--from",
+            metavar="FILES",
+            help="Folder of the predictions: a file for each frame, by sequence. motion: what carlasc finds to move, as instances and flow.",
+        ),
     ],
+    motion: Annotated[
+        carlasc.motion.MotionSource | None,
+        typer.Option(help="With --from motion, what tells which points move; default: the best field, and free space."),
+    ] = None,
     classes: Annotated[
         str | None, typer.Option(metavar="TABLE", help="Class table of the predictions, by name or in a JSON file.")
     ] = None,
@@ -31,10 +40,18 @@ def label(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a copy of SOURCE with the labels that a network predicted. SOURCE is not changed.
+    """Write a copy of SOURCE with the labels that a network predicted, or with what moves in it. SOURCE is not changed.
 
     Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
     """
+    if predictions == "motion":
+        others = {"--classes": classes, "--logits": logits, "--by": by, "--frames": frames}
+        if given := [name for name, value in others.items() if value]:
+            raise ArgumentError("predictions", expected=f"no {given[0]} with --from motion", found=given[0])
+        _label_motion(source, out, motion or "auto", overwrite, run, json)
+        return
+    if motion is not None:
+        raise ArgumentError("motion", expected="--from motion", found=f"--from {predictions}")
     with run.spread("Labelling", "files") as spread:
         result = carlasc.label(
             source,
@@ -56,3 +73,19 @@ def label(
     echo(
         f"{result.out}: labels of {count(result.frames, 'frame')} predicted by {result.by} ({result.classes}); {files}"
     )
+
+
+def _label_motion(
+    source: str, out: str, motion: carlasc.motion.MotionSource, overwrite: bool, run: RunFlags, json: bool
+) -> None:
+    """Write what moves, and print what was found."""
+    observe = carlasc.FromScans(motion=carlasc.motion.MotionOptions(motion))
+    with run.spread("Finding what moves", "scans and files") as spread:
+        result = carlasc.label_motion(source, out, observe=observe, overwrite=overwrite, run=spread)
+    if json:
+        print_json(result)
+        return
+    for note in result.notes:
+        echo(f"note: {note}", err=True)
+    files = f"{count(result.linked, 'file')} linked, {result.files} written"
+    echo(f"{result.out}: {count(result.actors, 'moving actor')}, in instances and flow; {files}")

@@ -1,4 +1,6 @@
 from .from_grid import resample as resample
+from .labelling_motion import MotionResult as MotionResult
+from .labelling_motion import label_motion as label_motion
 from .options import Complete as Complete
 from .options import Dynamic as Dynamic
 from .options import FromCapture as FromCapture

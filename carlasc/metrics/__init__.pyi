@@ -1,3 +1,4 @@
+from .actor_scores import ActorScore as ActorScore
 from .casting import cast_rays as cast_rays
 from .casting import rayiou_directions as rayiou_directions
 from .confusion import Completeness as Completeness
@@ -9,7 +10,6 @@ from .conventions import Convention as Convention
 from .conventions import ConventionScore as ConventionScore
 from .conventions import convention_named as convention_named
 from .conventions import own_convention as own_convention
-from .evaluation import Scoring as Scoring
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluate_by_all_conventions as evaluate_by_all_conventions
 from .grids import VoxelOutcome as VoxelOutcome
@@ -39,11 +39,14 @@ from .results import bootstrap as bootstrap
 from .results import compare as compare
 from .results import geometric_table as geometric_table
 from .results import semantic_table as semantic_table
+from .scoring import Scoring as Scoring
 from .temporal import Consistency as Consistency
 from .temporal import Forecasting as Forecasting
 from .temporal import ForecastScore as ForecastScore
 from .temporal import moved_grid as moved_grid
 from .temporal import shape_consistency as shape_consistency
+from .tracking import TrackingQuality as TrackingQuality
+from .tracking import TrackingScore as TrackingScore
 from .uncertainty import Reliability as Reliability
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import UncertaintyScore as UncertaintyScore

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, table_named
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.metrics.actor_scores import ActorScores
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
 from carlasc.metrics.grids import SequenceGrid
@@ -24,42 +23,14 @@ from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.rays import RayIoU, ray_origins
 from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_bands, motion, visibility
 from carlasc.metrics.results import Evaluation, FrameScore
+from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 
-Region = Callable[[GridSpec], NDArray[np.bool_]]
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair, which a worker scores together
 LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]  # of a prediction and of the truth
-BREAKDOWNS = ("distance", "height", "visibility", "motion")
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
-
-
-@dataclass(frozen=True)
-class Scoring:
-    """What is scored of each frame.
-
-    Attributes:
-        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
-        region: function from a GridSpec to a (X, Y, Z) bool mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in
-            the mask count. With several processes it must be a function that can be pickled.
-        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
-        rays: also compute RayIoU; this needs poses and a Cartesian grid.
-
-    Raises:
-        ArgumentError: an unknown value.
-    """
-
-    voxels: Voxels = "known"
-    region: Region | None = None
-    by: Collection[str] = ()
-    rays: bool = False
-
-    def __post_init__(self) -> None:
-        if self.voxels not in ("known", "all"):
-            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
-        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
-            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
 
 
 class Scorer:
@@ -78,6 +49,7 @@ class Scorer:
         self.frames: list[FrameScore] = []
         self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
         self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if scoring.rays else None
+        self.actors = ActorScores(self.convention) if scoring.actors else None
         try:
             for pair in pairs:
                 self.tables[pair.truth.path] = self._check(pair, given)
@@ -94,6 +66,7 @@ class Scorer:
         other.rays = copy(self.rays)
         if other.rays is not None:
             other.rays.reset()
+        other.actors = ActorScores(self.convention) if self.scoring.actors else None
         return other
 
     def merge(self, other: Scorer) -> None:
@@ -105,6 +78,8 @@ class Scorer:
         self.breakdown.merge(other.breakdown)
         if self.rays is not None and other.rays is not None:
             self.rays.merge(other.rays)
+        if self.actors is not None and other.actors is not None:
+            self.actors.merge(other.actors)
 
     def add(self, pair: Pair, frame: int, content: LabelPair | CarlascError) -> None:
         """Score a frame, or record the reason why it cannot be scored."""
@@ -131,6 +106,7 @@ class Scorer:
         return Evaluation(
             name, self.convention, summed, self.matrices, len(self.frames), self.scoring.voxels, self.failures, tuple(self.frames), notes,
             self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
+            None if self.actors is None else self.actors.compute(),
         )  # fmt: skip
 
     def _matrix(self) -> ConfusionMatrix:
@@ -156,6 +132,8 @@ class Scorer:
                 expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
                 found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
             )
+        if self.scoring.actors:
+            ActorScores.check(pair)
         for argument, asked in (("region", self.scoring.region), ("by", self.scoring.by), ("rays", self.scoring.rays)):
             if asked and pair.spec is None:
                 raise ArgumentError(
@@ -182,10 +160,12 @@ class Scorer:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
             matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
-            if (self.scoring.by or self.rays is not None) and spec is not None:
+            if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
                 pred, true, counted = self.convention.prepare(
                     (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
                 )
+                if self.actors is not None:
+                    self.actors.update(pair, frame, (pred, true, counted))
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):
                     self.breakdown.update(pred, true, masks, counted)
                 if self.rays is not None and isinstance(pair.truth, SequenceGrid):
@@ -254,7 +234,7 @@ def evaluate(
     grid: str | None = None,
     truth_grid: str | None = None,
     source_classes: str | None = None,
-    scoring: Scoring = Scoring(),
+    scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
     frames: Frames = None,
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)

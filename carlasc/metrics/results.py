@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.metrics.actor_scores import ActorScore
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import Convention, ConventionScore
 from carlasc.metrics.rays import RayScore
@@ -103,6 +104,7 @@ class Evaluation:
         notes: remarks for readers of the scores.
         breakdown: the confusion matrix of each requested region, by name.
         rays: RayIoU, if it was requested.
+        actors: who is in each voxel and how fast, if it was requested.
     """
 
     name: str
@@ -116,6 +118,7 @@ class Evaluation:
     notes: tuple[str, ...] = ()
     breakdown: Mapping[str, ConfusionMatrix] = field(default_factory=dict)
     rays: RayScore | None = None
+    actors: ActorScore | None = None
 
     @property
     def classes(self) -> ClassTable:
@@ -162,7 +165,7 @@ class Evaluation:
 
     def tables(self) -> tuple[FigureTable, ...]:
         """Return the paper's two tables, IoU of each class and completeness, and one of the regions if there are any."""
-        tables = semantic_table([self]), geometric_table([self])
+        tables = semantic_table([self]), geometric_table([self]), *self._actor_tables()
         if not self.breakdown:
             return tables
         rows: list[tuple[Cell, ...]] = []
@@ -171,6 +174,17 @@ class Evaluation:
             rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
         header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
         return (*tables, FigureTable("By region", header, tuple(rows)))
+
+    def _actor_tables(self) -> tuple[FigureTable, ...]:
+        """Return the table of panoptic quality and LSTQ, if actors were scored."""
+        if self.actors is None:
+            return ()
+        score, names = self.actors.panoptic, self.classes.names
+        found = [label for label in sorted(names) if not math.isnan(score.pq[label])]
+        lstq = (self.actors.tracking.lstq, self.actors.tracking.association)
+        row = _percent(*score.pq[found].tolist(), score.mean(), score.mean(which="things"), *lstq)
+        header = ("Network", *(names[label] for label in found), "PQ", "PQ of things", "LSTQ", "S_assoc")
+        return (FigureTable("Actors: panoptic quality of each class, and over time", header, ((self.name, *row),)),)
 
     def to_csv(self) -> str:
         """Return the scores of each frame as CSV."""
@@ -205,6 +219,7 @@ class Evaluation:
             "miou_interval": None if interval is None else [interval.low, interval.high],
             "class_iou": {name: _number(value) for name, value in self.class_iou.items()},
             "rayiou": None if self.rays is None else _number(self.rays.rayiou),
+            "actors": None if self.actors is None else self.actors.to_dict(self.classes),
             "breakdown": {
                 name: {"miou": _number(part.miou), "iou": _number(part.iou), "false_free": _number(part.false_free)}
                 for name, part in ((name, self.convention.score(matrix)) for name, matrix in self.breakdown.items())

@@ -10,6 +10,7 @@ from carlasc.core.geometry import invert, multiply
 from carlasc.motion.tracks import FIRST_MOVER, Track
 
 _FEWEST_COMMON = 3  # frames in which two tracks must have poses to be compared
+_AROUND_M = 0.3  # what is so near to a body may be a part of it
 _INSIDE = 0.7  # part of them in which one is in the other's body, if both are of one actor
 
 
@@ -17,7 +18,7 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
     """Return the number of the actor of each track, by the number of the track.
 
     It is that of the data where these have numbers. Other tracks are numbered above all of them, in the order in which they begin. Tracks are of
-    one actor if they have one class, no two numbers, and the smaller one's middle is in the larger one's body most of the time; people only
+    one actor if they have one class, no two numbers, and the middle of what was seen of the smaller one is in the larger one's body most of the time; people only
     where not both were seen in one scan.
 
     Args:
@@ -74,6 +75,7 @@ def _are_one(one: Track, other: Track) -> bool:
         return False
     poses = (track.world_T_actor[begin - track.first : end - track.first] for track in (large, small))
     large_T_world, world_T_small = invert(next(poses)), next(poses)
-    middle = multiply(large_T_world, world_T_small)[:, :3, 3]
-    inside = ((middle > large.lower) & (middle < large.upper)).all(axis=1)
+    seen = (small.extent.lower + small.extent.upper) / 2  # of what was completed, nobody knows where it is
+    middle = multiply(large_T_world, world_T_small, np.append(seen, 1.0)[:, None])[:, :3, 0]
+    inside = ((middle > large.lower - _AROUND_M) & (middle < large.upper + _AROUND_M)).all(axis=1)
     return bool(inside.mean() >= _INSIDE)

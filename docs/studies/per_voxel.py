@@ -105,7 +105,14 @@ class Scores:
         ids = sorted(THINGS)
         pq, whole = (score.compute().pq[ids] for score in (self.both, self.truth))
         errors = np.concatenate(self.errors)
-        cells = [np.nanmean(pq), *pq, np.nanmean(whole), np.mean(self.one), errors.mean(), len(errors) / self.moving]
+        cells = [
+            np.nanmean(pq),
+            *pq,
+            np.nanmean(whole),
+            np.mean(self.one),
+            errors.mean(),
+            len(errors) / self.moving,
+        ]
         return f"| {name} | {' | '.join(f'{cell:.2f}' for cell in cells)} |"
 
 

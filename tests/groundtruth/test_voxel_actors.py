@@ -15,7 +15,7 @@ from carlasc.cli import app
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, translation
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.from_scans.actor_voxels import _velocity
+from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
@@ -121,7 +121,7 @@ def test_a_turning_body_has_another_velocity_at_each_end(tmp_path):
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angles)
     poses[:, 1, 0], poses[:, 0, 1] = np.sin(angles), -np.sin(angles)
     middle = poses[NOW, :3, 3]
-    found = _velocity(replace(one, world_T_actor=poses), NOW, middle + [[2.0, 0, 0], [0, 0, 0], [0, -2.0, 1]], feed)
+    found = velocity_at(replace(one, world_T_actor=poses), NOW, middle + [[2.0, 0, 0], [0, 0, 0], [0, -2.0, 1]], feed)
     assert np.allclose(found, [[10, 0.6, 0], [10, 0, 0], [10.6, 0, 0]], atol=1e-6)
 
 

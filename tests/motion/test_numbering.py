@@ -11,7 +11,6 @@ from carlasc.motion.numbering import number_actors
 from carlasc.motion.tracks import FIRST_MOVER
 
 CAR, PERSON = 10, 4
-EXTENT = Extent(np.array([-2.0, -1, 0]), np.array([2.0, 1, 1.5]), (True, True, True, True), 100)
 
 
 def track(first, frames, *, x=0.0, instance=0, label=CAR, rigid=True, half=(2.0, 1.0, 0.75), seen=None):
@@ -19,8 +18,9 @@ def track(first, frames, *, x=0.0, instance=0, label=CAR, rigid=True, half=(2.0,
     poses = np.stack([translation((x + frame, 0.0, 0.0)) for frame in range(first, first + frames)])
     members = {frame: np.arange(5) for frame in (range(first, first + frames) if seen is None else seen)}
     upper = np.array(half)
+    extent = Extent(-upper, upper, (True,) * 4, 100)
     velocity = np.tile([10.0, 0, 0], (frames, 1))
-    return Track(label, instance, members, first, poses, velocity, -upper, upper, EXTENT, rigid)
+    return Track(label, instance, members, first, poses, velocity, -upper, upper, extent, rigid)
 
 
 def test_numbers_of_the_data_are_kept_and_others_are_new_and_above_them():
@@ -39,7 +39,8 @@ def test_numbers_of_the_data_are_kept_and_others_are_new_and_above_them():
     ("second", "is_same"),
     [
         (track(6, 10, x=1.5), True),
-        (track(6, 10, x=2.5), False),  # beside the body
+        (track(6, 10, x=2.2), True),  # at the body
+        (track(6, 10, x=2.4), False),  # beside it
         (track(7, 10, x=1.5), True),  # three common frames
         (track(8, 10, x=1.5), False),  # two
         (track(6, 10, x=1.5, label=PERSON), False),

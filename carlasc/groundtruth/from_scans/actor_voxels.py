@@ -65,7 +65,7 @@ def find_voxels(
         own = (regions.of_voxel[bodies] == region) & (movable[bodies] | (labels[bodies] == track.label))
         instance[bodies[own]] = actors.numbers[number]
         voxels.append(bodies[own])
-        velocities.append(rotate_vectors(now.grid_T_world, _velocity(track, now.frame, centers[own], feed)))
+        velocities.append(rotate_vectors(now.grid_T_world, velocity_at(track, now.frame, centers[own], feed)))
     free = movable & (instance == 0)
     _number_points(spec, feed, actors, now, window, free, instance)
     _number_boxes(spec, feed, actors, now, free & (instance == 0), instance)
@@ -78,7 +78,7 @@ def _centers(spec: GridSpec, voxels: NDArray[np.int64]) -> NDArray[np.float64]:
     return spec.from_axes(np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)).astype(np.float64)
 
 
-def _velocity(track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed) -> NDArray[np.float64]:
+def velocity_at(track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed) -> NDArray[np.float64]:
     """Return (N, 3) m/s, world, of places of an actor, (N, 3) metres, world: it moves, and turns about the vertical."""
     row, known = frame - track.first, feed.frames
     near = np.clip([frame - _TURN_FRAMES, frame + _TURN_FRAMES], known[0], known[-1]) - track.first

@@ -1,0 +1,238 @@
+"""What moves, and which actor each point belongs to, written back to the scans: a copy of a data set with instances and flow."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.frames import FrameRange
+from carlasc.core.geometry import invert, rotate_vectors, transform_points
+from carlasc.core.grids import GridSpec
+from carlasc.errors import ArgumentError
+from carlasc.groundtruth.from_scans.actor_voxels import velocity_at, with_numbers
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.from_scans.sequences import ScanSequence
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.options import FromScans, Voting
+from carlasc.motion.ground import ground_points
+from carlasc.motion.tracks import MovingActors, Track
+from carlasc.running.processes import one_pool
+from carlasc.running.spreading import Run
+from carlasc.storage import as_source, layout
+from carlasc.storage.copying import counter
+from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
+from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.sinks import SequenceWriter
+
+_WRITTEN = ("flow", "instances")
+_FOUND = "found by carlasc from "  # what carlasc.json says of motion, before what showed it
+
+
+@dataclass
+class MotionResult(CopyResult):
+    """What `label_motion` did: what writing a copy did, and this.
+
+    Attributes:
+        actors: number of actors that move.
+        notes: what was found in each sequence, in lines.
+    """
+
+    actors: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def label_motion(
+    source: str | os.PathLike[str] | Source,
+    out: str | os.PathLike[str],
+    *,
+    observe: FromScans = FromScans(),  # noqa: B008 (frozen)
+    overwrite: bool = False,
+    run: Run = Run(),  # noqa: B008 (frozen)
+) -> MotionResult:
+    """Write a copy of a data set whose scans say which actor each point belongs to, and how fast it moves. The source is not changed.
+
+    The fields `instances` and `flow` are made from the bodies of what moves, which `observe` says how to find: with its defaults from the best
+    field that exists, and from free space. An actor has one number in the whole sequence, that of the data where it has one. Points of what stands keep
+    the numbers of the data. Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one
+    file system: no file of either may be edited in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
+
+    Args:
+        source: what has the points: anything that `carlasc.open` takes, or a source.
+        out: the folder to write: a path, or a URL of an object store.
+        observe: what tells which points move, and where poses come from. `dynamic` is "align".
+        overwrite: replace a data set at `out` that this function has made.
+        run: how the work is spread. Steps of progress are scans, then files.
+
+    Returns:
+        What was written, and what was found.
+
+    Raises:
+        ArgumentError: `observe` does not look for actors.
+        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
+        MissingDataError: there are no scans, or not the field that `observe` asks for.
+        FormatError: poses or times are not valid.
+        StorageError: the files cannot be written.
+    """
+    began = time.perf_counter()
+    if observe.dynamic != "align" or observe.motion.source == "none":
+        found = f'dynamic="{observe.dynamic}", motion "{observe.motion.source}"'
+        raise ArgumentError("observe", expected='dynamic="align", and something that shows motion', found=found)
+    source = as_source(source)
+    given = sequences_with_scans(source)
+    plan = GridPlan(GridSpec.published(), layout.EVALUATION, observe, Voting(keep_actors=True), FrameRange())
+    inputs = {path: ScanSequence(one, plan, observe) for path, one in given.items()}
+    for one in inputs.values():
+        _ = one.feed.motion  # raises what is wrong before anything is written
+    copy = DerivedCopy.begin(
+        source,
+        out,
+        {"observe": repr(observe)},
+        kind="motion found by carlasc",
+        is_kind=lambda metadata: str(metadata.extra.get("motion")).startswith(_FOUND),
+        overwrite=overwrite,
+        run=run,
+    )
+    progress = run.progress or (lambda done, total: None)
+    scans = sum(one.steps_before for one in inputs.values())
+    files = sum(
+        len(one.frames("points" if name in _WRITTEN else name))
+        for one in given.values()
+        for name in {name for name in one.fields() if "/" not in name} | set(_WRITTEN)
+    )
+    step, moving, notes = counter(progress, scans + files), dict[str, _MovingSequence](), list[str]()
+    with one_pool(run) as pool:
+        for path, one in inputs.items():
+            _find(one, copy.writer(path), pool, step)
+            moving[path] = _MovingSequence(given[path], one.feed, one.actors)
+            notes += [note for note in one.notes() if "grids" not in note]
+        after = replace(pool, progress=lambda done, total: progress(scans + done, scans + total))
+        copied = copy.write(moving, after)
+    return MotionResult(
+        **vars(copied) | {"elapsed_s": time.perf_counter() - began},
+        actors=sum(len(set(one.actors.numbers.values())) for one in moving.values()),
+        notes=notes,
+    )
+
+
+def _find(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
+    """Find the actors of a sequence, or read what an interrupted run kept with `writer`."""
+    if writer is not None:
+        inputs.prepare(writer, run, step)
+        return
+    inputs.refine(None, run, step)
+    inputs.actors = with_numbers(find_actors(inputs.feed, run, step), inputs.feed)
+
+
+class _MovingSequence(DerivedSequence):
+    """A sequence with the instances and the flow of what was found to move."""
+
+    def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
+        extra = {**whole.metadata.extra, "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
+        super().__init__(whole, {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}, changed=_WRITTEN)
+        self._feed, self.actors = feed, actors
+        self._made: dict[int, NDArray[np.float32]] = {}  # flow of the frames whose instances have been read
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields that do not change, and those that were found."""
+        return self.kept | set(_WRITTEN)
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field."""
+        return self.whole.frames("points") if field in _WRITTEN else super().frames(field)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame."""
+        if field not in _WRITTEN:
+            return self.whole.read(field, frame)
+        if field == "flow" and frame in self._made:
+            return self._made.pop(frame)
+        instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
+        self._made = {frame: flow} if field == "instances" else {}
+        return instances if field == "instances" else flow
+
+
+def points_of_actors(
+    feed: ScanFeed, actors: MovingActors, frame: int
+) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+    """Return the actor of each point of a scan, and how fast it moves.
+
+    Args:
+        feed: the scans.
+        actors: what moves, with numbers.
+        frame: number of the scan.
+
+    Returns:
+        (N,) uint32 numbers, 0 for none, and (N, 3) float32 m/s, sensor frame, ego motion removed.
+    """
+    fields = {"labels", "instances"} & feed.sequence.fields()
+    scan, pose = feed.sequence.scan(frame, tuple(sorted(fields))), feed.pose(frame)
+    moving = {track.instance for track in actors.tracks.values()}
+    numbers = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances.astype(np.uint32)
+    numbers[np.isin(numbers, list(moving))] = 0  # these have tracks, which know better
+    _number_boxes(feed, frame, scan.points, numbers, moving)
+    flow, world = np.zeros((len(scan), 3)), transform_points(pose, scan.points)
+    classes = feed.classes
+    if scan.labels is not None and feed.names_ground and classes.ground:
+        ground = np.isin(scan.labels, sorted(classes.ground))
+    else:
+        ground = ground_points(scan.points)
+    rows = _Rows(scan.points)
+    tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
+    for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):
+        own = _inside(track, frame, world) & ~ground
+        if track.members.get(frame) is not None:
+            own[rows.of(feed.read(frame).points[track.members[frame]])] = True
+        velocity = rotate_vectors(invert(pose), velocity_at(track, frame, world[own], feed))
+        is_fast = np.square(velocity).sum(axis=1) > feed.options.motion.min_speed_m_s**2
+        numbers[own], flow[own] = actors.numbers[number], np.where(is_fast[:, None], velocity, 0)
+    return numbers, flow.astype(np.float32)
+
+
+class _Rows:
+    """Finds points of a scan again, by their coordinates: what merges scans has left out some points, and sorted others."""
+
+    def __init__(self, points: NDArray[np.float32]) -> None:
+        keys = _keys(points)
+        self._order = np.argsort(keys, kind="stable")
+        self._sorted = keys[self._order]
+
+    def of(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the indices of all points of the scan that are at some places of its points."""
+        keys = np.unique(_keys(points))
+        first, last = (np.searchsorted(self._sorted, keys, side) for side in ("left", "right"))
+        found = [self._order[begin:end] for begin, end in zip(first.tolist(), last.tolist(), strict=True)]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
+
+def _keys(points: NDArray[np.float32]) -> NDArray[Any]:
+    rows = np.ascontiguousarray(points[:, :3], "<f4")
+    return rows.view([("", rows.dtype)] * 3).reshape(-1)
+
+
+def _inside(track: Track, frame: int, world: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return (N,) which places, metres, world, are in the body of a track."""
+    pose = track.world_T_actor[frame - track.first]
+    near = (np.abs(world - pose[:3, 3]) <= np.linalg.norm(np.maximum(-track.lower, track.upper))).all(axis=1)
+    local = transform_points(invert(pose), world[near])
+    near[near] = ((local >= track.lower) & (local <= track.upper)).all(axis=1)
+    return near
+
+
+def _number_boxes(
+    feed: ScanFeed, frame: int, points: NDArray[np.float32], numbers: NDArray[np.uint32], moving: set[int]
+) -> None:
+    """Give points without a number that of the box that they are in, of those that do not move; the ground has none."""
+    boxes = feed.sequence.boxes(frame) if "boxes" in feed.sequence.fields() else None
+    for row in range(0 if boxes is None else len(boxes)):
+        if boxes is not None and int(boxes.tracks[row]) not in moving:
+            local = transform_points(invert(boxes.sensor_T_box[row]), points)
+            half = boxes.sizes[row] / 2
+            inside = (np.abs(local) <= half).all(axis=1) & (local[:, 2] > 0.2 - half[2]) & (numbers == 0)
+            numbers[inside] = boxes.tracks[row]

@@ -1,0 +1,151 @@
+"""Scores of who is in each voxel, and how fast: panoptic quality, numbers over time, velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.errors import ArgumentError, FormatError
+from carlasc.metrics.confusion import ratio
+from carlasc.metrics.conventions import Convention
+from carlasc.metrics.grids import SequenceGrid
+from carlasc.metrics.pairs import Pair
+from carlasc.metrics.panoptic import PanopticQuality, PanopticScore
+from carlasc.metrics.tracking import TrackingQuality, TrackingScore
+
+SPEEDS_M_S = (0.0, 2.0, 5.0, 10.0)
+"""Lower ends of the bands of speed that velocities are scored in."""
+Prepared = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class ActorScore:
+    """How well a prediction knows who is in each voxel, and how fast.
+
+    Attributes:
+        panoptic: panoptic quality of each class.
+        tracking: quality of segmentation and tracking (LSTQ) over the frames of each sequence.
+        velocity_m_s: mean length of the difference of velocities over the voxels that move in the truth; NaN if none does.
+        velocity_by_class: the same by name of the class.
+        velocity_by_speed: the same by the lower end of the band of the true speed, m/s.
+    """
+
+    panoptic: PanopticScore
+    tracking: TrackingScore
+    velocity_m_s: float
+    velocity_by_class: Mapping[str, float]
+    velocity_by_speed: Mapping[float, float]
+
+    def to_dict(self, classes: ClassTable) -> dict[str, Any]:
+        """Return every figure by name, as fractions and m/s, for JSON; None for a figure that is not defined."""
+        pq = {name: self.panoptic.pq[label] for label, name in classes.names.items() if label < len(self.panoptic.pq)}
+        means = {what: self.panoptic.mean(what) for what in ("pq", "sq", "rq")}
+        figures = means | {"pq_things": self.panoptic.mean(which="things")} | vars(self.tracking)
+        figures |= {"velocity_m_s": self.velocity_m_s}
+        by_speed = {f"from {low:g} m/s": value for low, value in self.velocity_by_speed.items()}
+        groups = {"class_pq": pq, "velocity_by_class": self.velocity_by_class, "velocity_by_speed": by_speed}
+        return {name: _number(value) for name, value in figures.items()} | {
+            name: {key: _number(value) for key, value in group.items()} for name, group in groups.items()
+        }
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+class ActorScores:
+    """Adds up the frames of all sequences, in the classes of a convention."""
+
+    def __init__(self, convention: Convention) -> None:
+        self.convention = convention
+        things = movable_of(convention, convention.usual_truth)
+        k, free = convention.num_classes, convention.free
+        self.panoptic = PanopticQuality(k, things, free=free)
+        self.tracking = TrackingQuality(k, things, unaveraged={free})
+        self.errors = np.zeros((2, k, len(SPEEDS_M_S)))  # sum and number of voxels by class and band of speed
+
+    @staticmethod
+    def check(pair: Pair) -> None:
+        """Check that both sides say who is in their voxels.
+
+        Raises:
+            ArgumentError: one does not.
+        """
+        for side in (pair.truth, pair.prediction):
+            if not isinstance(side, SequenceGrid) or f"{side.grid}/instance" not in side.sequence.fields():
+                raise ArgumentError(
+                    "actors", expected="grids with instances on both sides", found=f"{side.location} without",
+                    advice="make the ground truth with `regrid --keep-actors`",
+                )  # fmt: skip
+
+    def update(self, pair: Pair, frame: int, prepared: Prepared) -> None:
+        """Add a frame.
+
+        Args:
+            pair: both sides.
+            frame: its number.
+            prepared: predicted and true classes of the convention, (X, Y, Z), and the voxels that count.
+
+        Raises:
+            FormatError: a file does not fit its grid.
+        """
+        prediction, truth, counted = prepared
+        known, moving = dict[str, NDArray[Any]](), dict[str, NDArray[np.floating]]()
+        for name, side in (("prediction", pair.prediction), ("truth", pair.truth)):
+            if isinstance(side, SequenceGrid):
+                known[name] = side.sequence.read(f"{side.grid}/instance", frame)
+                moving[name] = _dense(side, frame, truth.size)
+        numberless = np.isin(truth, sorted(self.panoptic.things)) & (known["truth"] == 0)
+        counted = counted & ~numberless  # nobody knows whose they are
+        sides = (prediction, known["prediction"]), (truth, known["truth"])
+        self.panoptic.update(*sides, mask=counted)
+        self.tracking.update(pair.truth.path, *sides, mask=counted)
+        moves = counted.reshape(-1) & (moving["truth"] != 0).any(axis=1)
+        speed = np.linalg.norm(moving["truth"][moves], axis=1)
+        error = np.linalg.norm(moving["prediction"][moves] - moving["truth"][moves], axis=1)
+        place = truth.reshape(-1)[moves].astype(np.int64), np.searchsorted(SPEEDS_M_S, speed, side="right") - 1
+        np.add.at(self.errors[0], place, error)
+        np.add.at(self.errors[1], place, 1)
+
+    def merge(self, other: ActorScores) -> None:
+        """Add what another one by the same convention has added up."""
+        self.panoptic.merge(other.panoptic)
+        self.tracking.merge(other.tracking)
+        self.errors += other.errors
+
+    def compute(self) -> ActorScore:
+        """Return the scores of everything that was added."""
+        total, count = self.errors
+        by_class, by_speed = ratio(total.sum(axis=1), count.sum(axis=1)), ratio(total.sum(axis=0), count.sum(axis=0))
+        names = self.convention.classes.names
+        return ActorScore(
+            self.panoptic.compute(),
+            self.tracking.compute(),
+            float(ratio(total.sum(), count.sum())),
+            {names[label]: float(by_class[label]) for label in sorted(self.panoptic.things)},
+            dict(zip(SPEEDS_M_S, by_speed.tolist(), strict=True)),
+        )
+
+
+def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
+    """Return the classes of a convention that the movable classes of a table become."""
+    mapping = convention.maps[table.name]
+    found = {mapping[label] for label in table.movable if label in mapping}
+    return frozenset(label for label in found if label in convention.averaged and label != convention.free)
+
+
+def _dense(side: SequenceGrid, frame: int, count: int) -> NDArray[np.float32]:
+    """Return (V, 3) the velocity of each voxel; zero where nothing moves, or nobody says it."""
+    dense, name = np.zeros((count, 3), np.float32), f"{side.grid}/velocity"
+    if name in side.sequence.fields() and frame in side.sequence.frames(name):
+        table = side.sequence.read(name, frame)
+        if not np.isfinite(table["velocity"]).all() or not ((table["voxel"] >= 0) & (table["voxel"] < count)).all():
+            where = f"{side.sequence.location}: {name} of frame {frame}"
+            raise FormatError(where, expected=f"finite velocities of voxels 0 to {count - 1}", found="others")
+        dense[table["voxel"]] = table["velocity"]
+    return dense

@@ -1,0 +1,45 @@
+"""What is scored of each frame, beside the classes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
+from carlasc.core.grids import GridSpec
+from carlasc.errors import ArgumentError
+
+Region = Callable[[GridSpec], NDArray[np.bool_]]
+BREAKDOWNS = ("distance", "height", "visibility", "motion")
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """What is scored of each frame.
+
+    Attributes:
+        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
+        region: function from a GridSpec to a (X, Y, Z) bool mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in
+            the mask count. With several processes it must be a function that can be pickled.
+        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
+        rays: also compute RayIoU; this needs poses and a Cartesian grid.
+        actors: also score who is in each voxel and how fast: both sides need the field `instance`, and for velocities `velocity`.
+
+    Raises:
+        ArgumentError: an unknown value.
+    """
+
+    voxels: Voxels = "known"
+    region: Region | None = None
+    by: Collection[str] = ()
+    rays: bool = False
+    actors: bool = False
+
+    def __post_init__(self) -> None:
+        if self.voxels not in ("known", "all"):
+            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
+        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
+            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))

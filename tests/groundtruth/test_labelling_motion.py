@@ -1,0 +1,146 @@
+"""What moves, written back to the points of the scans."""
+
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.scenes.passing_car import SPEED_M_S, scan, sensor_pose, write_sequence
+from typer.testing import CliRunner
+
+import carlasc
+from carlasc import FromScans, Run
+from carlasc.cli import app
+from carlasc.core.geometry import invert, transform_points
+from carlasc.errors import ArgumentError, ConflictError
+from carlasc.motion import MotionOptions
+from carlasc.storage import FolderSource
+
+ONE = Run(workers=1)
+REAL = Path(__file__).parents[3] / "shared/real"
+
+
+def the_sequence(folder):
+    (sequence,) = FolderSource(folder).sequences().values()
+    return sequence
+
+
+def check_car(sequence, frames, number, tolerance):
+    """Check that the points of the passing car, and no others, move and have a number."""
+    counts = np.zeros(3, int)
+    for frame in frames:
+        _, _, moving = scan(frame, sensor_pose(frame))
+        flow, instances = sequence.read("flow", frame), sequence.read("instances", frame)
+        fast = np.linalg.norm(flow, axis=1) > 0.5
+        assert set(np.unique(instances[fast]).tolist()) <= {number} and fast.sum() == (instances == number).sum()
+        assert np.abs(flow[fast] - [SPEED_M_S, 0, 0]).max(initial=0) < tolerance
+        counts += ((fast & moving).sum(), moving.sum(), fast.sum())
+    assert counts[0] > 0.97 * counts[1] and counts[0] > 0.97 * counts[2]
+
+
+@pytest.fixture(scope="module")
+def numbered(tmp_path_factory):
+    """A drive with numbers of actors, and what `label_motion` makes of it."""
+    folder = tmp_path_factory.mktemp("drive")
+    write_sequence(folder / "in", ("labels", "instances"), frames=16)
+    observe = FromScans(motion=MotionOptions("instances"))
+    return folder, carlasc.label_motion(folder / "in", folder / "out", observe=observe, run=ONE)
+
+
+def test_points_get_numbers_and_velocities_and_what_stands_keeps_its_number(numbered):
+    folder, result = numbered
+    sequence, before = the_sequence(folder / "out"), the_sequence(folder / "in")
+    check_car(sequence, range(2, 16, 4), 9, 1.0)
+    for frame in (0, 8):
+        kept = before.read("instances", frame) == 4
+        assert kept.any() and (sequence.read("instances", frame)[kept] == 4).all()
+        assert sequence.read("points", frame).tobytes() == before.read("points", frame).tobytes()
+    assert sequence.metadata.extra["motion"] == "found by carlasc from instances"
+    assert result.actors == 1 and result.linked == 32 and result.files == 32
+
+
+def test_the_exporter_of_kitti_makes_the_classes_that_move_of_it(numbered):
+    folder, _ = numbered
+    carlasc.export("kitti", folder / "out", folder / "kitti", options={"labels": "moving"}, run=ONE)
+    _, _, moving = scan(8, sensor_pose(8))
+    (file,) = (folder / "kitti").rglob("labels/000008.label")
+    labels = np.fromfile(file, "<u4")
+    assert ((labels & 0xFFFF) == 251).sum() == pytest.approx(moving.sum(), rel=0.03)
+    assert set(np.unique(labels >> 16).tolist()) == {0, 4, 9}
+
+
+def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):
+    folder, _ = numbered
+    with pytest.raises(ConflictError, match="expected nothing there"):
+        carlasc.label_motion(folder / "in", folder / "out", run=ONE)
+    with pytest.raises(ConflictError, match="a data set with motion found by carlasc to overwrite"):
+        carlasc.label_motion(folder / "out", folder / "in", overwrite=True, run=ONE)
+
+
+@pytest.mark.parametrize("options", [{"dynamic": "drop"}, {"motion": MotionOptions("none")}], ids=["drop", "none"])
+def test_something_must_show_what_moves(numbered, options):
+    folder, _ = numbered
+    with pytest.raises(ArgumentError, match="observe: expected dynamic"):
+        carlasc.label_motion(folder / "in", folder / "other", observe=FromScans(**options))
+    assert not (folder / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--from", "motion", "--logits"], "no --logits with --from motion"),
+        (["--from", "motion", "--classes", "carla"], "no --classes with --from motion"),
+        (["--from", "predictions", "--motion", "flow"], "--motion: expected --from motion"),
+        (["--from", "motion", "--motion", "flow"], "expected flow in the sequence"),
+    ],
+)
+def test_the_command_says_what_does_not_fit(numbered, given, message):
+    folder, _ = numbered
+    result = CliRunner().invoke(app, ["label", str(folder / "in"), "-o", str(folder / "other"), *given])
+    assert result.exit_code in (1, 2) and message in " ".join(result.output.split())
+    assert not (folder / "other").exists()
+
+
+@pytest.mark.slow
+def test_the_command_finds_what_moves_from_points_alone(tmp_path):
+    write_sequence(tmp_path / "in", ())
+    given = ["label", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--from", "motion", "--workers", "2", "--json"]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["actors"] == 1
+    check_car(the_sequence(tmp_path / "out"), range(4, 37, 8), 1, 1.0)
+
+
+@pytest.mark.slow
+def test_a_real_drive_without_labels(tmp_path):
+    """KITTI tracking 0000: a van ahead and a cyclist beside move, a parked van does not, and each has one number."""
+    archive = REAL / "kitti_tracking_0000.tar.xz"
+    if not archive.exists():
+        pytest.skip("the archive of the real drive is absent")
+    pytest.importorskip("kiss_icp")
+    with tarfile.open(archive) as file:
+        file.extractall(tmp_path / "raw", filter="data")
+    (training,) = (tmp_path / "raw").rglob("training")
+    carlasc.convert("kitti-tracking", training.parent, tmp_path / "boxes", grids=None, run=ONE)
+    boxed = the_sequence(tmp_path / "boxes")
+    bare = tmp_path / "bare/cartesian"
+    bare.mkdir(parents=True)
+    for name in ("velodyne", "poses.txt", "times.txt", "carlasc.json"):
+        (Path(boxed.location) / name).rename(bare / name)
+    carlasc.label_motion(tmp_path / "bare", tmp_path / "out", run=ONE)
+    found = the_sequence(tmp_path / "out")
+    moving, all_points, numbers = dict.fromkeys((1, 2, 4), 0), dict.fromkeys((1, 2, 4), 0), {1: [], 2: []}
+    for frame in boxed.frames("boxes").tolist():
+        boxes, points = boxed.boxes(frame), found.read("points", frame)[:, :3]
+        fast = np.linalg.norm(found.read("flow", frame), axis=1) > 0.5
+        for row, track in enumerate(boxes.tracks.tolist()):
+            local, half = transform_points(invert(boxes.sensor_T_box[row]), points), boxes.sizes[row] / 2
+            own = (np.abs(local) < half).all(axis=1) & (local[:, 2] > 0.3 - half[2])
+            moving[track] += int((own & fast).sum())
+            all_points[track] += int(own.sum())
+            if track in numbers and (own & fast).any():
+                numbers[track].append(int(np.bincount(found.read("instances", frame)[own & fast]).argmax()))
+    assert moving[1] > 0.95 * all_points[1] and moving[2] > 0.95 * all_points[2]
+    assert moving[4] == 0 and all_points[4] > 10_000
+    assert len(set(numbers[1])) == len(set(numbers[2])) == 1
