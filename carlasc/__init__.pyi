@@ -31,6 +31,7 @@ from .groundtruth import FromCapture as FromCapture
 from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans
 from .groundtruth import Voting as Voting
+from .groundtruth import map as map
 from .groundtruth import refine as refine
 from .groundtruth import regrid as regrid
 from .inspection import CardDetails as CardDetails
