@@ -126,7 +126,7 @@ def _layout() -> str:
     grid = [layout.field_named(f"{layout.EVALUATION}/{part}") for part in layout.GRID_FIELDS]
     for field in (*layout.SCAN_FIELDS.values(), *grid):
         shape = "(X, Y, Z)" if field.per == "voxel" else "(N,)" if field.columns is None else f"(N, {field.columns})"
-        special = {"picture": "bytes", "votes": "npz", "boxes": "[table](#boxes)"}
+        special = {"picture": "bytes", "votes": "npz", "velocities": "npz", "boxes": "[table](#boxes)"}
         kind = special[field.kind] if field.kind in special else f"{np.dtype(field.dtype).name} {shape}"
         unit = f", {field.unit}" if field.unit in ("m", "m/s") else ""
         ours = "" if field.published else " *(ours)*"

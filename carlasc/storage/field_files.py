@@ -15,13 +15,26 @@ from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
+VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
 # Level 6, zlib's own, takes 6 times as long, and saves 3 %: voxels are in order, so what repeats is always four bytes back.
 _VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
 
-Per = Literal["point", "voxel", "vote", "box", "scan"]
+Per = Literal["point", "voxel", "vote", "mover", "box", "scan"]
 Kind = Literal[
-    "position", "vector", "class", "pairs", "id", "value", "count", "probability", "flags", "votes", "boxes", "picture"
+    "position",
+    "vector",
+    "class",
+    "pairs",
+    "id",
+    "value",
+    "count",
+    "probability",
+    "flags",
+    "votes",
+    "velocities",
+    "boxes",
+    "picture",
 ]
 
 
@@ -36,10 +49,10 @@ class Field:
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
         per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
-            "vote" (one row per vote), "box" (one row per box), or "scan" (the whole file belongs to the scan).
+            "vote" (one row per vote), "mover" (one row per voxel that moves), "box" (one row per box), or "scan" (the whole file belongs to the scan).
         kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (of a class
             and its probability), "id" (unsigned whole numbers, such as actors), "value" (any number), "count", "probability" (0 to 1),
-            "flags" (bits), "votes" and "boxes" (tables), "picture" (the bytes of a file).
+            "flags" (bits), "votes", "velocities" and "boxes" (tables), "picture" (the bytes of a file).
         dtype: NumPy type on disk, little-endian; "" for tables, whose columns have types of their own.
         names: name of each value of a row.
         unit: unit of the values.
@@ -80,6 +93,8 @@ class Field:
         """
         if self.kind == "votes":
             return _decode_votes(data, where, shape)
+        if self.kind == "velocities":
+            return _decode_velocities(data, where, shape)
         if self.kind == "boxes":
             return _decode_boxes(data, where)
         dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
@@ -114,6 +129,8 @@ class Field:
         self.check(array, where)
         if self.kind == "votes":
             return _encode_votes(array)
+        if self.kind == "velocities":
+            return npz_bytes({name: (np.ascontiguousarray(array[name]), 4) for name in self.names})
         if self.kind == "boxes":
             return array.tobytes()
         return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
@@ -127,6 +144,11 @@ class Field:
         if self.kind == "votes":
             if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
                 raise FormatError(where, expected="a table of voxel, label and votes", found=str(array.dtype))
+            return
+        if self.kind == "velocities":
+            if array.dtype != VELOCITY_DTYPE or array.ndim != 1:
+                found = f"{array.dtype}, shape {array.shape}"
+                raise FormatError(where, expected="a table of voxel and velocity", found=found)
             return
         if self.kind == "boxes":
             if array.dtype != BOXES_DTYPE or array.ndim != 1:
@@ -151,6 +173,14 @@ def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] |
         for name in ("voxel", "votes"):
             votes[name] = archive.read(name, ArrayFormat((VOTES_DTYPE[name].str,), labels.shape))
     return votes
+
+
+def _decode_velocities(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    with open_npz(data, where) as archive:
+        voxels = archive.read("voxel", ArrayFormat(("<i4",), (None,), None if shape is None else math.prod(shape)))
+        table = np.empty(len(voxels), VELOCITY_DTYPE)
+        table["voxel"], table["velocity"] = voxels, archive.read("velocity", ArrayFormat(("<f2",), (len(voxels), 3)))
+    return table
 
 
 def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:

@@ -198,7 +198,7 @@ class WholeFiles:
         """Whether the file of a field exists, and is neither empty nor of a length that it cannot have.
 
         Files of a grid have a length that params.json tells. Files with a row per point must have as many rows as the points, which have as many as
-        the labels. A table of votes must end as a zip does. An empty file is valid for boxes, of which there may be none, and for a scan whose points
+        the labels. A table of votes or velocities must end as a zip does. An empty file is valid for boxes, of which there may be none, and for a scan whose points
         and labels are both empty.
         """
         entry = layout.field_named(name)
@@ -210,7 +210,7 @@ class WholeFiles:
         if entry.per == "voxel":
             cells = self._cells_of(entry.folder)
             return size > 0 if cells is None else size == cells * np.dtype(entry.dtype).itemsize
-        if entry.kind == "votes":
+        if entry.kind in ("votes", "velocities"):
             return self._ends_as_zip(entry.file(frame), size)
         if entry.per == "point":
             other = layout.SCAN_FIELDS["labels" if name == "points" else "points"]

@@ -132,9 +132,21 @@ _GRID_FIELDS: dict[str, Field] = {
             dtype="<u2", names=("views",), unit="scans",
             meaning="number of scans that saw the voxel", published=False,
         ),
+        Field(
+            name="instance", folder="", suffix=".instance", per="voxel", kind="id",
+            dtype="<u4", names=("actor",), unit="actor",
+            meaning="actor that the voxel belongs to, 0 none, consistent over a sequence", published=False,
+        ),
+        Field(
+            name="velocity", folder="", suffix=".velocity.npz", per="mover", kind="velocities",
+            dtype="", names=("voxel", "velocity"), unit="m/s",
+            meaning="velocity of each voxel that moves: voxel (flat index), velocity; sensor frame, ego motion removed",
+            published=False,
+        ),
     )
 }  # fmt: skip
 GRID_FIELDS = tuple(_GRID_FIELDS)
+ACTOR_FIELDS = ("instance", "velocity")  # what `carlasc regrid --keep-actors` adds to a grid
 EVIDENCE_FIELDS = ("occupied", "classes", "flags", "views")  # what `carlasc regrid --keep-evidence` adds to a grid
 LINE_FIELDS = ("poses", "times")
 

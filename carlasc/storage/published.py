@@ -135,7 +135,7 @@ class PublishedSequence(Sequence):
         return self._listing[field]
 
     def _shape(self, entry: field_files.Field) -> tuple[int, int, int] | None:
-        return self.grids[entry.folder].size if entry.per in ("voxel", "vote") else None
+        return self.grids[entry.folder].size if entry.per in ("voxel", "vote", "mover") else None
 
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""

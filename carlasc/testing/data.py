@@ -78,6 +78,14 @@ def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = 
     }
 
 
+def actors(rng: np.random.Generator, size: tuple[int, int, int], count: int) -> dict[str, NDArray[Any]]:
+    """Return the fields of a random grid that say which actor a voxel belongs to, and how it moves, of `count` voxels that move."""
+    velocity = np.zeros(count, field_files.VELOCITY_DTYPE)
+    velocity["voxel"] = np.sort(rng.permutation(int(np.prod(size)))[:count])
+    velocity["velocity"] = rng.normal(scale=5, size=(count, 3))
+    return {"instance": rng.choice([0, 1, 2, 300, 70_000], size).astype(np.uint32), "velocity": velocity}
+
+
 def lines(count: int) -> tuple[bytes, bytes]:
     """Return the bytes of poses.txt and times.txt of a straight drive."""
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -138,6 +146,9 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
         if frame == FRAMES[0]:  # whole numbers, which stores often keep in another type, before others
             fields["occupied"] = np.round(fields["occupied"])
         for part, array in fields.items():
+            whole.write(f"evaluation_8x4x3/{part}", frame, array)
+    for frame, count in zip(FRAMES, (0, 1, 17, 33), strict=True):
+        for part, array in actors(rng, SECOND, count).items():
             whole.write(f"evaluation_8x4x3/{part}", frame, array)
     for frame, count in zip(FRAMES, (0, 1, 777, 1001), strict=True):
         whole.write("probabilities", frame, rng.integers(0, 65536, (count, 6)).astype(np.uint16))

@@ -1,3 +1,5 @@
+import io
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -76,6 +78,22 @@ def test_votes_come_back():
         assert (back == votes).all()
     with pytest.raises(FormatError, match=r"v.npz: expected an .npz"):
         field.decode(b"PK nonsense", "v.npz")
+
+
+def test_velocities_come_back_bit_for_bit():
+    field = layout.field_named("evaluation/velocity")
+    for count in (0, 3):
+        table = np.zeros(count, field_files.VELOCITY_DTYPE)
+        table["voxel"] = np.arange(count) * 7
+        table["velocity"] = np.random.default_rng(0).normal(size=(count, 3))
+        data = bytes(field.encode(table, "x"))
+        assert field.decode(data, "x", (2, 3, 4)).tobytes() == table.tobytes()
+        with np.load(io.BytesIO(data)) as file:
+            assert file.files == ["voxel", "velocity"] and file["velocity"].shape == (count, 3)
+    with pytest.raises(FormatError, match="v.npz: voxel: expected at most 2 values, found 3"):
+        field.decode(data, "v.npz", (1, 1, 2))
+    with pytest.raises(FormatError, match="v.npz: expected a table of voxel and velocity, found float32"):
+        field.encode(np.zeros((2, 4), np.float32), "v.npz")
 
 
 def test_boxes_come_back_bit_for_bit():

@@ -292,7 +292,9 @@ def digest_of(field: str, array: NDArray[Any]) -> bytes:
         FormatError: the array does not fit the field.
     """
     entry = layout.field_named(field)
-    data = np.ascontiguousarray(array).tobytes() if entry.kind == "votes" else entry.encode(array, field)
+    data = (
+        np.ascontiguousarray(array).tobytes() if entry.kind in ("votes", "velocities") else entry.encode(array, field)
+    )
     return digest_of_bytes(data)
 
 

@@ -26,7 +26,7 @@ SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlas
 _SLOTS = 16  # a frame has room for this many typical frames
 _PCODEC = "pcodec"  # value of the attribute `codec` of points that are packed smaller
 _HEADROOM = 1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
-_CELLS_PER_VOTE = 4  # a frame has room for four entries per voxel
+_CELLS_PER_ROW = {"vote": 4, "mover": 64}  # a frame has room for four votes per voxel, and for a quarter that moves
 _PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
 FrameTable = dict[int, dict[str, int]]
 """Frames of a field: the number of elements of each in each column that it needs."""
@@ -230,8 +230,8 @@ def typical_size(
         return arrays[0].shape
     announced = rows.get("points") if entry.per == "point" else None
     announced = rows.get(entry.name) if announced is None else announced
-    if announced is None and entry.per == "vote":
-        announced = _cells(entry.folder, read_document) // _CELLS_PER_VOTE
+    if announced is None and entry.per in _CELLS_PER_ROW:
+        announced = _cells(entry.folder, read_document) // _CELLS_PER_ROW[entry.per]
     if announced is None:
         announced = max(map(len, arrays), default=0)
         announced = 1 << (max(announced, _PICTURE) - 1).bit_length() if entry.kind == "picture" else announced

@@ -267,6 +267,30 @@ class VotesPacking(Packing):
         return votes
 
 
+class VelocitiesPacking(Packing):
+    """Velocities of the voxels that move: the columns of the table, as `voxel`, and `velocity` as (3, N)."""
+
+    kind = "velocities"
+
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
+        encoding = Encoding(shuffle=SHUFFLE)
+        return Column("voxel", "<i4", encoding, "index"), Column("velocity", "<f2", encoding, self.entry.unit, rows=3)
+
+    def published_bytes(self, counts: Mapping[str, int]) -> int:
+        """Return the bytes of tables with this many rows."""
+        return counts.get("voxel", 0) * field_files.VELOCITY_DTYPE.itemsize
+
+    def split(self, array: NDArray[Any]) -> Columns:
+        """Return the columns of the table."""
+        return {"voxel": np.ascontiguousarray(array["voxel"]), "velocity": array["velocity"].T}
+
+    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return the table."""
+        table = np.empty(len(columns["voxel"]), field_files.VELOCITY_DTYPE)
+        table["voxel"], table["velocity"] = columns["voxel"], columns["velocity"].T
+        return table
+
+
 class BoxesPacking(Packing):
     """Boxes: the numbers of the table as `geometry` (10, N), and its other columns as they are."""
 
@@ -312,6 +336,7 @@ _BY_KIND: dict[field_files.Kind, Callable[..., Packing]] = {
     "vector": FlowPacking,
     "pairs": PairsPacking,
     "votes": VotesPacking,
+    "velocities": VelocitiesPacking,
     "boxes": BoxesPacking,
 }
 

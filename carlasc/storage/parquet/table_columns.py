@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
-from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
+from carlasc.storage.field_files import VELOCITY_DTYPE, VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
 from carlasc.storage.packed.columns import narrow, quantise
 
 AXES = frozenset("xyz")
 """Columns of points that are quantised; not quantised, they have Parquet's byte-stream split, for numbers that seldom repeat."""
+
+_VELOCITY = ("vx", "vy", "vz")
 
 
 def describe(entry: Field, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
@@ -42,6 +44,8 @@ def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
             return {"jpeg": "binary"}
         case "votes":
             return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
+        case "velocities":
+            return {"voxel": "int32"} | dict.fromkeys(_VELOCITY, "float16")
         case "boxes":
             return {name: BOXES_DTYPE[name].name for name in entry.names}
         case _:
@@ -65,6 +69,9 @@ def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, An
             expected=f"{attributes['label_bytes']} bytes each, as in the first frame",
             found=str(array.dtype["label"].itemsize),
         )
+    if entry.kind == "velocities":
+        velocity = dict(zip(_VELOCITY, np.ascontiguousarray(array["velocity"].T), strict=True))
+        return {"voxel": np.ascontiguousarray(array["voxel"]), **velocity}
     if array.dtype.names:
         return {name: np.ascontiguousarray(array[name]) for name in types}
     rows, scale = array.reshape(-1, len(types)), attributes.get("scale_m")
@@ -81,6 +88,11 @@ def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: 
     first = next(iter(columns.values()))
     if entry.kind == "picture":
         return np.frombuffer(first[0], np.uint8)
+    if entry.kind == "velocities":
+        table = np.empty(len(first), VELOCITY_DTYPE)
+        table["voxel"] = first
+        table["velocity"] = np.column_stack([columns[name] for name in _VELOCITY])
+        return table
     if entry.kind in ("votes", "boxes"):
         dtype = (
             BOXES_DTYPE
