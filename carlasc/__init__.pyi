@@ -32,6 +32,7 @@ from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans
 from .groundtruth import Voting as Voting
 from .groundtruth import label_motion as label_motion
+from .groundtruth import map as map
 from .groundtruth import refine as refine
 from .groundtruth import regrid as regrid
 from .inspection import CardDetails as CardDetails

@@ -26,6 +26,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "convert",
     "label",
     "refine",
+    "map",
     "export",
     "pack",
     "unpack",

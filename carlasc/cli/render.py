@@ -93,7 +93,7 @@ class ContentFlags(Flags):
     ] = None
     color: Annotated[
         GridColor,
-        typer.Option(help="What the colours of the grid mean: classes, or one of the kinds of evidence."),
+        typer.Option(help="What the colours of the grid mean: classes, one of the kinds of evidence, or actors."),
     ] = "class"
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes around actors.")] = False
 

@@ -41,5 +41,5 @@ StyleName = Literal["screen", "paper"]
 PaletteName = Literal["class", "colorblind", "height"]
 """The colours of classes, or colours by height."""
 
-GridColor = Literal["class", "confidence", "views", "votes", "inferred"]
-"""What the colours of a grid mean: its classes, or one of the kinds of evidence (see `docs/format.md#evidence`)."""
+GridColor = Literal["class", "confidence", "views", "votes", "inferred", "actor"]
+"""What the colours of a grid mean: its classes, one of the kinds of evidence (see `docs/format.md#evidence`), or who is in it."""

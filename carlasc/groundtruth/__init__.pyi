@@ -1,6 +1,8 @@
 from .from_grid import resample as resample
 from .labelling_motion import MotionResult as MotionResult
 from .labelling_motion import label_motion as label_motion
+from .maps.mapping import MapResult as MapResult
+from .maps.mapping import map as map
 from .options import Complete as Complete
 from .options import Dynamic as Dynamic
 from .options import FromCapture as FromCapture

@@ -288,6 +288,29 @@ class SceneReader:
         scan = self.data.read_scan(frame)
         return mirror_scan(scan) if self.mirrored else scan
 
+    @property
+    def has_motion(self) -> bool:
+        """Whether something says how things move: the flow of points, or the velocity of voxels."""
+        return self.has("flow") or self.has(f"{self.data.grid}/velocity")
+
+    def read_motion(self, frame: int, scan: Scan | None) -> Scan | None:
+        """Return what moves in a frame, with flow: points of its scan, or the middles of voxels if points have no flow; None if neither says it.
+
+        Raises:
+            FormatError: the data do not have the format.
+        """
+        if scan is not None and scan.flow is not None:
+            return scan.select(np.linalg.norm(scan.flow, axis=1) > 0)
+        data, name = self.data, f"{self.data.grid}/velocity"
+        if not data.grid or frame not in data.frames_with(name):
+            return None
+        moving = data.sequence.read(name, frame)
+        points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(np.float32)
+        numbered = frame in data.frames_with(f"{data.grid}/instance")
+        actors = data.read_part("instance", frame).reshape(-1)[moving["voxel"]] if numbered else None
+        found = Scan(points, flow=moving["velocity"].astype(np.float32), instances=actors)
+        return mirror_scan(found) if self.mirrored else found
+
     def read_time(self, frame: int) -> float | None:
         """Return the seconds since the first frame, or None if the sequence has no times."""
         try:

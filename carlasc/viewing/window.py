@@ -279,7 +279,7 @@ class Window:
         self._replace("edges", None)
         self._replace("grid", self._grid() if content.grids and "grid" in layers else None)
         self._replace("points", self._points() if content.scan is not None and "points" in layers else None)
-        self._replace("flow", self._flow() if content.scan is not None and "flow" in layers else None)
+        self._replace("flow", self._flow() if "flow" in layers else None)
         self._replace("boxes", self._boxes() if content.boxes is not None and "boxes" in layers else None)
         self._replace("vehicle", self._mesh(ego_vehicle()) if "vehicle" in layers else None)
 
@@ -324,10 +324,10 @@ class Window:
         return cloud if shown.any() else None
 
     def _flow(self) -> Any:
-        scan = self._content.scan
-        if scan is None or scan.flow is None:
+        moving = self.reader.read_motion(self.reader.frames[self.state.position], self._content.scan)
+        if moving is None:
             return None
-        tails, vectors = motion_arrows(scan.select(np.linalg.norm(scan.flow, axis=1) > 0))
+        tails, vectors = motion_arrows(moving)
         if self.reader.panels and "points" not in self.state.layers:  # no arrows where nothing else is drawn
             spec = self.reader.panels[0].spec
             _, inside = spec.index(spec.to_axes(tails * [1, 1, 0] + [0, 0, (spec.lower[2] + spec.upper[2]) / 2]))

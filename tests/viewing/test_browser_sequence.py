@@ -8,6 +8,10 @@ from helpers.displays.browser import Page, serve_folder
 from helpers.readers.pixels import middle_of, red_pixels
 from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
 
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import translation
+from carlasc.storage import FolderSink
+from carlasc.storage.field_files import VELOCITY_DTYPE
 from carlasc.viewing import Scene, view
 
 pytestmark = pytest.mark.slow
@@ -404,3 +408,44 @@ def test_the_page_follows_the_system_in_colours_and_motion(browser, drive_page):
         assert 0.9 < seconds < 10  # a second per frame
     finally:
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+@pytest.fixture(scope="module")
+def actors(tmp_path_factory):
+    """A drive straight ahead, three frames, whose red block has a box, a number in the grid, and a velocity that no point has."""
+    folder = write_blocks(tmp_path_factory.mktemp("actors") / "Town01_Light" / "cartesian", 3, points=False)
+    add_poses(folder, [0.0] * 3, step_m=1.0)
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    for frame in range(3):
+        pose = translation((10.0 + frame, 5, 0))[None]
+        box = Boxes.from_poses(np.array([7], np.uint32), np.array([4], np.uint32), pose, np.array([[3.0, 3, 3]]))
+        writer.write("boxes", frame, box.to_table())
+        labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32)
+        writer.write("evaluation/instance", frame, np.where(labels == 4, 7, 0).astype(np.uint32).reshape(64, 64, 4))
+        velocity = np.zeros(np.count_nonzero(labels == 4), VELOCITY_DTYPE)
+        velocity["voxel"], velocity["velocity"] = np.flatnonzero(labels == 4), (6, 0, 0)
+        writer.write("evaluation/velocity", frame, velocity)
+    return folder
+
+
+def test_boxes_tracks_velocities_and_actors_are_drawn(browser, actors, tmp_path):
+    page = Page(browser, view(actors, tmp_path / "scene.html").out, (1000, 700))
+    names = page.run("return [...document.querySelectorAll('[data-layer]')].map((e) => e.textContent)")
+    assert names == ["Grid", "Flow", "Boxes", "Tracks", "Path", "Car"]
+    page.run("await carlasc.step(2)")
+    page.click("[data-layer='grid']")
+    for layer in ("boxes", "tracks", "flow"):
+        before = page.canvas()
+        page.click(f"[data-layer='{layer}']")
+        assert 20 < (page.canvas() != before).any(-1).sum() < 0.1 * before[..., 0].size, layer
+    box = page.run("return Array.from(carlasc.panels.actorBoxes.lines[0].geometry.attributes.position.array)")
+    ends = np.reshape(box, (-1, 3))[:24]
+    assert np.allclose([ends.min(axis=0), ends.max(axis=0)], [[3.5, -1.5, -13.5], [6.5, 1.5, -10.5]])  # right, up, back
+    track = page.run("return Array.from(carlasc.panels.tracks.lines[0].geometry.attributes.position.array)")
+    assert np.allclose(np.reshape(track, (-1, 3)), [[5, 0, -8], [5, 0, -10], [5, 0, -10], [5, 0, -12]], atol=1e-4)
+    page.click("[data-layer='grid']")
+    choose(page, "#color-by", "actor")
+    assert page.run("return document.querySelector('#ramp tbody').textContent").startswith("actor 7")
+    picture = page.canvas("page_actors")
+    assert not red_pixels(picture).any() and colored(picture, (0xE6, 0x67, 0xB0)).sum() > 30
+    assert page.complaints() == []

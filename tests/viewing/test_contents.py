@@ -1,12 +1,29 @@
 import numpy as np
 import pytest
 from helpers.readers.page_arrays import unpack_arrays
+from helpers.readers.pixels import BLUE, RED
+from helpers.scenes.road_blocks import write_blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import translation
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.viewing.page.contents import OFFSET_STEPS, encode_grid, encode_scan, pack_arrays
+from carlasc.storage import FolderSink
+from carlasc.storage.field_files import VELOCITY_DTYPE
+from carlasc.viewing import Scene
+from carlasc.viewing.page.contents import (
+    OFFSET_STEPS,
+    encode_actors,
+    encode_grid,
+    encode_scan,
+    open_content,
+    pack_arrays,
+)
+from carlasc.viewing.recordings.content import Trail
+from carlasc.viewing.rendering.drawings import evidence_drawing
+from carlasc.viewing.scene import FrameContent
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),
@@ -75,10 +92,64 @@ def test_a_scan_comes_back_thinned_to_one_point_a_cell(seed, count, cell):
 def test_each_moving_actor_becomes_one_arrow():
     points = np.array([[1, 0, 0], [1.2, 0, 0], [20, 0, 0], [30, 0, 0]], np.float32)
     flow = np.array([[5, 0, 0], [5, 0, 0], [0, -2, 0], [0, 0, 0]], np.float32)
-    arrows = encode_scan(Scan(points, flow=flow), 0.2)["arrows"].reshape(-1, 6)
+    scan = Scan(points, flow=flow)
+    moving = scan.select(np.abs(flow).sum(axis=1) > 0)
+    arrows = encode_actors(FrameContent((), scan, None), moving, ())["arrows"].reshape(-1, 6)
     assert np.allclose(sorted(arrows[:, 3:].tolist()), [[0, -2, 0], [5, 0, 0]])
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 def test_empty_arrays_come_back(kind):
     assert unpack_arrays(pack_arrays({"a": np.empty(0, kind)}))["a"].dtype == kind
+
+
+def test_boxes_and_tracks_are_lines_in_the_frame_of_the_sensor():
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[:, :3, 3] = [[10, 2, 0], [5, -3, 1]]
+    boxes = Boxes.from_poses(
+        np.array([4, 9], np.uint32), np.array([10, 4], np.uint32), poses, np.array([[4.0, 2, 1.5], [1, 1, 2]])
+    )
+    pose = translation((100.0, 0, 0))
+    trail = Trail(4, 10, np.array([[106.0, 2, 0], [108, 2, 0], [110, 2, 0]]))
+    found = encode_actors(FrameContent((), None, None, boxes, pose), None, [trail])
+    lines = found["boxes"].reshape(2, 13, 2, 3)
+    assert np.allclose(lines[0, :12].reshape(-1, 3).min(axis=0), [8, 1, -0.75])
+    assert np.allclose(lines[0, :12].reshape(-1, 3).max(axis=0), [12, 3, 0.75])
+    assert np.allclose(np.linalg.norm(lines[1, :12, 1] - lines[1, :12, 0], axis=1).sum(), 4 * (1 + 1 + 2))
+    assert np.allclose(found["tracks"].reshape(2, 2, 3), [[[6, 2, 0], [8, 2, 0]], [[8, 2, 0], [10, 2, 0]]])
+    assert "arrows" not in found
+    assert encode_actors(FrameContent((), None, None), None, ()) == {}
+
+
+@pytest.fixture
+def moving_grid(tmp_path):
+    """A grid whose red block is actor 70,001 and moves at 3 m/s; the blue one is actor 5 and stands. There are no points."""
+    folder = write_blocks(tmp_path / "cartesian", frames=1, points=False)
+    labels = np.fromfile(folder / "evaluation/000000.label", np.uint32)
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    instance = np.select([labels == RED, labels == BLUE], [70_001, 5], 0).astype(np.uint32).reshape(64, 64, 4)
+    writer.write("evaluation/instance", 0, instance)
+    velocity = np.zeros(np.count_nonzero(labels == RED), VELOCITY_DTYPE)
+    velocity["voxel"], velocity["velocity"] = np.flatnonzero(labels == RED), (3, 0, 0)
+    writer.write("evaluation/velocity", 0, velocity)
+    return folder
+
+
+def test_voxels_have_actors_and_arrows_where_no_point_has_flow(moving_grid):
+    content = open_content(Scene(moving_grid), 0.2)
+    arrays, _ = content.read(0)
+    assert set(np.unique(arrays["panel0/instance"]).tolist()) == {0, 5, 70_001}
+    assert np.array_equal(arrays["panel0/instance"] == 5, arrays["panel0/label"] == BLUE)
+    (arrow,) = arrays["actors/arrows"].reshape(-1, 6)
+    assert np.allclose(arrow[:2], (10, 5), atol=0.5) and np.allclose(arrow[3:], (3, 0, 0))
+    assert content.describe()["hasFlow"] and content.panels[0].evidence == ("instance",)
+    right = Scene(moving_grid).open().right_handed()
+    moving = right.read_motion(0, None)
+    assert np.allclose(moving.points.mean(axis=0)[:2], (10, -5), atol=0.5) and np.allclose(moving.flow, (3, 0, 0))
+
+
+def test_pictures_colour_voxels_by_actor(moving_grid):
+    drawing = evidence_drawing(Scene(moving_grid).open("grid").data, 0, "actor", ego=False)
+    colors = {tuple(color) for color in np.unique(drawing.mesh.colors, axis=0).tolist()}
+    assert len(colors) == 3  # no actor, and two
+    assert [entry.name for entry in drawing.legend] == ["no actor", "an actor, each in a colour of its own"]

@@ -54,7 +54,7 @@ def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
     assert (scene["pointTable"], scene["hasPoints"], scene["hasFlow"], scene["pointCell"]) == ("carla", True, True, 0.2)
     own, truth, errors = (frames[1][f"panel{number}/label"] for number in range(3))
     assert (own == 4).sum() == (truth == 4).sum() > 0 and set(np.unique(errors)) == {1, 3, 4}
-    assert {"scan/arrows", "scan/label"} <= set(frames[1])
+    assert {"actors/arrows", "scan/label"} <= set(frames[1])
 
 
 def test_data_with_y_on_the_left_say_so_in_the_page(tmp_path):

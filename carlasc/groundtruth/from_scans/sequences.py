@@ -213,15 +213,27 @@ class ScanSequence(StoredSequence):
 
     def notes(self) -> list[str]:
         """Return what the scans lack, and what was found in spite of it."""
-        where, dynamic, notes = self.location, self.options.dynamic, []
+        where, notes = self.location, self.findings()
+        if not self.feed.has_labels:
+            notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
+        below = self._share_below()
+        if below > _BELOW:
+            notes.append(
+                f"{where}: {below:.0%} of the points on the ground are below the grid, which begins at {self.plan.spec.lower[2]:g} m"
+            )
+        if len(self.feed.frames) == 1:
+            notes.append(f"{where}: there is one scan only: nothing is merged, and what it did not see is unknown")
+        return notes
+
+    def findings(self) -> list[str]:
+        """Return what was found of the poses, and of what moves."""
+        where, notes = self.location, list[str]()
         if self.estimates_poses and self.options.poses.source == "auto":
             notes.append(f"{where}: there are no poses: they were estimated from the scans (kiss-icp)")
         notes += (
             [] if self.refined is None else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
         )
-        if not self.feed.has_labels:
-            notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
-        elif not self.feed.motion and dynamic != "tube":
+        if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
             notes.append(f"{where}: nothing shows what moves: everything was treated as static")
         found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
         left_out = sum(len(points) for points in self.actors.moving.values())
@@ -240,13 +252,6 @@ class ScanSequence(StoredSequence):
             notes.append(
                 f"{where}: {wrong} actors are larger than any vehicle, so their numbers or boxes are wrong: their points were treated as static"
             )
-        below = self._share_below()
-        if below > _BELOW:
-            notes.append(
-                f"{where}: {below:.0%} of the points on the ground are below the grid, which begins at {self.plan.spec.lower[2]:g} m"
-            )
-        if len(self.feed.frames) == 1:
-            notes.append(f"{where}: there is one scan only: nothing is merged, and what it did not see is unknown")
         return notes
 
     def _share_below(self) -> float:

@@ -9,7 +9,7 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import PurePath
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.geometry import invert, transform_points
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, MissingDataError
@@ -25,8 +26,10 @@ from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.finding import SceneSource, find_truth
+from carlasc.viewing.recordings.content import Trail, Trails
+from carlasc.viewing.rendering.actor_boxes import box_lines
 from carlasc.viewing.rendering.drawings import motion_arrows
-from carlasc.viewing.scene import Scene, SceneReader
+from carlasc.viewing.scene import FrameContent, Scene, SceneReader
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -71,12 +74,11 @@ def encode_evidence(grid: Grid, fields: Mapping[str, NDArray[Any]]) -> Arrays:
 
 
 def encode_scan(scan: Scan, cell_m: float) -> Arrays:
-    """Encode a scan, thinned to one point per cell, and an arrow for each moving actor.
+    """Encode a scan, thinned to one point per cell.
 
     Returns:
         `box` (6,) int32: first cell and number of cells along each axis. `index`: differences of the rising C-order indices of the cells
         in the box. `offset` (3 N,): position within the cell in steps, axis by axis. `label` of each point, if the scan has labels.
-        `arrows` (6 M,) float32: start point (m) and vector (m/s) of each arrow, if the scan has flow.
     """
     cells = np.floor(scan.points.astype(np.float64) / cell_m).astype(np.int64)
     lower = cells.min(0) if len(cells) else np.zeros(3, np.int64)
@@ -92,9 +94,29 @@ def encode_scan(scan: Scan, cell_m: float) -> Arrays:
     }
     if scan.labels is not None:
         arrays["label"] = _narrow(scan.labels[first])
-    if scan.flow is not None:
-        moving = scan.select(np.linalg.norm(scan.flow, axis=1) > 0)
+    return arrays
+
+
+def encode_actors(content: FrameContent, moving: Scan | None, trails: Sequence[Trail]) -> Arrays:
+    """Encode what moves in a frame, metres, sensor frame.
+
+    Args:
+        content: the frame.
+        moving: the points that move, with flow; None if nothing says what does.
+        trails: the ways of the actors.
+
+    Returns:
+        Flat float32 arrays: `arrows`, start point and vector (m/s) of an arrow for each moving actor, unless `moving` is None; `boxes` and
+        `tracks`, both ends of each line, where there are any.
+    """
+    arrays: Arrays = {}
+    if moving is not None:
         arrays["arrows"] = np.concatenate(motion_arrows(moving), axis=1).astype(np.float32).reshape(-1)
+    if content.boxes is not None and len(content.boxes.tracks):
+        arrays["boxes"] = box_lines(content.boxes).astype(np.float32).reshape(-1)
+    if trails and content.pose is not None:
+        lines = [np.stack([trail.points[:-1], trail.points[1:]], axis=1).reshape(-1, 3) for trail in trails]
+        arrays["tracks"] = transform_points(invert(content.pose), np.concatenate(lines)).astype(np.float32).reshape(-1)
     return arrays
 
 
@@ -124,7 +146,7 @@ def _narrow(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
     return values.astype(next(t for t in (np.uint8, np.uint16, np.uint32) if largest <= np.iinfo(t).max))
 
 
-EVIDENCE = ("occupied", "views", "flags")  # the fields of a grid that a page shows, where they exist
+EVIDENCE = ("occupied", "views", "flags", "instance")  # the fields of a grid that a page shows, where they exist
 
 
 @dataclass(frozen=True)
@@ -213,8 +235,12 @@ class PageContent:
                 return first, second
         return "left", "right"
 
-    def read(self, frame: int) -> tuple[Arrays, FrameScores | None]:
-        """Return the arrays of a frame, named `panel0/index`, ... and `scan/index`, ..., and its scores if there is a truth.
+    def read(self, frame: int, trails: Trails | None = None) -> tuple[Arrays, FrameScores | None]:
+        """Return the arrays of a frame, named `panel0/index`, `scan/index`, `actors/boxes`, ..., and its scores if there is a truth.
+
+        Args:
+            frame: frame number.
+            trails: follows the actors through the frames, which are then read in their order; None shows no tracks.
 
         Raises:
             FormatError: the data do not have the format.
@@ -232,8 +258,11 @@ class PageContent:
             names = [name for name in panel.evidence if frame in data.frames_with(f"{data.grid}/{name}")]
             found = encode_grid(grid) | encode_evidence(grid, {name: data.read_part(name, frame) for name in names})
             arrays |= {f"panel{number}/{name}": array for name, array in found.items()}
+        moving = self.reader.read_motion(frame, content.scan)
         if content.scan is not None:
             arrays |= {f"scan/{name}": array for name, array in encode_scan(content.scan, self.thin_m).items()}
+        ways = trails.follow(content) if trails is not None else ()
+        arrays |= {f"actors/{name}": array for name, array in encode_actors(content, moving, ways).items()}
         return arrays, self._score(grids)
 
     def describe(self) -> dict[str, Any]:
@@ -253,7 +282,9 @@ class PageContent:
             "times": [reader.read_time(frame) for frame in self.frames],
             "poses": [np.round(pose[:3].reshape(-1), 5).tolist() for pose in poses] or None,  # first_T_sensor
             "hasPoints": reader.has("points"),
-            "hasFlow": reader.has("flow"),
+            "hasFlow": reader.has_motion,
+            "hasBoxes": reader.has("boxes"),
+            "hasTracks": bool(poses) and (reader.has("boxes") or reader.has("instances")),
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
         }

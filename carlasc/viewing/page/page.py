@@ -19,6 +19,7 @@ from carlasc.storage.files import write_output, writing
 from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content, pack_arrays
+from carlasc.viewing.recordings.content import Trails
 from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import ViewResult, check_target, first_frames
 
@@ -214,8 +215,9 @@ class _Writer:
 
     def blocks(self) -> Iterator[bytes]:
         """Yield the frames, each as one block of arrays (see `contents`)."""
+        trails = Trails()
         for done, frame in enumerate(self.content.frames, 1):
-            arrays, scores = self.content.read(frame)
+            arrays, scores = self.content.read(frame, trails)
             self.scores.append(scores)
             yield pack_arrays(arrays)
             if self.progress is not None:

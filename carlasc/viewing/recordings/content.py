@@ -218,8 +218,8 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
         time_s = number * FRAME_PERIOD_S if content.time_s is None else content.time_s
         scan, nothing = content.scan, np.empty((0, 3))
         tails, vectors = nothing, nothing
-        if scan is not None and scan.flow is not None:
-            tails, vectors = motion_arrows(scan.select(np.linalg.norm(scan.flow, axis=1) > 0))
+        if (moving := reader.read_motion(number, scan)) is not None:
+            tails, vectors = motion_arrows(moving)
         yield RecordedFrame(
             number,
             time_s,

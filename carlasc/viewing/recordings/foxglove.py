@@ -93,7 +93,7 @@ class FoxgloveWriter:
                 log(f"/{panel.name}", "VoxelGrid", timestamp=stamp, frame_id=EGO, **self._voxels(panel, grid))
         if frame.scan is not None:
             log("/points", "PointCloud", timestamp=stamp, frame_id=EGO, **self._points(frame.scan))
-        if self._reader.has("flow"):
+        if self._reader.has_motion:
             arrows = [self._arrow(tail, vector) for tail, vector in zip(frame.tails, frame.vectors, strict=True)]
             log_scene("/flow", [entity("flow", EGO, arrows=arrows)])
         if self._reader.has("boxes"):

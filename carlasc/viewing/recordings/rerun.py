@@ -144,7 +144,7 @@ class RerunWriter:
         if frame.scan is not None:
             labels = np.zeros(len(frame.scan), np.uint16) if frame.scan.labels is None else frame.scan.labels
             log("world/ego/points", rr.Points3D(frame.scan.points, class_ids=labels, radii=[_POINT_RADIUS_M]))
-        if self._reader.has("flow"):
+        if self._reader.has_motion:
             log("world/ego/flow", rr.Arrows3D(origins=frame.tails, vectors=frame.vectors, colors=[palette.ARROW]))
         if self._reader.has("boxes"):
             self._write_boxes(frame.boxes)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import transform_points
 from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
@@ -105,15 +106,27 @@ def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
     )
 
 
+def _lines_of(size: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the ends of the edges of a box, and of the bar on its floor, metres, frame of the box."""
+    corners, floor = _CORNERS * size, -size[2] / 2
+    bar = np.array([0.0, 0.0, floor]), np.array([size[0] / 2 + 0.8, 0.0, floor])
+    return [*((corners[a], corners[b]) for a, b in _EDGES), bar]
+
+
+def box_lines(boxes: Boxes) -> NDArray[np.float64]:
+    """Return (L, 2, 3) both ends of the edges of boxes, and of a bar from the middle of each to its front, metres, sensor frame."""
+    found = [
+        transform_points(pose, np.array(_lines_of(size)).reshape(-1, 3))
+        for pose, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True)
+    ]
+    return np.concatenate([np.empty((0, 3)), *found]).reshape(-1, 2, 3)
+
+
 def box_edges(boxes: Boxes) -> QuadMesh:
     """Return the edges of boxes as bars."""
     bars = []
     for sensor_T_box, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True):
-        corners = _CORNERS * size
-        ends = [(corners[a], corners[b]) for a, b in _EDGES]
-        floor = -size[2] / 2
-        ends.append((np.array([0.0, 0.0, floor]), np.array([size[0] / 2 + 0.8, 0.0, floor])))
-        for start, end in ends:
+        for start, end in _lines_of(size):
             lower, upper = np.minimum(start, end) - _BAR_M / 2, np.maximum(start, end) + _BAR_M / 2
             bar = box(lower, upper, palette.ARROW)
             rotation = sensor_T_box[:3, :3]

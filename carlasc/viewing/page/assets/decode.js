@@ -48,11 +48,11 @@ function decodeGrid(arrays, prefix, panel) {
     unknown = new Uint8Array(volume.length);
     for (let i = 0; i < turns.length; i += 2) unknown.fill(1, turns[i], i + 1 < turns.length ? turns[i + 1] : volume.length);
   }
-  const [votes, occupied, views, flags] = ['votes', 'occupied', 'views', 'flags'].map((name) => arrays[`${prefix}/${name}`] ?? null);
-  return { index, label, votes, occupied, views, flags, volume, unknown };
+  const [votes, occupied, views, flags, instance] = ['votes', 'occupied', 'views', 'flags', 'instance'].map((name) => arrays[`${prefix}/${name}`] ?? null);
+  return { index, label, votes, occupied, views, flags, instance, volume, unknown };
 }
 
-/** Returns the points of a scan (x, y, z of each, metres), their labels, and the arrows. */
+/** Returns the points of a scan (x, y, z of each, metres), and their labels. */
 function decodeScan(arrays, scene) {
   if (!arrays['scan/index']) return null;
   const index = sumUp(arrays['scan/index']);
@@ -67,5 +67,5 @@ function decodeScan(arrays, scene) {
     const cell = [x0 + x, y0 + y, z0 + z];
     for (let a = 0; a < 3; a++) points[3 * i + a] = (cell[a] + (offset[a * count + i] + 0.5) / scene.offsetSteps) * scene.pointCell;
   }
-  return { points, label: arrays['scan/label'] ?? new Uint8Array(count), arrows: arrays['scan/arrows'] ?? new Float32Array(0) };
+  return { points, label: arrays['scan/label'] ?? new Uint8Array(count) };
 }

@@ -118,6 +118,7 @@ function fillCard(card, scene, contents, picked) {
   }
   if (own.occupied) lines.push(['occupied with probability', (own.occupied[place] / 255).toFixed(2)]);
   if (own.views) lines.push(['views', grouped(own.views[place])]);
+  if (own.instance?.[place]) lines.push(['actor', String(own.instance[place])]);
   if (own.flags) for (const { flag, name } of KNOWLEDGE) if (own.flags[place] & flag) lines.push(['evidence', name]);
   lines.push(['voxel', cell.join(', ')]);
   lines.push(['x, y, z', `${center.map((value) => value.toFixed(2)).join(', ')} m`]);

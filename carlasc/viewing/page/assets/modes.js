@@ -10,6 +10,13 @@ const KNOWLEDGE = [ // the first one of which the flag is set
   { flag: 0, name: 'seen by other scans', color: '#b4bac4' },
 ];
 
+const ACTORS = ['#b4bac4', '#0ab0f5', '#d54600', '#0aa558', '#8a56c2', '#f0c828', '#c8140a', '#16d0c0', '#e667b0', '#1045be', '#9a6a2f', '#7ac943', '#5e5253'];
+
+/** Returns the place of an actor's colour in ACTORS; the first one is that of voxels without an actor. */
+function colorOfActor(number) {
+  return number ? 1 + (number % (ACTORS.length - 1)) : 0;
+}
+
 /** Returns the place in KNOWLEDGE of a voxel with these flags. */
 function knowledgeOf(flags) {
   const place = KNOWLEDGE.findIndex(({ flag }) => flags & flag);
@@ -62,6 +69,23 @@ const MODES = {
     legend: () => rampScale('Confidence: probability of being occupied', '0.5 or less', '1'),
   },
   views: logarithmic('views', 'Views: scans that saw it', 'views'),
+  actor: {
+    label: 'actor',
+    colors: ACTORS,
+    stepped: true,
+    most: () => 0,
+    values: (grid, drawn) => grid.instance && Uint8Array.from(drawn, (i) => (255 * (colorOfActor(grid.instance[i]) + 0.5)) / ACTORS.length),
+    legend(grids) {
+      const counts = new Map();
+      for (const grid of grids) for (const number of grid.instance ?? []) if (number) counts.set(number, (counts.get(number) ?? 0) + 1);
+      const rows = [...counts].sort((a, b) => b[1] - a[1]).slice(0, ACTORS.length - 1).map(([number, count]) => {
+        const name = make('th', { scope: 'row' }, swatch(ACTORS[colorOfActor(number)]), make('span', { class: 'name' }, `actor ${number}`));
+        return make('tr', {}, name, make('td', { class: 'count' }, grouped(count)));
+      });
+      const table = make('table', { class: 'knowledge', 'aria-label': 'Actors with most voxels in this frame' }, make('tbody', {}, ...rows));
+      return make('section', { id: 'ramp' }, make('h2', {}, 'Actors'), table);
+    },
+  },
   evidence: {
     label: 'inferred or seen',
     colors: KNOWLEDGE.map(({ color }) => color),
@@ -87,7 +111,7 @@ const MODES = {
 /** Returns the names of the modes that a scene has data for. */
 function modesOf(scene) {
   const has = (field) => scene.panels.some((panel) => panel.evidence.includes(field));
-  const available = { votes: scene.panels.length > 0, confidence: has('occupied'), views: has('views'), evidence: has('flags') };
+  const available = { votes: scene.panels.length > 0, confidence: has('occupied'), views: has('views'), actor: has('instance'), evidence: has('flags') };
   return Object.keys(MODES).filter((name) => available[name] ?? true);
 }
 

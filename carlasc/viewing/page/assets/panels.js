@@ -20,6 +20,8 @@ class Panels {
     this.most = 0;
     this.share = 0.5; // of the width of a panel with two runs, for the first
     this.path = new PathLayer();
+    this.actorBoxes = new LineLayer(this.side, '#15171b');
+    this.tracks = new LineLayer(this.side, '#c2410c');
     this.scan = new ScanLayer(this.side, this.palettes[scene.pointTable], heights, first);
     this.panels = (scene.panels.length ? scene.panels : [null]).map((panel) => this.makePanel(panel));
     for (const panel of this.panels) {
@@ -48,7 +50,7 @@ class Panels {
     const vehicle = egoVehicle();
     if (layer) scene.add(layer.mesh, outline(panel, this.side));
     const path = this.path.object();
-    scene.add(vehicle, path, ...this.scan.objects());
+    scene.add(vehicle, path, this.actorBoxes.object(), this.tracks.object(), ...this.scan.objects());
     return { panel, scene, layer, vehicle, path, shown: true };
   }
 
@@ -57,10 +59,12 @@ class Panels {
     return this.panels.filter((panel) => panel.shown && !panel.isRight);
   }
 
-  setFrame({ grids, scan }) {
+  setFrame({ grids, scan, arrows, boxes, tracks }) {
     this.most = Math.max(0, ...grids.map((grid) => this.mode.most(grid)));
     this.panels.forEach(({ layer }, number) => layer && layer.set(grids[number], this.most));
-    this.scan.set(scan);
+    this.scan.set(scan, arrows);
+    this.actorBoxes.set(boxes);
+    this.tracks.set(tracks);
     this.invalidate();
   }
 
@@ -75,7 +79,7 @@ class Panels {
       if (what === 'path') path.visible = visible;
       if (what === 'vehicle') vehicle.visible = visible;
     }
-    const objects = { points: this.scan.points, flow: this.scan.arrows }[what] ?? [];
+    const objects = { points: this.scan.points, flow: this.scan.arrows, boxes: this.actorBoxes.lines, tracks: this.tracks.lines }[what] ?? [];
     for (const object of objects) object.visible = visible;
     this.scan.thinArrows();
     this.invalidate();
@@ -101,6 +105,7 @@ class Panels {
   setBackground(color, ink) {
     this.renderer.setClearColor(new THREE.Color(color), 1);
     this.scan.arrowMaterial.color.set(ink);
+    this.actorBoxes.material.color.set(ink);
     this.invalidate();
   }
 

@@ -70,3 +70,36 @@ class PathLayer {
     }
   }
 }
+
+/** Straight lines in the frame of the sensor: the edges of boxes, or the ways of actors. All panels share them. */
+class LineLayer {
+  constructor(side, color) {
+    this.side = side;
+    this.material = new THREE.LineBasicMaterial({ color });
+    this.lines = [];
+  }
+
+  /** Returns the object for the scene of a panel. */
+  object() {
+    const lines = new THREE.LineSegments(new THREE.BufferGeometry(), this.material);
+    lines.frustumCulled = false;
+    this.lines.push(lines);
+    return lines;
+  }
+
+  /** Draws lines; `ends` has x, y and z of both ends of each, in the axes of the data. */
+  set(ends) {
+    const corners = new Float32Array(ends.length);
+    for (let i = 0; i < ends.length; i += 3) {
+      corners[i] = this.side * ends[i + 1];
+      corners[i + 1] = ends[i + 2];
+      corners[i + 2] = -ends[i];
+    }
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute('position', new THREE.BufferAttribute(corners, 3));
+    for (const lines of this.lines) {
+      lines.geometry.dispose();
+      lines.geometry = geometry;
+    }
+  }
+}

@@ -61,7 +61,7 @@ class ScanLayer {
     return [points, arrows];
   }
 
-  set(scan) {
+  set(scan, arrows) {
     const count = scan ? scan.points.length / 3 : 0;
     const positions = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) {
@@ -76,7 +76,7 @@ class ScanLayer {
     for (const points of this.points) points.geometry = this.geometry;
     for (const group of this.arrows) {
       group.clear();
-      for (let i = 0; i + 5 < (scan?.arrows.length ?? 0); i += 6) group.add(this.arrow(scan.arrows.subarray(i, i + 6)));
+      for (let i = 0; i + 5 < arrows.length; i += 6) group.add(this.arrow(arrows.subarray(i, i + 6)));
     }
     this.thinArrows();
   }

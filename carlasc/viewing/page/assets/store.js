@@ -36,7 +36,8 @@ class FrameStore {
     const bytes = this.scene.embedded ? this.unwrap(position) : await this.fetch(position, signal);
     const arrays = unpackArrays(await inflate(bytes));
     const grids = this.scene.panels.map((panel, number) => decodeGrid(arrays, `panel${number}`, panel));
-    return { grids, scan: decodeScan(arrays, this.scene) };
+    const [arrows, boxes, tracks] = ['arrows', 'boxes', 'tracks'].map((name) => arrays[`actors/${name}`] ?? new Float32Array(0));
+    return { grids, scan: decodeScan(arrays, this.scene), arrows, boxes, tracks };
   }
 
   /** Returns the bytes of a frame that is part of the page. */

@@ -16,7 +16,7 @@ class Viewer {
     this.picked = null;
     this.playing = false;
     this.follows = false;
-    this.layers = { grid: scene.panels.length > 0, points: scene.panels.length === 0, flow: true, path: true, vehicle: true };
+    this.layers = { grid: scene.panels.length > 0, points: scene.panels.length === 0, flow: true, boxes: true, tracks: true, path: true, vehicle: true };
     this.makeHeader();
     this.makeLayers();
     this.makeLegends();
@@ -74,9 +74,9 @@ class Viewer {
   }
 
   makeLayers() {
-    const { panels, hasPoints, hasFlow, frames, poses } = this.scene;
-    const names = { grid: 'Grid', points: 'Points', flow: 'Flow', path: 'Path', vehicle: 'Car' };
-    const available = { grid: panels.length > 0, points: hasPoints, flow: hasFlow, path: Boolean(poses) && frames.length > 1, vehicle: true };
+    const { panels, hasPoints, hasFlow, hasBoxes, hasTracks, frames, poses } = this.scene;
+    const names = { grid: 'Grid', points: 'Points', flow: 'Flow', boxes: 'Boxes', tracks: 'Tracks', path: 'Path', vehicle: 'Car' };
+    const available = { grid: panels.length > 0, points: hasPoints, flow: hasFlow, boxes: hasBoxes, tracks: hasTracks, path: Boolean(poses) && frames.length > 1, vehicle: true };
     this.layerButtons = {};
     for (const [layer, label] of Object.entries(names)) {
       if (!available[layer]) continue;

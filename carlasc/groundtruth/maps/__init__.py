@@ -1,0 +1,1 @@
+"""Maps: what is static in a drive, in one frame."""

@@ -1,0 +1,186 @@
+"""The cells of a map while it grows. What is not near any more is on the disk, so memory does not grow with the length of a drive.
+
+Each scan votes once in a cell: for the class that most of its points in the cell have. All sums are whole numbers, so that they do not depend
+on the order in which scans are added.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.storage.cloud_files import POINT_DTYPE
+
+Part = tuple[int, int, int]
+"""What cells are kept together: a group (`STATIC`, or the number of an actor), and x and y of a tile."""
+
+STATIC = -1
+ROW_DTYPE = np.dtype(
+    [("key", "<i8"), ("seen", "<u4"), ("points", "<u4"), ("votes", "<i8"), ("x", "<i8"), ("y", "<i8"), ("z", "<i8")]
+)
+"""A cell and a class: scans, points, votes in 1 / `_VOTE`, and the sums of the points' places in the cell in 1 / `_STEPS` of it."""
+
+_SIDE_BITS, _HEIGHT_BITS, _LABEL_BITS = 9, 24, 16  # of a key: x and y in the tile, z, and the class
+_SIDE, _MIDDLE = 1 << _SIDE_BITS, 1 << (_HEIGHT_BITS - 1)
+_STEPS, _VOTE = 1024, 65535
+_EDGE = 1 / 64  # of a cell: points stay so far from its faces that float32 keeps them in it
+_MOST_ROWS = 4_000_000  # in memory: 200 MB
+
+
+def rows_of_scan(
+    points: NDArray[np.float64],
+    labels: NDArray[np.unsignedinteger],
+    sure: NDArray[np.float32] | None,
+    groups: NDArray[np.int64],
+    cell_m: float,
+) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    """Return the cells in which a scan has points.
+
+    Args:
+        points: (N, 3) metres, map frame, or the frame of the actor that they belong to.
+        labels: (N,) classes.
+        sure: (N,) probability of each class; None: 1.
+        groups: (N,) `STATIC`, or the number of an actor.
+        cell_m: size of a cell, metres.
+
+    Returns:
+        (M, 3) the parts, and (M,) rows.
+    """
+    if not len(points):
+        return np.empty((0, 3), np.int64), np.empty(0, ROW_DTYPE)
+    scaled = points / cell_m
+    cells = np.floor(scaled).astype(np.int64)
+    places = np.minimum(np.floor((scaled - cells) * _STEPS), _STEPS - 1).astype(np.int64)
+    whole = (groups, cells[:, 0], cells[:, 1], cells[:, 2])
+    order = np.lexsort((labels, *whole[::-1]))
+    changed = np.zeros(len(order), np.bool_)
+    changed[0] = True
+    for column in whole:
+        changed[1:] |= np.diff(column[order]) != 0
+    begins = np.flatnonzero(changed)
+    rows = np.zeros(len(begins), ROW_DTYPE)
+    rows["seen"], rows["points"] = 1, np.diff(np.append(begins, len(order)))
+    for axis, name in enumerate("xyz"):
+        rows[name] = np.add.reduceat(places[order, axis], begins)
+
+    # The class that most points have, the lowest of several: one run of equal classes is the longest of its cell.
+    sorted_labels = labels[order].astype(np.int64)
+    runs = np.flatnonzero(changed | np.append(True, np.diff(sorted_labels) != 0))
+    lengths, cell_of = np.diff(np.append(runs, len(order))), np.searchsorted(begins, runs, side="right") - 1
+    best = np.lexsort((sorted_labels[runs], -lengths, cell_of))
+    best = best[np.flatnonzero(np.diff(cell_of[best], prepend=-1))]
+    certain = np.ones(len(order)) if sure is None else sure[order].astype(np.float64)
+    votes = np.add.reduceat(certain, runs)[best] / rows["points"]
+    rows["votes"] = np.maximum(np.rint(votes * _VOTE), 1)
+
+    at = cells[order[begins]]
+    tile = at[:, :2] >> _SIDE_BITS
+    x, y = (at[:, :2] & (_SIDE - 1)).T
+    z = np.clip(at[:, 2] + _MIDDLE, 0, 2 * _MIDDLE - 1)
+    rows["key"] = (((x << _SIDE_BITS | y) << _HEIGHT_BITS | z) << _LABEL_BITS) | sorted_labels[runs[best]]
+    return np.column_stack([groups[order[begins]], tile]), rows
+
+
+def split(parts: NDArray[np.int64], rows: NDArray[Any]) -> list[tuple[Part, NDArray[Any]]]:
+    """Return the rows of each part, in order, those of one cell and class added up."""
+    order = np.lexsort((rows["key"], *parts.T[::-1]))
+    parts, rows = parts[order], rows[order]
+    begins = np.flatnonzero((np.diff(parts, axis=0, prepend=np.iinfo(np.int64).min) != 0).any(axis=1))
+    places: list[Part] = [(int(p[0]), int(p[1]), int(p[2])) for p in parts[begins]]
+    pieces = np.split(rows, begins)[1:]  # before the first one is nothing
+    return [(place, _added([piece])) for place, piece in zip(places, pieces, strict=True)]
+
+
+def _added(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    """Return rows in order of their keys, those with one key added up."""
+    rows = np.concatenate(list(pieces))
+    rows = rows[np.argsort(rows["key"], kind="stable")]
+    begins = np.flatnonzero(np.diff(rows["key"], prepend=-1))
+    added = rows[begins]
+    for name in ROW_DTYPE.names[1:] if ROW_DTYPE.names else ():
+        added[name] = np.add.reduceat(rows[name], begins)
+    return added
+
+
+class GrowingCells:
+    """The cells of a map, to which scans are added.
+
+    Args:
+        folder: an empty folder, where cells are kept that do not fit into memory.
+        cell_m: size of a cell, metres.
+        most_rows: rows in memory, of 48 bytes each.
+    """
+
+    def __init__(self, folder: Path, cell_m: float, most_rows: int = _MOST_ROWS) -> None:
+        self.folder, self.cell_m, self.most_rows = folder, cell_m, most_rows
+        self.counts: dict[Part, int] = {}
+        self._rows: OrderedDict[Part, list[NDArray[Any]]] = OrderedDict()
+        self._held = 0
+        self._stored: set[Part] = set()
+
+    def add(self, pieces: Iterable[tuple[Part, NDArray[Any]]]) -> None:
+        """Add the cells of some scans: see `split`."""
+        for part, rows in pieces:
+            self._rows.setdefault(part, []).append(rows)
+            self._rows.move_to_end(part)
+            self._held += len(rows)
+        if self._held > self.most_rows:
+            self._rows = OrderedDict((part, [_added(rows)]) for part, rows in self._rows.items())
+            self._held = sum(len(rows[0]) for rows in self._rows.values())
+            while self._held > self.most_rows // 2:  # those that were seen longest ago
+                part, (rows,) = self._rows.popitem(last=False)
+                self._held -= len(rows)
+                np.save(self._path(part), self._whole(part, [rows]))
+                self._stored.add(part)
+
+    def _path(self, part: Part) -> Path:
+        return self.folder / f"{'_'.join(map(str, part))}.npy"
+
+    def _whole(self, part: Part, rows: list[NDArray[Any]]) -> NDArray[Any]:
+        return _added([np.load(self._path(part)), *rows] if part in self._stored else rows)
+
+    def finish(self) -> None:
+        """Elect the class of each cell; then `counts` has the number of points of each part, and `points` yields them."""
+        for part in sorted({*self._rows, *self._stored}):
+            points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
+            self.counts[part] = len(points)
+            np.save(self._path(part), points)
+
+    def _elect(self, part: Part, rows: NDArray[Any]) -> NDArray[Any]:
+        """Return one point for each cell: the mean of its points, with the class that has most votes, the lowest of several."""
+        cells = rows["key"] >> _LABEL_BITS
+        begins = np.flatnonzero(np.diff(cells, prepend=-1))
+        best = np.lexsort((rows["key"], -rows["votes"], cells))
+        best = best[np.flatnonzero(np.diff(cells[best], prepend=-1))]
+        points, count = np.zeros(len(begins), POINT_DTYPE), np.add.reduceat(rows["points"].astype(np.int64), begins)
+        for name, index in zip("xyz", _indices(part, cells[begins]).T, strict=True):
+            inside = (np.add.reduceat(rows[name], begins) / count + 0.5) / _STEPS
+            points[name] = (index + np.clip(inside, _EDGE, 1 - _EDGE)) * self.cell_m
+        points["seen"] = np.add.reduceat(rows["seen"], begins)
+        points["label"] = rows["key"][best] & ((1 << _LABEL_BITS) - 1)
+        points["confidence"] = rows["votes"][best] / _VOTE / (points["seen"] + 1.0)
+        return points
+
+    def points(self, group: int = STATIC) -> Iterator[NDArray[Any]]:
+        """Yield the points of a group, tile by tile, after `finish`."""
+        for part in self.counts:
+            if part[0] == group:
+                yield np.load(self._path(part))
+
+
+def _indices(part: Part, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (N, 3) the indices of cells of a part, which keys without their class give."""
+    column = cells >> _HEIGHT_BITS
+    x, y = column >> _SIDE_BITS, column & (_SIDE - 1)
+    z = (cells & (2 * _MIDDLE - 1)) - _MIDDLE
+    return np.stack([x + part[1] * _SIDE, y + part[2] * _SIDE, z], axis=1)
+
+
+def cells_of(points: NDArray[Any], cell_m: float) -> NDArray[np.int64]:
+    """Return (N, 3) indices of the cells of points of a map, (N,) `POINT_DTYPE`."""
+    return np.stack([np.floor(points[axis].astype(np.float64) / cell_m) for axis in "xyz"], axis=1).astype(np.int64)

@@ -1,0 +1,175 @@
+"""Are maps of drives clean? `python docs/studies/maps.py [WORK]` prints SA, DA and AA of maps by `carlasc map`, and of other programs.
+
+The measures are those of DynamicMap_Benchmark (Q. Zhang et al., ITSC 2023), by points: SA is the share of the static points within 5 cm of a point of
+the map, DA the share of the dynamic ones without such a point, AA the square root of their product. A point is dynamic if its actor
+moves faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WORK keeps them, and results; the default is a temporary folder.
+
+    --town, --street SEED ...   drives (61 to 63 and 261 to 263)
+    --rows NAME ...             only these rows
+
+The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12 or older); rows without them are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from movers_drives import MOVES_M_S, Recorded, record
+from movers_rows import Changed, find_static, noisy_boxes
+from numpy.typing import NDArray
+
+import carlasc
+from carlasc import Run
+from carlasc.core.geometry import transform_points
+from carlasc.motion import MotionOptions, PoseOptions
+from carlasc.storage import Sequence
+from carlasc.storage.views import ChosenSequences, SequenceView
+
+CELL_M, NEAR_M = 0.05, 0.05
+CHANNELS = 32
+SEEDS = {"town": [61, 62, 63], "street": [261, 262, 263]}
+POSES = PoseOptions("file", "never")  # which are exact
+Keep = dict[int, NDArray[np.bool_]]
+
+
+class WithoutLabels(SequenceView):
+    """A sequence without labels, as most recordings are."""
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields, without labels."""
+        return self.whole.fields() - {"labels", "instances", "flow", "boxes"}
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field; none of the labels."""
+        return self.whole.frames(field) if field in self.fields() else np.empty(0, np.int64)
+
+
+@dataclass(frozen=True)
+class MapRow:
+    """One way to make a map: what is mapped, and what tells what moves."""
+
+    name: str
+    motion: MotionOptions
+    change: Callable[[Recorded], Sequence] = lambda drive: drive.sequence
+    needs: str = ""
+    clean: Callable[[NDArray[np.float32], Recorded], NDArray[np.float32]] = lambda points, drive: points
+
+
+def without(drive: Recorded, kept: Keep) -> Sequence:
+    """Return a drive with only some of its points."""
+    return Changed(drive.sequence, keep=lambda frame: kept[frame])
+
+
+def dynamic_points(drive: Recorded) -> Keep:
+    """Return which points of each frame are dynamic."""
+    sequence, moving = drive.sequence, set[int]()
+    frames = sequence.frames("points").tolist()
+    for frame in frames:
+        fast = np.linalg.norm(sequence.read("flow", frame), axis=1) > MOVES_M_S
+        moving |= set(np.unique(sequence.read("instances", frame)[fast]).tolist())
+    return {frame: np.isin(sequence.read("instances", frame), sorted(moving - {0})) for frame in frames}
+
+
+def by_dynamic_object_removal(points: NDArray[np.float32], drive: Recorded) -> NDArray[np.float32]:
+    """Return the points of a map that the package's best method (`fusion`) keeps, with its own settings."""
+    from dynamic_object_removal import clean_map_by_fusion  # noqa: PLC0415 (pip install dynamic-object-removal)
+
+    scans = []
+    for frame in drive.sequence.frames("points").tolist():
+        pose = drive.sequence.read_pose(frame)
+        own = transform_points(pose, drive.sequence.read("points", frame)[:, :3].astype(np.float64))
+        scans.append((own * (1, -1, 1), (pose[:3, 3] * (1, -1, 1)).tolist()))
+    kept, _ = clean_map_by_fusion(points.astype(np.float64), scans)
+    return kept.astype(np.float32)
+
+
+ROWS = (
+    MapRow("all points", MotionOptions("none"), lambda drive: WithoutLabels(drive.sequence)),
+    MapRow(
+        "exact labels", MotionOptions("none"), lambda d: without(d, {f: ~own for f, own in dynamic_points(d).items()})
+    ),
+    MapRow("carlasc, flow", MotionOptions("flow")),
+    MapRow("carlasc, exact boxes", MotionOptions("boxes")),
+    MapRow("carlasc, boxes", MotionOptions("boxes"), lambda drive: noisy_boxes(drive, 0)),
+    MapRow("carlasc, nothing", MotionOptions("evidence")),
+    MapRow("carlasc, nothing, no labels", MotionOptions("evidence"), lambda drive: WithoutLabels(drive.sequence)),
+    MapRow("DUFOMap", MotionOptions("none"), lambda d: without(d, find_static(d)), "dufomap"),
+    MapRow(
+        "dynamic-object-removal",
+        MotionOptions("none"),
+        lambda drive: WithoutLabels(drive.sequence),
+        "dynamic_object_removal",
+        by_dynamic_object_removal,
+    ),
+)
+
+
+def measure(row: MapRow, drive: Recorded, dynamic: Keep, folder: Path) -> dict[str, float]:
+    """Make a map, and return its SA, DA and AA."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    start, out = time.perf_counter(), folder / "map.npz"
+    source = ChosenSequences(row.name, {"": row.change(drive)})
+    carlasc.map(source, out, cell_m=CELL_M, motion=row.motion, poses=POSES, overwrite=True, run=Run(workers=1))
+    tree = cKDTree(row.clean(np.load(out)["points"], drive))
+    seconds = time.perf_counter() - start
+    near: dict[bool, list[int]] = {False: [0, 0], True: [0, 0]}
+    for frame, moves in dynamic.items():
+        points = drive.sequence.read("points", frame)[:, :3].astype(np.float64)
+        points = transform_points(drive.sequence.read_pose(frame), points) * (1, -1, 1)
+        found = np.isfinite(tree.query(points, distance_upper_bound=NEAR_M)[0])
+        for kind in (False, True):
+            near[kind][0] += int(found[moves == kind].sum())
+            near[kind][1] += int((moves == kind).sum())
+    static, moved = (found / count for found, count in near.values())
+    return {"SA": static, "DA": 1 - moved, "AA": float(np.sqrt(static * (1 - moved))), "seconds": seconds}
+
+
+def to_markdown(found: dict[str, list[dict[str, Any]]]) -> str:
+    """Return the table: mean and standard deviation over drives, in percent."""
+    lines = ["| map | SA | DA | AA |", "|---|---:|---:|---:|"]
+    for name, drives in found.items():
+        cells = []
+        for key in ("SA", "DA", "AA"):
+            values = 100 * np.array([drive[key] for drive in drives])
+            cells.append(f"{values.mean():.2f} ± {values.std(ddof=1) if len(values) > 1 else 0.0:.2f}")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure all rows, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", nargs="?", type=Path)
+    for kind, seeds in SEEDS.items():
+        parser.add_argument(f"--{kind}", nargs="*", type=int, default=seeds)
+    parser.add_argument("--rows", nargs="+")
+    arguments = parser.parse_args()
+    rows = [row for row in ROWS if (not row.needs or find_spec(row.needs)) and row.name in (arguments.rows or row.name)]
+    found: dict[str, list[dict[str, Any]]] = {row.name: [] for row in rows}
+    with tempfile.TemporaryDirectory() as temporary:
+        work = arguments.work or Path(temporary)
+        for kind in SEEDS:
+            for seed in getattr(arguments, kind):
+                (drive,) = record(kind, seed, [CHANNELS], work)
+                dynamic = dynamic_points(drive)
+                for row in rows:
+                    kept = drive.folder / f"map {row.name}.json"
+                    if not kept.exists():
+                        kept.write_text(json.dumps(measure(row, drive, dynamic, Path(temporary))))
+                    found[row.name].append(json.loads(kept.read_text()))
+                    print(f"{drive.setting.drive}, {row.name}: {found[row.name][-1]}", flush=True)
+    print(to_markdown(found))
+
+
+if __name__ == "__main__":
+    main()

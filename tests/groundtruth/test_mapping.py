@@ -1,0 +1,225 @@
+"""Maps of drives: one point per cell, as a few lines of plain Python say, without what moves; their files, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from carlasc_converters.point_files import read_columns
+from helpers.scenes.passing_car import CAR, SPEED_M_S, scan, sensor_pose, write_sequence
+from numpy.testing import assert_allclose, assert_array_equal
+
+import carlasc
+from carlasc import GridSpec, Run
+from carlasc.core.geometry import relative_to, transform_points
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError, ConflictError, MissingDataError
+from carlasc.groundtruth import Voting
+from carlasc.motion import MotionOptions, PoseOptions
+from carlasc.storage import layout
+
+FRAMES = 14
+ALONE, NONE, FLOW = Run(workers=1), MotionOptions("none"), MotionOptions("flow")
+GIVEN = PoseOptions("file", "never")
+SPEC = GridSpec.published().with_bounds((-12.8, -12.8, -2), (12.8, 12.8, 1.2)).with_resolution(0.4)
+GRID = layout.grid_folder(SPEC)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A car passes while the sensor moves slowly."""
+    folder = write_sequence(tmp_path_factory.mktemp("drive"), frames=FRAMES)
+    voting = Voting(rule="sensor")
+    carlasc.regrid(folder, SPEC, observe=carlasc.FromScans(dynamic="tube"), voting=voting, frames="3", run=ALONE)
+    return folder
+
+
+def make(drive, out, **options):
+    given = {"motion": NONE, "poses": GIVEN, "run": ALONE, "cell_m": 0.1} | options
+    return carlasc.map(drive, out, **given)
+
+
+def world_points(frame):
+    """Return the points of a scan in the frame of the first one, y to the left, their labels, and which are on the car."""
+    pose = sensor_pose(frame)
+    points, labels, moving = scan(frame, pose)
+    pose = relative_to(sensor_pose(0), pose[None])[0]
+    return transform_points(pose, points.astype(np.float32).astype(np.float64)) * (1, -1, 1), labels, moving
+
+
+def plain_map(cell_m, frames):
+    """Return {cell: [points, labels by scan]} by one point after the other."""
+    cells = {}
+    for frame in frames:
+        points, labels, _ = world_points(frame)
+        here = {}
+        for point, label in zip(points, labels.tolist(), strict=True):
+            here.setdefault(tuple(np.floor(point / cell_m).astype(int).tolist()), []).append((point, label))
+        for cell, found in here.items():
+            counts = np.bincount([label for _, label in found])
+            vote = (int(counts.argmax()), counts.max() / len(found))
+            whole, votes = cells.setdefault(cell, ([], []))
+            whole += [point for point, _ in found]
+            votes.append(vote)
+    return cells
+
+
+def test_a_map_is_what_plain_python_makes(drive, tmp_path):
+    frames = range(3, 6)
+    result = make(drive, tmp_path / "map.npz", frames=frames)
+    made, expected = np.load(tmp_path / "map.npz"), plain_map(0.1, frames)
+    cells = np.floor(made["points"].astype(np.float64) / 0.1).astype(int)
+    assert result.points == len(cells) == len(expected) and result.frames == 3
+    order = [expected[tuple(cell)] for cell in cells.tolist()]  # KeyError: a cell without points
+    inside = np.array([np.mean(points, axis=0) for points, _ in order]) / 0.1 - cells
+    assert_allclose(made["points"], 0.1 * (np.clip(inside, 1 / 64, 63 / 64) + cells), atol=1e-4)
+    shares = [np.bincount([label for label, _ in votes], [share for _, share in votes]) for _, votes in order]
+    assert_array_equal(made["label"], [votes.argmax() for votes in shares])
+    assert_array_equal(made["seen"], [len(votes) for _, votes in order])
+    assert_allclose(
+        made["confidence"], [v.max() / (len(votes) + 1) for v, (_, votes) in zip(shares, order, strict=True)], atol=1e-4
+    )
+    assert dict(made["classes"].tolist())[1] == CARLA.names[1]
+
+
+def test_what_moves_leaves_no_trace_and_what_stands_stays(drive, tmp_path):
+    result = make(drive, tmp_path / "map.npz", motion=FLOW, movers=True)
+    points = np.load(tmp_path / "map.npz")["points"]
+    worlds = [world_points(frame) for frame in range(FRAMES)]
+    car = np.concatenate([points[moving] for points, _, moving in worlds])
+    stands = np.concatenate([points[~moving] for points, _, moving in worlds])
+    cells = {tuple(cell) for cell in np.floor(points.astype(np.float64) / 0.1).astype(int).tolist()}
+    trace = [tuple(cell) in cells for cell in np.floor(car / 0.1).astype(int).tolist()]
+    kept = [tuple(cell) in cells for cell in np.floor(stands / 0.1).astype(int).tolist()]
+    assert len(trace) > 1000 and np.mean(trace) < 0.01
+    assert np.mean(kept) > 0.99
+
+    actor, *parts = json.loads((tmp_path / "map_movers" / "actors.json").read_text())
+    assert result.actors == 1 + len(parts) and actor["class"] == "Vehicle" and actor["frames"] == list(range(FRAMES))
+    places = np.array(actor["map_T_actor"]).reshape(-1, 3, 4)[:, :, 3]
+    assert_allclose(np.diff(places[:, 0]), SPEED_M_S * 0.1, atol=0.1)
+    with np.load(tmp_path / "map_movers" / actor["file"]) as body:
+        spread = np.ptp(body["points"], axis=0)
+    assert spread[0] == pytest.approx(CAR[0], abs=0.4) and spread[1] < CAR[1] + 0.3
+    again = np.concatenate(
+        [
+            transform_points(np.vstack([np.reshape(p, (3, 4)), [0, 0, 0, 1]]), np.zeros((1, 3)))
+            for p in actor["map_T_actor"]
+        ]
+    )
+    assert (np.abs(again[:, 1] + 2.6 + CAR[1] / 2) < 0.5).all()  # it passes on the right
+
+
+def test_all_files_of_points_hold_the_same_points(drive, tmp_path):
+    pytest.importorskip("laspy")
+    made = {}
+    for ending in (".npz", ".ply", ".pcd", ".las"):
+        make(drive, tmp_path / f"map{ending}", frames="0:2")
+        made[ending] = read_columns(tmp_path / f"map{ending}") if ending != ".npz" else np.load(tmp_path / "map.npz")
+    expected = made.pop(".npz")
+    for ending, columns in made.items():
+        places = np.stack([columns[axis] for axis in "xyz"], axis=1)
+        assert_allclose(places, expected["points"], atol=1e-4 if ending == ".las" else 0)
+        for name in ("label", "seen", "confidence"):
+            assert_array_equal(columns[name], expected[name])
+    color = CARLA.colors[int(expected["label"][0])]
+    assert tuple(int(made[".ply"][name][0]) for name in ("red", "green", "blue")) == color
+    assert tuple(int(made[".las"][name][0]) // 257 for name in ("red", "green", "blue")) == color
+    assert int(made[".pcd"]["rgb"][0]) & 0xFFFFFF == color[0] << 16 | color[1] << 8 | color[2]
+    assert_array_equal(made[".las"]["classification"], expected["label"])
+
+
+def test_other_programs_read_the_map_and_its_mesh(drive, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    result = make(drive, tmp_path / "map.ply", frames="0:2", mesh=tmp_path / "map.glb")
+    cloud, scene = trimesh.load(tmp_path / "map.ply"), trimesh.load(tmp_path / "map.glb")
+    assert len(cloud.vertices) == result.points and cloud.colors.shape == (result.points, 4)
+    (mesh,) = scene.geometry.values()
+    turned = np.stack([mesh.bounds[:, 0], -mesh.bounds[::-1, 2], mesh.bounds[:, 1]], axis=1)  # in glTF, y is up
+    assert_allclose(turned, cloud.bounds, atol=0.1)
+    assert len(mesh.faces) > 10 * result.points ** (1 / 2) and mesh.volume > 0
+    colors = {tuple(color[:3]) for color in np.unique(mesh.visual.vertex_colors, axis=0).tolist()}
+    assert colors == {tuple(color[:3]) for color in np.unique(cloud.colors, axis=0).tolist()}
+
+
+@pytest.mark.slow
+def test_processes_and_right_handed_data_make_the_same_map(drive, tmp_path):
+    make(drive, tmp_path / "one.npz", motion=FLOW)
+    make(drive, tmp_path / "two.npz", motion=FLOW, run=Run(workers=2))
+    assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
+
+
+def test_a_grid_is_a_map_of_its_voxels(drive, tmp_path):
+    result = make(drive, tmp_path / "grid.npz", grid=GRID, distance=tmp_path / "far.npz")
+    (sequence,) = carlasc.open(drive).sequences().values()
+    grid = sequence.grid(GRID, 3)
+    points = np.load(tmp_path / "grid.npz")
+    assert result.points == np.count_nonzero(grid.labels) and result.actors == 0
+    voxel = SPEC.flat_index(points["points"].astype(np.float64) * (1, -1, 1))
+    assert_array_equal(np.sort(voxel), np.flatnonzero(grid.labels))
+    assert_array_equal(points["label"], grid.labels.reshape(-1)[voxel])
+    assert_array_equal(points["seen"], grid.counts.reshape(-1)[voxel])
+    assert np.load(tmp_path / "far.npz")["distance"].shape == SPEC.size
+
+
+def test_wrong_arguments_are_refused_before_anything_is_written(drive, tmp_path, monkeypatch):
+    out = tmp_path / "map.ply"
+    for message, options in {
+        "out: expected a file that ends in .ply": {"out": tmp_path / "map.xyz"},
+        "mesh: expected a file that ends in .ply, .glb": {"mesh": tmp_path / "mesh.obj"},
+        "out: expected a file to write": {"out": None},
+        "cell_m: expected a positive number of metres, found nan": {"cell_m": float("nan")},
+        "distance: expected the `grid`": {"distance": tmp_path / "far.npz"},
+        "movers: expected a file of points of a drive": {"movers": True, "grid": GRID},
+        "mesh: expected files of different names": {"mesh": out},
+        "part: expected none": {"run": Run(part=carlasc.running.Part(1, 2))},
+    }.items():
+        with pytest.raises(ArgumentError, match=message):
+            make(drive, **({"out": out} | options))
+    with pytest.raises(MissingDataError, match=f"expected the grid other, found {GRID}"):
+        make(drive, out, grid="other")
+    with pytest.raises(MissingDataError, match="expected frames in 99:"):
+        make(drive, out, frames="99:")
+    with pytest.raises(MissingDataError, match="expected points of something static, found none"):
+        monkeypatch.setattr(
+            "carlasc.groundtruth.from_scans.merging.Merger.static",
+            lambda self, frame: np.zeros(len(self.scan_of(frame).points), bool),
+        )
+        make(drive, out, frames="0:2")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_map_without_poses_is_one_line(tmp_path):
+    folder = write_sequence(tmp_path / "drive", frames=3, poses=False)
+    with pytest.raises(MissingDataError, match=r"poses.txt: expected poses, which merging scans needs, found none"):
+        make(folder, tmp_path / "map.ply")
+
+
+def test_several_sequences_have_no_one_frame(tmp_path):
+    write_sequence(tmp_path / "a", frames=2)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "a").rename(tmp_path / "b" / "one")
+    write_sequence(tmp_path / "b" / "two", frames=2)
+    with pytest.raises(ArgumentError, match=r"source: expected one sequence, as a map has one frame, found 2"):
+        make(tmp_path / "b", tmp_path / "map.ply")
+
+
+def test_what_exists_stays_unless_it_is_to_be_replaced(drive, tmp_path):
+    out = tmp_path / "map.npz"
+    make(drive, out, frames="0:1", movers=True)
+    before = out.read_bytes()
+    with pytest.raises(ConflictError, match="expected nothing, found a file: give `overwrite=True`"):
+        make(drive, out, frames="0:2")
+    assert out.read_bytes() == before
+    make(drive, out, frames="0:2", movers=True, overwrite=True)
+    assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == ["map.npz", "map_movers"]
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_an_interrupted_run_leaves_nothing(drive, tmp_path, steps):
+    def progress(done, total):
+        if done >= steps:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make(drive, tmp_path / "map.ply", frames="0:2", run=Run(workers=1, progress=progress))
+    assert list(tmp_path.iterdir()) == []
