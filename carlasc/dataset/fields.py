@@ -26,6 +26,8 @@ FIELDS = (
 """Fields that samples of published data may have."""
 EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
 """Fields of grids that say how certain each voxel is, which published grids do not."""
+CAMERA_FIELDS = ("camera_visible",)
+"""Fields of grids of data with cameras."""
 ALWAYS = ("valid", "sequence", "frame")
 RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
 
@@ -43,6 +45,7 @@ class Sample(TypedDict, total=False):
     occupied: NDArray[np.float32]
     flags: NDArray[np.uint8]
     views: NDArray[np.uint16]
+    camera_visible: NDArray[np.uint8]
     points: NDArray[np.float32]
     point_labels: NDArray[np.unsignedinteger[Any]]
     flow: NDArray[np.float32]

@@ -85,6 +85,7 @@ _PARTS = {  # field of a sample -> fields of the grid
     "occupied": ("occupied",),
     "flags": ("flags",),
     "views": ("views",),
+    "camera_visible": ("seen",),
 }
 OF_GRID = frozenset(_PARTS)
 """The fields of a sample that come from a grid."""
@@ -92,6 +93,7 @@ _PLAIN: dict[str, type[np.generic]] = {
     "occupied": np.float32,
     "flags": np.uint8,
     "views": np.uint16,
+    "camera_visible": np.uint8,
 }  # types in samples
 
 
@@ -140,7 +142,7 @@ class GridFields:
         def where(part: str) -> str:
             return f"{grids.location}: {grid}/{part} of frame {frame}"
 
-        sample: Values = {name: np.array(read(name), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
+        sample: Values = {name: np.array(read(_PARTS[name][0]), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
         if "labels" in self.fields:
             sample["labels"] = label_map(read("labels"), where("labels"))
         if "counts" in self.fields:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import count, describe
-from carlasc.dataset.fields import ALWAYS, EVIDENCE_FIELDS, FIELDS, Sample, Values
+from carlasc.dataset.fields import ALWAYS, CAMERA_FIELDS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.selection import (
     RecentScans,
@@ -68,6 +68,7 @@ class Dataset(_MapStyle):
         occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where nothing is known
         flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
         views         (X, Y, Z) uint16, number of scans that saw the voxel
+        camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees the voxel; see `carlasc.Voting(keep_seen=True)`
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
@@ -382,13 +383,12 @@ class Dataset(_MapStyle):
 
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([fields] if isinstance(fields, str) else fields))
-    unknown = [name for name in names if name not in (*FIELDS, *EVIDENCE_FIELDS, *ALWAYS)]
+    allowed = (*FIELDS, *EVIDENCE_FIELDS, *CAMERA_FIELDS)
+    unknown = [name for name in names if name not in (*allowed, *ALWAYS)]
     if unknown:
-        expected = f"any of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}"
+        expected = f"any of {', '.join(allowed)}"
         raise ArgumentError("fields", expected=expected, found=", ".join(map(repr, unknown)))
     chosen = tuple(name for name in names if name not in ALWAYS)
     if not chosen:
-        raise ArgumentError(
-            "fields", expected=f"at least one of {', '.join((*FIELDS, *EVIDENCE_FIELDS))}", found="none"
-        )
+        raise ArgumentError("fields", expected=f"at least one of {', '.join(allowed)}", found="none")
     return chosen

@@ -180,10 +180,16 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
                 sequence.location,
                 expected=f"the field {field}",
                 found="no frame that has it",
-                advice=_ADVICE_EVIDENCE if field.rpartition("/")[2] in layout.EVIDENCE_FIELDS else _ADVICE,
+                advice=_advice(field.rpartition("/")[2]),
             )
         common = frames if common is None else np.intersect1d(common, frames, assume_unique=True)
     return np.empty(0, np.int64) if common is None else common
+
+
+def _advice(part: str) -> str:
+    if part == "seen":
+        return _ADVICE_EVIDENCE.replace("keep_evidence", "keep_seen")
+    return _ADVICE_EVIDENCE if part in layout.EVIDENCE_FIELDS else _ADVICE
 
 
 def common_value(values: Mapping[str, _T], what: str) -> _T:
