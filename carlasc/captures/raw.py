@@ -3,6 +3,7 @@
 Sensor 0 is the ego sensor. The files in the folder raw/, which `carlasc.captures.writing` writes, are:
 
 velodyne{s}/{f}.npy  labels{s}/  instances{s}/  velocities{s}/  pose{s}/  times{s}.txt  bev/{f}.jpg
+cameras.json  images/{camera}/{f}.jpg, and the other folders of images
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.scans import Scan, check_finite
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.storage import layout
 from carlasc.storage.arrays import ArrayFormat, parse_npy
+from carlasc.storage.camera_files import cameras_from_json
 from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
 from carlasc.storage.transport.trees import LocalTree, Tree
 
@@ -59,6 +63,12 @@ def times_path(sensor: int) -> str:
 def bev_path(frame: int) -> str:
     """Return the path of a frame's bird's-eye picture."""
     return f"{_BEV}/{frame}.jpg"
+
+
+def image_path(field: str, frame: int) -> str:
+    """Return the path of an image of a frame, by the name of its field in the layout."""
+    entry = layout.field_named(field)
+    return f"{entry.folder}/{frame}{entry.suffix}"
 
 
 def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, str]]:
@@ -263,6 +273,34 @@ class Capture:
     def has_bev(self, frame: int) -> bool:
         """Whether a frame has a bird's-eye picture."""
         return self.tree.is_file(self._folder + bev_path(frame))
+
+    @cached_property
+    def cameras(self) -> dict[str, CameraModel]:
+        """The cameras of cameras.json by name; none where it does not exist. They are in the frame of the ego sensor.
+
+        Raises:
+            FormatError: the file is damaged.
+        """
+        path = self._folder + layout.CAMERAS
+        if not self.tree.is_file(path):
+            return {}
+        return cameras_from_json(bytes(self.tree.read(path)), self.tree.where(path), "left")
+
+    def image_fields(self, frame: int) -> tuple[str, ...]:
+        """Return the names in the layout of the images that a frame has, such as `images.front.jpg`."""
+        names = [
+            f"{folder}.{camera}.{suffix}"
+            for camera in self.cameras
+            for folder in layout.IMAGE_FOLDERS
+            for suffix in layout.IMAGE_SUFFIXES
+        ]
+        return tuple(name for name in names if self.tree.is_file(self._folder + image_path(name, frame)))
+
+    def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
+        """Return the bytes of the files of a frame's images, by their names in the layout."""
+        names = self.image_fields(frame)
+        files = self.tree.read_many([self._folder + image_path(name, frame) for name in names])
+        return {name: np.frombuffer(data, np.uint8) for name, data in zip(names, files, strict=True)}
 
     def light(self) -> Capture:
         """Return a copy without the listings that this one has read, to be sent to other processes with every frame."""

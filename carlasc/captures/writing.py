@@ -11,7 +11,17 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.raw import FOLDERS, FORMATS, RAW, SensorRecording, array_path, bev_path, parse_times, times_path
+from carlasc.captures.raw import (
+    FOLDERS,
+    FORMATS,
+    RAW,
+    SensorRecording,
+    array_path,
+    bev_path,
+    image_path,
+    parse_times,
+    times_path,
+)
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
@@ -85,15 +95,17 @@ class CaptureWriter:
         """Whether all of a sensor's files of a frame exist. An existing file is whole unless a power failure left it empty."""
         return all(self._has(array_path(name, sensor, frame)) for name in FOLDERS)
 
-    def has_frame(self, frame: int, sensors: int, bev: bool) -> bool:
+    def has_frame(self, frame: int, sensors: int, bev: bool, images: Sequence[str] = ()) -> bool:
         """Whether all files of a frame exist.
 
         Args:
             frame: number of the frame.
             sensors: number of sensors whose files are looked for.
             bev: whether the bird's-eye picture is looked for too.
+            images: fields of images that are looked for.
         """
         complete = all(self.has(sensor, frame) for sensor in range(sensors))
+        complete = complete and all(self._has(image_path(field, frame)) for field in images)
         return complete and (not bev or self._has(bev_path(frame)))
 
     def _has(self, path: str) -> bool:
@@ -175,6 +187,10 @@ class CaptureWriter:
     def write_bev(self, frame: int, jpeg: bytes) -> None:
         """Write a frame's bird's-eye picture, given as JPEG bytes."""
         self.target.put(bev_path(frame), jpeg)
+
+    def write_images(self, frame: int, images: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Write the images of a frame, given as the bytes of their files by field."""
+        self.target.put_many({image_path(field, frame): data.data for field, data in images.items()})
 
     def __repr__(self) -> str:
         return f"<CaptureWriter {self.location}>"

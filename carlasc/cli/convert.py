@@ -21,7 +21,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
-from carlasc.core.choices import Axes, FlowSource, SplitName
+from carlasc.core.choices import Axes, FlowSource, Images, SplitName
 from carlasc.core.wording import count
 from carlasc.errors import ArgumentError
 
@@ -52,10 +52,16 @@ class LayoutFlags(Flags):
     allow_unknown: Annotated[bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")] = (
         False
     )
+    images: Annotated[
+        Images,
+        typer.Option(
+            help="Images of cameras. copy: beside the scans. link: only where they lie. none: left out. Calibrations are always written."
+        ),
+    ] = "none"
 
     def options(self) -> carlasc.converting.LayoutOptions:
         """Return how sequences are written."""
-        return carlasc.converting.LayoutOptions(self.classes, self.axes, self.flow, self.allow_unknown)
+        return carlasc.converting.LayoutOptions(self.classes, self.axes, self.flow, self.allow_unknown, self.images)
 
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:

@@ -156,11 +156,20 @@ class VoteFlags(Flags):
             help="Voxels that are neither free nor occupied with at least this probability become unknown (for scans only)."
         ),
     ] = 0.0
+    keep_seen: Annotated[
+        bool, typer.Option("--keep-seen", help="Also write which cameras see each voxel (for data with cameras only).")
+    ] = False
 
     def voting(self) -> carlasc.Voting:
         """Return how votes are counted."""
         return carlasc.Voting(
-            self.rule, self.free_step_m, self.keep, self.keep_evidence, self.min_confidence, self.keep_actors
+            self.rule,
+            self.free_step_m,
+            self.keep,
+            self.keep_evidence,
+            self.min_confidence,
+            self.keep_actors,
+            self.keep_seen,
         )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.errors import ArgumentError, FormatError, check_choice
 from carlasc.storage.metadata import Axes
@@ -30,18 +31,22 @@ class LayoutOptions:
         flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
             the actor's points, if they are numbered; "none" writes no flow.
         allow_unknown: treat class ids that the table does not have as unlabelled.
+        images: what becomes of the images of cameras: "copy" writes them beside the scans, "link" writes where they lie, "none" leaves them
+            out. The calibration of the cameras is written in any case.
 
     Raises:
-        ArgumentError: unknown axes, or an unknown source of flow.
+        ArgumentError: unknown axes, an unknown source of flow, or something else about images.
     """
 
     classes: str = "auto"
     axes: Axes = "left"
     flow: FlowSource = "auto"
     allow_unknown: bool = False
+    images: Images = "none"
 
     def __post_init__(self) -> None:
         check_choice("axes", self.axes, Axes)
+        check_choice("images", self.images, Images)
         check_choice("flow", self.flow, FlowSource)
 
     def of(self, converter: Converter) -> AxesAndClasses:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform, check_rigid, slerp
@@ -235,6 +236,17 @@ class Recording(ABC):
             FormatError: a file does not hold what it must.
         """
         return None
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the cameras; none if the recording has none, or their calibration does not exist.
+
+        Their `sensor_T_camera` leads to the frame of the vehicle. `times` are by the clock of `times()`, a row per frame number, and `images`
+        are paths.
+
+        Raises:
+            FormatError: a file does not hold what it must.
+        """
+        return ()
 
     def problems(self) -> list[tuple[int, str]]:
         """Return (frame number, message in one line) of frames that should exist and do not."""

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from carlasc.converting.camera_stage import write_cameras
 from carlasc.converting.layout_options import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
 from carlasc.converting.protocol import Converter, Recording
@@ -112,6 +113,7 @@ def convert(
             for conversion in conversions:
                 writers.enter_context(conversion.plan.writer)
                 conversion.run(metadata)
+                conversion.notes += write_cameras(conversion.plan, target, layout.images)
         if sink is not out:
             sink.finish(incomplete=True)  # what is missing could not be read, and is reported
         made = None

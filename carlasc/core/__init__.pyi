@@ -13,6 +13,7 @@ from .benchmarks import TO_OCC3D as TO_OCC3D
 from .benchmarks import TO_SSCBENCH as TO_SSCBENCH
 from .boxes import BOXES_DTYPE as BOXES_DTYPE
 from .boxes import Boxes as Boxes
+from .cameras import CameraModel as CameraModel
 from .classes import ClassTable as ClassTable
 from .classes import Color as Color
 from .classes import Remap as Remap

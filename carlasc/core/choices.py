@@ -32,6 +32,9 @@ FlowSource = Literal["auto", "none"]
 Voxels = Literal["known", "all"]
 """Which voxels are scored."""
 
+Images = Literal["none", "link", "copy"]
+"""What a conversion does with the images of cameras."""
+
 ViewName = Literal["perspective", "bev", "both"]
 """Where the pictures of a scene are taken from."""
 

@@ -28,6 +28,8 @@ EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
 """Fields of grids that say how certain each voxel is, which published grids do not."""
 ACTOR_FIELDS = ("instances", "voxel_flow")
 """Fields of grids that say who is in each voxel, and how fast it moves."""
+CAMERA_FIELDS = ("camera_visible",)
+"""Fields of grids of data with cameras."""
 ALWAYS = ("valid", "sequence", "frame")
 RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
 
@@ -47,6 +49,7 @@ class Sample(TypedDict, total=False):
     views: NDArray[np.uint16]
     instances: NDArray[np.int64]
     voxel_flow: NDArray[np.float32]
+    camera_visible: NDArray[np.uint8]
     points: NDArray[np.float32]
     point_labels: NDArray[np.unsignedinteger[Any]]
     flow: NDArray[np.float32]

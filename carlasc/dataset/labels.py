@@ -88,6 +88,7 @@ _PARTS = {  # field of a sample -> fields of the grid
     "views": ("views",),
     "instances": ("instance",),
     "voxel_flow": ("velocity",),
+    "camera_visible": ("seen",),
 }
 OF_GRID = frozenset(_PARTS)
 """The fields of a sample that come from a grid."""
@@ -96,6 +97,7 @@ _PLAIN: dict[str, type[np.generic]] = {
     "flags": np.uint8,
     "views": np.uint16,
     "instances": np.int64,
+    "camera_visible": np.uint8,
 }  # types in samples
 
 

@@ -21,7 +21,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.wording import count
-from carlasc.dataset.fields import ACTOR_FIELDS, ALWAYS, EVIDENCE_FIELDS, FIELDS, Sample, Values
+from carlasc.dataset.fields import ACTOR_FIELDS, ALWAYS, CAMERA_FIELDS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.selection import (
     RecentScans,
@@ -71,6 +71,7 @@ class Dataset(_MapStyle):
         views         (X, Y, Z) uint16, number of scans that saw the voxel
         instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none; the same in all frames of a sequence
         voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of what is in the voxel, sensor frame; zero where nothing moves
+        camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees the voxel; see `carlasc.Voting(keep_seen=True)`
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
@@ -385,7 +386,7 @@ class Dataset(_MapStyle):
 
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([fields] if isinstance(fields, str) else fields))
-    known = (*FIELDS, *EVIDENCE_FIELDS, *ACTOR_FIELDS)
+    known = (*FIELDS, *EVIDENCE_FIELDS, *ACTOR_FIELDS, *CAMERA_FIELDS)
     unknown = [name for name in names if name not in (*known, *ALWAYS)]
     if unknown:
         expected = f"any of {', '.join(known)}"

@@ -188,7 +188,7 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
 
 def _advice(part: str) -> str:
     """Return what to do if a field, or part of a grid, does not exist."""
-    kept = {"evidence": layout.EVIDENCE_FIELDS, "actors": layout.ACTOR_FIELDS}
+    kept = {"evidence": layout.EVIDENCE_FIELDS, "actors": layout.ACTOR_FIELDS, "seen": ("seen",)}
     return next((_ADVICE_KEEP.format(name) for name, parts in kept.items() if part in parts), _ADVICE)
 
 

@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError
 _DIRECTIONS = ("x", "y")
 _TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, which is off by 9e-8
 _FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "visibility": 1, "posterior": 1} | dict.fromkeys(
-    ("labels", "known", "counts", "occupied", "flags", "views", "instances", "voxel_flow"), 0
+    ("labels", "known", "counts", "occupied", "flags", "views", "instances", "voxel_flow", "camera_visible"), 0
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,12 @@ from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, Sequence
 from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.groundtruth.voxel_actors import ActorPoints
 from carlasc.storage import layout
+from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Source
+
+if TYPE_CHECKING:
+    from carlasc.groundtruth.seen import Views
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,14 @@ class CaptureFrame(FrameInput):
     source_frame: int
 
     def fields(self) -> tuple[str, ...]:
-        """Return points, labels, flow and instances, and bev if the frame has a picture."""
+        """Return points, labels, flow and instances, and the pictures that the frame has."""
         always = ("points", "labels", "flow", "instances")
-        return (*always, "bev") if self.capture.has_bev(self.source_frame) else always
+        bev = ("bev",) if self.capture.has_bev(self.source_frame) else ()
+        return (*always, *bev, *(self.capture.image_fields(self.source_frame) if self.capture.cameras else ()))
+
+    def views(self) -> Views:
+        """Return the cameras of the capture: their images are taken at the instant of the frame."""
+        return [(camera, camera.sensor_T_camera) for camera in self.capture.cameras.values()]
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the ego sensor's recording, which is the scan, and count the votes of all sensors.
@@ -50,6 +59,8 @@ class CaptureFrame(FrameInput):
         picture = self.capture.read_bev(self.source_frame)
         if picture is not None:
             fields["bev"] = np.frombuffer(picture, np.uint8)
+        if self.capture.cameras:
+            fields |= self.capture.read_images(self.source_frame)
         step = plan.voting.free_step_m
         who = ActorPoints(plan.spec) if plan.voting.keep_actors else None
         seen = self._observations(ego, who)
@@ -104,6 +115,10 @@ class CaptureSequence(SequenceInput):
         """Return (f - first) * 0.1 for each frame f: see the format page, `docs/format.md#votes`."""
         numbers = np.array([frame.source_frame for frame in self.frames])
         return (numbers - numbers[0]) * layout.FRAME_PERIOD_S
+
+    def cameras(self) -> bytes | None:
+        """Return cameras.json; None if the capture has no cameras."""
+        return cameras_to_json(self.capture.cameras.values()) if self.capture.cameras else None
 
     def record(self) -> dict[str, Any]:
         """Return the frames and the number of sensors.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,11 +20,15 @@ from carlasc.groundtruth.inputs import (
     StoredSequence,
     choose_frames,
     scan_fields,
+    stored_views,
     without_caches,
 )
 from carlasc.groundtruth.options import FromGrid
 from carlasc.storage import as_source
 from carlasc.storage.protocol import Sequence, Source
+
+if TYPE_CHECKING:
+    from carlasc.groundtruth.seen import Views
 
 
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
@@ -97,6 +101,10 @@ class ResampledFrame(FrameInput):
     def fields(self) -> tuple[str, ...]:
         """Return the names of the scan fields that the frame has."""
         return scan_fields(self.sequence, self.number)
+
+    def views(self) -> Views:
+        """Return the cameras of the sequence, and where they were."""
+        return stored_views(self.sequence, self.number)
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the frame and resample its grid."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,13 @@ from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
+from carlasc.storage.camera_files import cameras_of, scan_T_camera
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence
 from carlasc.storage.sinks import SequenceWriter
+
+if TYPE_CHECKING:
+    from carlasc.groundtruth.seen import Views
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,8 @@ class GridPlan:
         votes = ("votes",) if self.voting.keep else ()
         evidence = layout.EVIDENCE_FIELDS if self.voting.keep_evidence else ()
         actors = layout.ACTOR_FIELDS if self.voting.keep_actors else ()
-        return tuple(f"{self.grid}/{part}" for part in ("labels", "counts", *votes, *evidence, *actors))
+        seen = ("seen",) if self.voting.keep_seen else ()
+        return tuple(f"{self.grid}/{part}" for part in ("labels", "counts", *votes, *evidence, *actors, *seen))
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,10 @@ class FrameInput(ABC):
             FormatError: the content of a file is not valid.
         """
 
+    def views(self) -> Views:
+        """Return the cameras of the sequence, each with where it was when it took its image of the frame."""
+        return ()
+
     def thinned(self, plan: GridPlan) -> Grid | None:
         """Return the grid without a tenth of the scans of other frames; None if it is not made from scans of other frames."""
         return None
@@ -194,6 +203,10 @@ class SequenceInput(ABC):
     @abstractmethod
     def times(self) -> NDArray[np.float64] | None:
         """Return (F,) seconds since the first frame by output frame; None if there are no times."""
+
+    def cameras(self) -> bytes | None:
+        """Return the content of cameras.json; None if the sequence has no cameras."""
+        return None
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
@@ -268,6 +281,11 @@ class StoredSequence(SequenceInput):
         """Return the sequence's times, one per line of times.txt; None if it has none."""
         return self.sequence.times if layout.TIMES in self.sequence.documents() else None
 
+    def cameras(self) -> bytes | None:
+        """Return the sequence's cameras.json; None if it has none."""
+        has_cameras = layout.CAMERAS in self.sequence.documents()
+        return self.sequence.read_document(layout.CAMERAS) if has_cameras else None
+
 
 def choose_frames(frames: FrameRange, available: NDArray[np.int64], where: str) -> list[int]:
     """Return the available frame numbers that are in a range.
@@ -287,6 +305,11 @@ def scan_fields(sequence: Sequence, frame: int) -> tuple[str, ...]:
     """Return the names of the scan fields that a frame has."""
     present = sequence.fields()
     return tuple(name for name in layout.SCAN_FIELDS if name in present and frame in sequence.frames(name))
+
+
+def stored_views(sequence: Sequence, frame: int) -> Views:
+    """Return the cameras of a sequence of the layout, each with where it was when it took its image of a frame."""
+    return [(camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()]
 
 
 def parent_path(sequence: Sequence) -> str:

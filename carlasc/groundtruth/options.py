@@ -110,6 +110,7 @@ class Voting:
             for grids from a finer grid; of scans with `dynamic="align"` only.
         min_confidence: voxels that are neither free nor occupied with at least this probability become unknown; 0 to 0.5 keeps all.
             For scans with the rule "ray" only.
+        keep_seen: also write which cameras see each voxel: the field `seen` of the grid. For Cartesian grids and up to eight cameras.
 
     Raises:
         ArgumentError: an unknown rule, a distance that is not positive, or a confidence outside of 0 <= c < 1.
@@ -121,6 +122,7 @@ class Voting:
     keep_evidence: bool = False
     min_confidence: float = 0.0
     keep_actors: bool = False
+    keep_seen: bool = False
 
     def __post_init__(self) -> None:
         check_rule(self.rule or "sensor", self.free_step_m)

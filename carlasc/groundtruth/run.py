@@ -17,6 +17,7 @@ from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
 from carlasc.groundtruth.inputs import GridPlan, SequenceInput
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
+from carlasc.groundtruth.seen import check_views
 from carlasc.groundtruth.work import FrameFailure, SequenceJob, Work
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run
@@ -205,6 +206,9 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
     how |= {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
     made_from = inputs.record()
     record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
+    cameras = inputs.cameras()
+    if plan.voting.keep_seen:
+        check_views(plan.spec, inputs.frames[0].views(), inputs.location)
     record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
     settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
     params = parse_json(to_json(settings), plan.grid)  # as it is read again
@@ -214,6 +218,7 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
         layout.METADATA: agree_metadata(writer, inputs.metadata),
         layout.POSES: None if (poses := inputs.poses()) is None else agree_poses(writer, poses),
         layout.TIMES: None if (times := inputs.times()) is None else agree_times(writer, times),
+        layout.CAMERAS: None if cameras == writer.read_document(layout.CAMERAS) else cameras,
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}

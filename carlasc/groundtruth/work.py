@@ -23,6 +23,7 @@ from carlasc.errors import CarlascError, ConflictError, FormatError, MissingData
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, RunProgress, SequenceInput
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
 from carlasc.groundtruth.reporting.report import Report
+from carlasc.groundtruth.seen import see_voxels
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -84,6 +85,8 @@ class MakeFrame(FrameTask):
         try:
             thinned = self.frame.thinned(plan) if self.sampled else None  # first, while there are no outputs to keep
             outputs, grid = _outputs_of(self.frame.make(plan), plan, number)
+            if plan.voting.keep_seen:
+                outputs[f"{plan.grid}/seen"] = see_voxels(grid.labels > 0, plan.spec, self.frame.views())
             changes = None if thinned is None else Changes.between(grid, thinned)
             facts = FrameFacts.of(number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals())
         except MemoryError as error:

@@ -321,7 +321,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 name="occ3d-camera",
                 title="Occ3D-nuScenes, voxels that a camera observed",
                 seen_by="camera",
-                notes="Data without cameras do not say which voxels a camera observed, so this score does not exist for them.",
+                notes="Grids without the field `seen` do not say which voxels a camera observed, so this score does not exist for them.",
             ),
             Convention(
                 "openoccupancy",

@@ -77,11 +77,11 @@ class SequenceGrid(GridFrames):
         return self.sequence.read(f"{self.grid}/labels", frame)
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X, Y, Z) which voxels have votes; None for a grid without counts, and for cameras, which these data do not have."""
-        if seen_by == "camera":
+        """Return (X, Y, Z) which voxels have votes, and with cameras which of them any camera sees; None for a grid that does not say it."""
+        fields = [f"{self.grid}/counts"] + ([f"{self.grid}/seen"] if seen_by == "camera" else [])
+        if not set(fields) <= self.sequence.fields():
             return None
-        field = f"{self.grid}/counts"
-        return self.sequence.read(field, frame) > 0 if field in self.sequence.fields() else None
+        return np.logical_and.reduce([self.sequence.read(field, frame) > 0 for field in fields])
 
 
 class LabelFolder(GridFrames):

@@ -1,3 +1,6 @@
+from .camera_files import cameras_of as cameras_of
+from .camera_files import read_image as read_image
+from .camera_files import scan_T_camera as scan_T_camera
 from .downloading import download as download
 from .folder import FolderSink as FolderSink
 from .folder import FolderSource as FolderSource

@@ -27,6 +27,7 @@ EVALUATION = "evaluation"  # the folder of the published grid
 POSES = "poses.txt"
 TIMES = "times.txt"
 METADATA = "carlasc.json"
+CAMERAS = "cameras.json"
 PARAMS = "params.json"
 REPORT = "carlasc-report.json"
 DERIVED = ".carlasc"  # the folder of what is derived of a sequence: no field, never packed, safe to delete
@@ -143,8 +144,21 @@ _GRID_FIELDS: dict[str, Field] = {
             meaning="velocity of each voxel that moves: voxel (flat index), velocity; sensor frame, ego motion removed",
             published=False,
         ),
+        Field(
+            name="seen", folder="", suffix=".seen", per="voxel", kind="flags",
+            dtype="u1", names=("seen",), unit="bits",
+            meaning="which cameras see the voxel: bit i for camera i of cameras.json", published=False,
+        ),
     )
 }  # fmt: skip
+IMAGE_FOLDERS = {
+    "images": "image of a camera, as its JPEG or PNG bytes",
+    "image_labels": "class of each pixel of a camera's image, as the bytes of an 8-bit or 16-bit PNG",
+    "image_instances": "actor of each pixel, 0 none, as the bytes of a 16-bit PNG",
+    "image_depths": "depth of each pixel along the camera's axis in 1/256 m, 0 none, as the bytes of a 16-bit PNG",
+}
+"""Folders with one folder per camera, and what is in them; the field of images/front/000000.jpg is `images.front.jpg`."""
+IMAGE_SUFFIXES = ("jpg", "png")
 GRID_FIELDS = tuple(_GRID_FIELDS)
 ACTOR_FIELDS = ("instance", "velocity")  # what `carlasc regrid --keep-actors` adds to a grid
 EVIDENCE_FIELDS = ("occupied", "classes", "flags", "views")  # what `carlasc regrid --keep-evidence` adds to a grid
@@ -175,6 +189,13 @@ def field_named(name: str) -> Field:
     grid, _, part = name.rpartition("/")
     if grid and part in _GRID_FIELDS:
         return replace(_GRID_FIELDS[part], name=name, folder=grid)
+    folder, _, rest = name.partition(".")
+    camera, _, suffix = rest.rpartition(".")
+    if folder in IMAGE_FOLDERS and camera and suffix in IMAGE_SUFFIXES and "/" not in name:
+        return Field(
+            name=name, folder=f"{folder}/{camera}", suffix=f".{suffix}", per="scan", kind="picture",
+            dtype="u1", names=(suffix,), unit="bytes", meaning=IMAGE_FOLDERS[folder], published=False,
+        )  # fmt: skip
     raise FormatError(
         f"field {name!r}",
         expected=f"one of {', '.join(SCAN_FIELDS)}, or <grid>/ and one of {', '.join(_GRID_FIELDS)}",

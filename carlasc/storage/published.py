@@ -73,7 +73,11 @@ class PublishedSequence(Sequence):
         """The fields whose folders exist: lists the sequence's folder, and asks for one file in each grid's."""
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
         fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
-        for grid in sorted(folders - layout.scan_folders()):
+        for folder in sorted(folders & layout.IMAGE_FOLDERS.keys()):
+            cameras = [name for name, below in self.tree.entries(self._prefix + folder).items() if below]
+            names = [f"{folder}.{camera}.{suffix}" for camera in cameras for suffix in layout.IMAGE_SUFFIXES]
+            fields |= {name: layout.field_named(name) for name in names}
+        for grid in sorted(folders - layout.scan_folders() - layout.IMAGE_FOLDERS.keys()):
             if self.tree.is_file(self._prefix + layout.params_file(grid)):
                 fields |= {f"{grid}/{part}": layout.field_named(f"{grid}/{part}") for part in layout.GRID_FIELDS}
         return fields
@@ -139,7 +143,7 @@ class PublishedSequence(Sequence):
 
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""
-        texts = (layout.POSES, layout.TIMES, layout.METADATA)
+        texts = (layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS)
         names = [name for name in texts if self.tree.is_file(self._prefix + name)]
         grids = sorted({field.folder for name, field in self._listing.items() if "/" in name})
         reports = [
@@ -154,14 +158,15 @@ class PublishedSequence(Sequence):
     def unknown_files(self) -> tuple[str, ...]:
         """Return the files and folders of the sequence that the layout does not know; names of folders end in "/"."""
         known = {field.folder for field in self._listing.values()}
-        texts = {layout.POSES, layout.TIMES, layout.METADATA}
+        texts = {layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS}
+        known |= {folder.partition("/")[0] for folder in known}
         entries = self.tree.entries(self.path)
         unknown = [
             f"{name}/" if is_folder else name
             for name, is_folder in entries.items()
             if name not in known | texts | {layout.DERIVED}
         ]
-        for folder in sorted(known):
+        for folder in sorted(known - layout.IMAGE_FOLDERS.keys()):
             suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}
             for name in self.tree.entries(self._prefix + folder):
                 frames = [number for suffix in suffixes if (number := layout.frame_of(name, suffix)) is not None]

@@ -122,6 +122,11 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
         if frame != 2:  # a frame that was not annotated; the first one has no objects
             whole.write("boxes", frame, boxes(rng, frame).to_table())
         whole.write("bev", frame, rng.integers(0, 256, 300 + frame).astype(np.uint8))
+    whole.write_document("cameras.json", b'{"format": 1,  "cameras": []}\n')
+    for frame in FRAMES[1:]:  # each camera has images of one kind
+        for number, field in enumerate(("images.front.jpg", "images.left-1.png", "image_depths.front.png")):
+            whole.write(field, frame, rng.integers(0, 256, 200 + 10 * frame + number).astype(np.uint8))
+        whole.write("evaluation_8x4x3/seen", frame, rng.integers(0, 256, SECOND).astype(np.uint8))
     scans = sink.sequence(SCANS)
     for frame in range(3):
         some = scan(rng, 50 + frame)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
 from carlasc.errors import FormatError, MissingDataError
@@ -25,6 +26,8 @@ _SENSORS = ("up_lidar", "down_lidar")  # lasers 0 to 31, and 32 to 63
 _LASERS = 32
 _AXLE_HEIGHT_M = 0.33  # the origin of the vehicle's frame is the rear axle: measured on the ground points of two logs
 _ASSUMED_M = (1.35, 0.0, 1.58)  # midway between the two LiDARs, which are 0.11 m apart, as calibrated in log 7fab2350
+_INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
+_NEAR_NS = 100_000_000  # an image farther from its frame belongs to another one
 _QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 
@@ -157,6 +160,53 @@ class Argoverse2Log(Recording):
         """Return seconds after the first frame. Nanoseconds are subtracted as integers, because float64 would round them to 64 ns."""
         start = self._timeline[0] if len(self._timeline) else 0
         return (timestamps.astype(np.int64) - start) * 1e-9
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the ring and stereo cameras, with the images nearest in time to each frame; none without their calibration."""
+        path = self.folder / "calibration" / "intrinsics.feather"
+        if not path.is_file() or not self._calibration.is_file():
+            return ()
+        table = read_columns(path, _INTRINSICS, ("sensor_name",))
+        places = read_columns(self._calibration, (*_QUATERNION, *_TRANSLATION), ("sensor_name",))
+        poses = poses_of(_stack(places, _QUATERNION), _stack(places, _TRANSLATION), str(self._calibration))
+        by_name = dict(zip(places["sensor_name"].tolist(), poses, strict=True))
+        found = []
+        for row, name in enumerate(table["sensor_name"].tolist()):
+            if name not in by_name:
+                expected = f"a row for each of {', '.join(table['sensor_name'].tolist())}"
+                raise FormatError(self._calibration, expected=expected, found=f"no {name}")
+            fx, fy, cx, cy, k1, k2, k3, width, height = (float(table[key][row]) for key in _INTRINSICS)
+            times, images = self._images_of(name)
+            found.append(
+                CameraModel(
+                    name=name,
+                    width=int(width),
+                    height=int(height),
+                    model="radial-tangential",
+                    matrix=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+                    distortion=(k1, k2, 0.0, 0.0, k3),
+                    sensor_T_camera=by_name[name],
+                    times=times,
+                    images=images,
+                )
+            )
+        return found
+
+    def _images_of(self, name: str) -> tuple[NDArray[np.float64] | None, tuple[str, ...] | None]:
+        """Return the time and the path of the image nearest to each frame; None if the camera has no images."""
+        folder = self.folder / "sensors" / "cameras" / name
+        paths = {int(path.stem): path for path in folder.glob("*.jpg") if path.stem.isascii() and path.stem.isdigit()}
+        if not paths:
+            return None, None
+        stamps = np.array(sorted(paths), np.int64)
+        after = np.searchsorted(stamps, self._timeline).clip(1, max(1, len(stamps) - 1))
+        after = np.minimum(after, len(stamps) - 1)
+        before = np.maximum(after - 1, 0)
+        is_after = np.abs(stamps[after] - self._timeline) < np.abs(self._timeline - stamps[before])
+        nearest = np.where(is_after, stamps[after], stamps[before])
+        near = np.abs(nearest - self._timeline) < _NEAR_NS
+        images = [str(paths[at].absolute()) if ok else "" for at, ok in zip(nearest.tolist(), near, strict=True)]
+        return np.where(near, self._seconds(nearest), np.nan), tuple(images)
 
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of the annotated sweeps. Tracks are numbered by the order of their UUIDs."""

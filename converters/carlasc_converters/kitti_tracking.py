@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW, BoxRows, class_of
+from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
     Calibration,
@@ -125,6 +127,18 @@ class TrackingSequence(Recording):
         """Return times at the mean rate of KITTI's raw data: the benchmark has none."""
         return np.arange(self._numbers[-1] + 1, dtype=np.float64) * PERIOD_S
 
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the rectified cameras of calib/; none without that file."""
+        if not self._file("calib").is_file():
+            return ()
+        calibration = self._calibration("P0 to P3, R0_rect and Tr_velo_to_cam")
+
+        def image_of(name: str, frame: int) -> Path:
+            return self.folder / name / self.number / f"{frame:06d}.png"
+
+        projections = {f"image_0{number}": f"P{number}" for number in range(4)}
+        return rectified_cameras(calibration, _camera_T_lidar(calibration), projections, image_of, self._numbers)
+
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of label_02/ in the frame of the LiDAR; tracks count from 1, so that they are those of the file plus 1.
 
@@ -137,10 +151,7 @@ class TrackingSequence(Recording):
         calibration = self._calibration(
             "R0_rect and Tr_velo_to_cam, which take LiDAR points to the camera of the boxes"
         )
-        camera_T_lidar = calibration.rotation("R0_rect", "R_rect") @ calibration.transform(
-            "Tr_velo_to_cam", "Tr_velo_cam"
-        )
-        lidar_T_camera = invert(camera_T_lidar)
+        lidar_T_camera = invert(_camera_T_lidar(calibration))
         rows = BoxRows(str(path), self._numbers)
         for line, row in enumerate(map(str.split, filter(None, read_lines(path, "boxes", "a line per box"))), 1):
             where = f"{path}: line {line}"
@@ -183,6 +194,12 @@ class TrackingFrame(FrameHandle):
         """Read the points, and find their times from their azimuths."""
         points = read_scan(self.location)
         return [Cloud(points, seconds=sweep_seconds(points, PERIOD_S))]
+
+
+def _camera_T_lidar(calibration: Calibration) -> Transform:
+    """Return the (4, 4) transform from the LiDAR to the rectified frame of the first camera."""
+    to_camera = calibration.transform("Tr_velo_to_cam", "Tr_velo_cam")
+    return calibration.rotation("R0_rect", "R_rect") @ to_camera
 
 
 def _camera_T_box(center: NDArray[np.float64], turn_rad: float) -> Transform:

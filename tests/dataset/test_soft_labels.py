@@ -71,6 +71,19 @@ def test_soft_labels_are_those_of_the_definition_in_the_classes_of_the_samples(w
     assert not sample["posterior"][:, ~sample["known"]].any() and not sample["known"].all()
 
 
+def test_samples_say_which_cameras_see_each_voxel(tmp_path):
+    folder = write_drive(tmp_path / "A/cartesian", range(2), spec=SPEC)
+    with pytest.raises(MissingDataError, match=r"field evaluation/seen.*keep_seen=True"):
+        Dataset(tmp_path, fields=("camera_visible",))
+    writer, bits = FolderSink(folder.parent).sequence("cartesian"), np.arange(SPEC.num_voxels).reshape(SPEC.size)
+    writer.write("evaluation/seen", 1, bits.astype(np.uint8))
+    dataset = Dataset(tmp_path, fields=("labels", "camera_visible"))
+    (sample,) = dataset
+    assert sample["frame"] == 1 and sample["camera_visible"].dtype == np.uint8
+    assert np.array_equal(sample["camera_visible"], bits)
+    assert np.array_equal(flip(sample, "x", SPEC)["camera_visible"], bits[::-1])
+
+
 def test_certain_voxels_have_soft_labels_that_are_exactly_their_labels(tmp_path):
     folder = write_drive(tmp_path / "A/cartesian", [0], spec=SPEC)
     writer = FolderSink(folder.parent).sequence("cartesian")

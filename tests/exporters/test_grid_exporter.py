@@ -75,6 +75,26 @@ def test_occ3d_says_that_the_mask_of_cameras_is_a_copy(occ3d):
     assert sum(annotations["carlasc"] in note for note in occ3d[1].notes) == 1
 
 
+def test_occ3d_masks_what_no_camera_sees(tmp_path):
+    write_scene(tmp_path / "in", frames=1)
+    (place,) = (tmp_path / "in").glob("**/small/000000.label")
+    counts = np.fromfile(place.with_suffix(".bin"), np.float32)
+    bits = np.where(np.arange(len(counts)) < len(counts) // 2, 5, 0)  # two cameras see all voxels of one half along x
+    place.with_suffix(".seen").write_bytes(bits.astype(np.uint8).tobytes())
+    result = export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    annotations, arrays = read_occ3d(tmp_path / "out", NAME)
+    (array,) = arrays.values()
+    assert annotations["carlasc"] == "mask_camera is 1 where a camera sees a known voxel"
+    assert not any("mask_camera" in note for note in result.notes)
+    lidar, camera = array["mask_lidar"].astype(bool), array["mask_camera"].astype(bool)
+    assert set(np.unique(array["mask_camera"])) == {0, 1} and not (camera & ~lidar).any()
+    params = json.loads(place.with_name("params.json").read_text())
+    middle = (params["min_bound"][0] + params["max_bound"][0]) / 2
+    x = -40 + 0.4 * (np.arange(200) + 0.5)
+    near, far = x < middle - 0.5, x > middle + 0.5
+    assert lidar[near].any() and np.array_equal(camera[near], lidar[near]) and not camera[far].any()
+
+
 @pytest.mark.parametrize("name", GRID_FORMATS)
 def test_structure_without_a_class_of_its_own_is_said_to_become_something(tmp_path, name):
     write_scene(tmp_path / "in", frames=1)

@@ -218,6 +218,20 @@ def test_every_convention_scores_the_same_frames_or_says_why_not(folders, world)
     assert len({round(r.miou, 6) for r in found.values() if not np.isnan(r.miou)}) > 3
 
 
+def test_voxels_that_no_camera_sees_do_not_count_for_cameras(folders):
+    truth = folders[1]
+    rng, seen = np.random.default_rng(0), 0
+    for path in sorted(truth.rglob("*/evaluation/*.label")):
+        bits = rng.integers(0, 3, SHAPE).astype(np.uint8)
+        path.with_suffix(".seen").write_bytes(bits.tobytes())
+        counts = np.fromfile(path.with_suffix(".bin"), np.float32)
+        seen += int(((counts > 0) & (bits.reshape(-1) > 0)).sum())
+    by_camera = evaluate(folders[0], truth, convention="occ3d-camera")
+    by_lidar = evaluate(folders[0], truth, convention="occ3d-lidar")
+    assert 0 < by_camera.matrix.total <= seen
+    assert by_camera.matrix.total < 0.8 * by_lidar.matrix.total
+
+
 def test_a_sequence_without_prediction_is_named_in_a_note(folders):
     assert evaluate(*folders).notes == ()
     write_grids(

@@ -159,4 +159,14 @@ def test_broken_lines_are_named():
 def test_the_data_set_of_the_contract_tests_has_every_field(tmp_path):
     sequences = FolderSource(write_dataset(tmp_path)).sequences().values()
     names = {name.rpartition("/")[2] for sequence in sequences for name in sequence.fields()}
-    assert names == {*layout.SCAN_FIELDS, *layout.GRID_FIELDS}
+    images = {name for name in names if name.partition(".")[0] in layout.IMAGE_FOLDERS}
+    assert images == {"images.front.jpg", "images.left-1.png", "image_depths.front.png"}
+    assert names - images == {*layout.SCAN_FIELDS, *layout.GRID_FIELDS}
+
+
+def test_a_field_of_images_is_a_folder_per_camera():
+    field = layout.field_named("image_labels.front_left.png")
+    assert (field.file(7), field.per, field.kind) == ("image_labels/front_left/000007.png", "scan", "picture")
+    for name in ("images.front.gif", "images.jpg", "images..jpg", "pictures.front.jpg", "images.a/b.jpg"):
+        with pytest.raises(FormatError, match="expected one of"):
+            layout.field_named(name)

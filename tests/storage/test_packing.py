@@ -200,7 +200,7 @@ def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(data: Path
     assert (
         steps[-1][0]
         == steps[-1][1]
-        == len([n for n in files if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance"))])
+        == len([n for n in files if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance", ".png", ".seen"))])
     )
 
 
@@ -306,7 +306,7 @@ def test_a_second_run_does_not_pack_blocks_again(data: Path, tmp_path: Path) -> 
     out = tmp_path / "x.zarr"
     subprocess.run([sys.executable, "-c", KILLED, "pack", data, out, "999"], check=False)
     before = {file: file.stat().st_mtime_ns for file in out.rglob("c/**/0") if file.is_file()}
-    assert len(before) == 41
+    assert len(before) == 45
     pack(data, out)
     assert {file: file.stat().st_mtime_ns for file in before} == before
 
@@ -354,7 +354,7 @@ def test_the_command_line_packs_and_unpacks(data: Path, tmp_path: Path) -> None:
     unpacked = runner.invoke(app, ["unpack", str(tmp_path / "x.zarr"), str(tmp_path / "files"), "--json"])
     assert unpacked.exit_code == 0, unpacked.output
     assert json.loads(unpacked.output)["files"] == len(
-        [n for n in files_of(data) if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance"))]
+        [n for n in files_of(data) if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance", ".png", ".seen"))]
     )
     assert files_of(tmp_path / "files") == files_of(data)
 

@@ -9,7 +9,7 @@ import dataclasses
 import io
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -26,13 +26,15 @@ from carlasc.captures.settings import (
     check_at_least,
 )
 from carlasc.captures.town.drive import Snapshot, TownDrive
+from carlasc.captures.town.photographs import photo_fields, photograph, town_cameras
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.geometry import Transform, rotate_vectors
 from carlasc.core.tables import CARLA
 from carlasc.errors import MissingDataError, check_choice, import_extra
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
-from carlasc.storage.layout import FRAME_PERIOD_S
+from carlasc.storage.camera_files import cameras_to_json
+from carlasc.storage.layout import CAMERAS, FRAME_PERIOD_S
 from carlasc.storage.transport.targets import check_shared
 
 _SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
@@ -112,6 +114,7 @@ class SimulatedCapture(Capture):
         traffic: TrafficLevel = "medium",
         lidar: Lidar | None = None,
         bev: bool = True,
+        cameras: Sequence[str] = (),
     ) -> None:
         """Take the settings of a simulation; the arguments are those of `carlasc.simulate`.
 
@@ -124,6 +127,7 @@ class SimulatedCapture(Capture):
         self.location, self.classes = f"the simulated town of seed {seed}", CARLA
         self._frames, self._count = range(first_frame, first_frame + count), sensors
         self._drive_of, self._bev = (seed, traffic, lidar or Lidar()), bev
+        self.cameras = {camera.name: camera for camera in town_cameras(cameras)}
 
     @cached_property
     def sensors(self) -> tuple[int, ...]:
@@ -161,6 +165,16 @@ class SimulatedCapture(Capture):
     def has_bev(self, frame: int) -> bool:
         """Whether a frame has a bird's-eye picture."""
         return self._bev and frame in self._frames
+
+    def image_fields(self, frame: int) -> tuple[str, ...]:
+        """Return the names in the layout of the images that a frame has."""
+        return photo_fields(self.cameras.values())
+
+    def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
+        """Return the bytes of the files of a frame's images, by their names in the layout."""
+        if not self.cameras:
+            return {}
+        return photograph(self._drive.snapshot(frame), tuple(self.cameras.values()), self.read_pose(0, frame))
 
     def light(self) -> Capture:
         """Return the capture: it holds settings only."""
@@ -231,6 +245,7 @@ def simulate(
     traffic: TrafficLevel = "medium",
     lidar: Lidar | None = None,
     bev: bool = True,
+    cameras: Sequence[str] = (),
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> SimulationResult:
     """Record a drive through a simulated town as a raw capture. The same arguments write the same bytes.
@@ -246,6 +261,8 @@ def simulate(
         traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
         lidar: model of the LiDARs. None: the data set's.
         bev: whether to write bird's-eye pictures.
+        cameras: names of the cameras on the roof of the vehicle, of "front", "front_left", "front_right", "left", "right", "back_left",
+            "back_right" and "back". Each has images of colour, class, instance and depth; see the format page, `docs/format.md#cameras`.
         run: how the work is spread, whether this is only a part of it, and who is told of its progress. The part that finds that no frame
             is missing any more writes the times.
 
@@ -260,17 +277,21 @@ def simulate(
         CarlascError: a worker process died.
     """
     drive = SimulatedCapture(
-        count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev
-    )
+        count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev, cameras=cameras
+    )  # fmt: skip
     check_shared(os.fspath(out), run)
-    settings = _SimulationSettings(seed, traffic, sensors, bev, lidar or Lidar())
-    check_dependencies(bev)
+    settings = dataclasses.asdict(_SimulationSettings(seed, traffic, sensors, bev, lidar or Lidar()))
+    settings |= {"cameras": list(cameras)} if cameras else {}
+    images = photo_fields(drive.cameras.values())
+    check_dependencies(bev or bool(cameras))
     writer = CaptureWriter(out)
-    writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc simulate")
-    writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))
+    writer.check_settings(SETTINGS_FILE, settings, "carlasc simulate")
+    writer.write_settings(SETTINGS_FILE, settings)
+    if cameras:
+        writer.target.put(CAMERAS, cameras_to_json(drive.cameras.values()))
 
     wanted = run.part.take(range(first_frame, first_frame + count))
-    missing = [frame for frame in wanted if not writer.has_frame(frame, sensors, bev)]
+    missing = [frame for frame in wanted if not writer.has_frame(frame, sensors, bev, images)]
     complete = set(wanted) - set(missing)
     progress = run.progress or (lambda done, total: None)
     progress(len(complete), len(wanted))
@@ -291,7 +312,7 @@ def simulate(
     if run.part.count > 1:
         writer.target.tree.refresh()
         frames = range(first_frame, first_frame + count)
-        if all(writer.has_frame(frame, sensors, bev) for frame in frames):
+        if all(writer.has_frame(frame, sensors, bev, images) for frame in frames):
             timed = writer.timed_frames(sensors)
             writer.write_times({frame: [frame * FRAME_PERIOD_S] * sensors for frame in frames if frame not in timed})
     classes = {name: points[name] for name in CARLA.names.values() if points[name]}
@@ -322,4 +343,6 @@ def _record_frame(writer: CaptureWriter, drive: SimulatedCapture, frame: int) ->
         writer.write(sensor, frame, recording)
     if (picture := drive.read_bev(frame)) is not None:
         writer.write_bev(frame, picture)
+    if drive.cameras:
+        writer.write_images(frame, drive.read_images(frame))
     return {CARLA.names[label]: int(number) for label, number in enumerate(points) if number}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from carlasc.groundtruth.inputs import (
     choose_frames,
     parent_path,
     scan_fields,
+    stored_views,
 )
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
@@ -45,6 +46,9 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD
 from carlasc.storage.sinks import SequenceWriter
+
+if TYPE_CHECKING:
+    from carlasc.groundtruth.seen import Views
 
 _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
 _RANGE_M = 100.0  # of a sensor whose range carlasc.json does not give
@@ -78,6 +82,10 @@ class ScanFrame(FrameInput):
     def fields(self) -> tuple[str, ...]:
         """Return the names of the scan fields that the frame has."""
         return scan_fields(self.inputs.feed.sequence, self.number)
+
+    def views(self) -> Views:
+        """Return the cameras of the sequence, and where they were."""
+        return stored_views(self.inputs.feed.sequence, self.number)
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the frame's own files, and count the votes of the scans in its window."""

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting import Exported, Files, TargetFrame
+from carlasc.converting import Exported, Files, TargetFrame, resample_to
 from carlasc.core.axes import mirror_poses
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.geometry import quaternions_of, translation
@@ -27,6 +28,7 @@ from carlasc_converters.exporters.grid_exporter import GridExporter, GridName, P
 
 _ANNOTATIONS = "annotations.json"
 _CAMERAS = "mask_camera is a copy of mask_lidar, because no cameras are known"
+_SEEN = "mask_camera is 1 where a camera sees a known voxel"
 _SPLITS = {"Train": "train_split", "Val": "val_split", "Test": "test_split"}
 
 
@@ -73,7 +75,7 @@ class Occ3dExporter(GridExporter):
             notes.append(f"the height of the sensor is not known, and taken to be {height:g} m: `height_m` sets it")
         if layout.POSES not in sequence.documents():
             notes.append(f"{sequence.location} has no poses: annotations.json has none either")
-        if not self.predictions:
+        if not self.predictions and not self._has_seen(sequence):
             notes.append(f"{_CAMERAS}: do not train or score with camera masks")
         return notes + super().check(sequence)
 
@@ -86,12 +88,23 @@ class Occ3dExporter(GridExporter):
         return (f"{frame_token(sequence.name, frame)}/labels.npz",)
 
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
-        """Return semantics and masks. There are no cameras: what the LiDAR observed counts as observed by them too."""
+        """Return semantics and masks. Without the field `seen`, what the LiDAR observed counts as observed by cameras too."""
         labels, known = self.read(sequence, frame)
         semantics, mask = np.where(known, labels, self.free).astype(np.uint8), known.astype(np.uint8)
+        seen = self._read_seen(sequence, frame) & mask if self._has_seen(sequence) else mask
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, semantics=semantics, mask_lidar=mask, mask_camera=mask)
+        np.savez_compressed(buffer, semantics=semantics, mask_lidar=mask, mask_camera=seen)
         return {self.frame_files(sequence, frame)[0]: buffer.getbuffer()}
+
+    def _has_seen(self, sequence: storage.Sequence) -> bool:
+        return not self.predictions and f"{self.grid_of(sequence)}/seen" in sequence.fields()
+
+    def _read_seen(self, sequence: storage.Sequence, frame: int) -> NDArray[np.uint8]:
+        """Return (200, 200, 16) 1 for voxels that any camera sees."""
+        name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
+        seen = place.turn((sequence.read(f"{name}/seen", frame) > 0).astype(np.uint8), axes)
+        spec = place.spec_in(sequence.grids[name], axes)
+        return resample_to(seen, np.ones(spec.size, np.bool_), spec, self.target)[0].astype(np.uint8)
 
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
         """Return annotations.json, with the scenes that are in it already."""
@@ -106,7 +119,9 @@ class Occ3dExporter(GridExporter):
                     names.add(part.sequence.name)
             scenes[part.sequence.name] = self._scene(part)
         lists = {key: sorted(names) for key, names in splits.items() if names or key != "test_split"}
-        content = lists | {"carlasc": _CAMERAS, "scene_infos": {name: scenes[name] for name in sorted(scenes)}}
+        copied = not all(self._has_seen(part.sequence) for part in exported)
+        about = {"carlasc": _CAMERAS if copied else _SEEN}
+        content = lists | about | {"scene_infos": {name: scenes[name] for name in sorted(scenes)}}
         return {_ANNOTATIONS: json.dumps(content, indent=1).encode()}
 
     def _scene(self, part: Exported) -> dict[str, Any]:

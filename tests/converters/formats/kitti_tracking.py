@@ -49,7 +49,7 @@ def write_tracking(
     (folder / f"label_02/{sequence}.txt").write_text("\n".join(lines) + "\n")
     rectify, to_camera, to_lidar, after = names
     (folder / f"calib/{sequence}.txt").write_text(
-        f"P2: {' '.join(['1.0'] * 12)}\n"
+        "P2: 721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003\n"
         f"{rectify}{after} {' '.join(map(repr, RECTIFY[:3, :3].reshape(-1).tolist()))}\n"
         f"{to_camera}{after} {numbers(CAMERA_T_LIDAR)}\n{to_lidar}{after} {numbers(LIDAR_T_IMU)}\n"
     )

@@ -1,0 +1,67 @@
+"""The cameras of a recording in the layout: cameras.json, and their images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from carlasc.converting.layout_options import AxesAndClasses, Images
+from carlasc.converting.plans import RecordingPlan
+from carlasc.core.cameras import CameraModel
+from carlasc.core.geometry import invert
+from carlasc.storage import layout
+from carlasc.storage.camera_files import cameras_to_json
+
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) -> list[str]:
+    """Write the cameras of a recording, and return notes.
+
+    Args:
+        plan: the recording, and where it is written.
+        target: the axes in which it is written.
+        images: what becomes of the images.
+
+    Raises:
+        FormatError: a calibration is damaged.
+        StorageError: nothing can be written.
+    """
+    cameras = plan.recording.cameras()
+    if not cameras:
+        return []
+    written = [_in_layout(camera, plan, target, images) for camera in cameras]
+    content = cameras_to_json(written)
+    if plan.writer.read_document(layout.CAMERAS) != content:
+        plan.writer.write_document(layout.CAMERAS, content)
+    return _copy_images(plan, cameras) if images == "copy" else []
+
+
+def _in_layout(camera: CameraModel, plan: RecordingPlan, target: AxesAndClasses, images: Images) -> CameraModel:
+    scan_T_camera = invert(plan.rig.vehicle_T_scan) @ camera.sensor_T_camera
+    place = _MIRROR @ scan_T_camera if target.mirrored else scan_T_camera
+    times = None if camera.times is None else camera.times - plan.times[0]
+    return camera.replaced(sensor_T_camera=place, times=times, images=camera.images if images == "link" else None)
+
+
+def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[str]:
+    """Copy the images of all frames, those that are stored together at once; return how many do not exist."""
+    missing, blocks = 0, dict[int, list[int]]()
+    for handle in plan.recording.frames:
+        blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)
+    for numbers in blocks.values():
+        found: dict[int, dict[str, np.ndarray]] = {}
+        for number in numbers:
+            for camera in cameras:
+                path = Path(camera.images[number] if camera.images else "")
+                if path.suffix not in (".jpg", ".png") or not path.is_file():
+                    missing += 1
+                    continue
+                field = f"images.{camera.name}{path.suffix}"
+                if not plan.writer.has(field, number):
+                    found.setdefault(number, {})[field] = np.frombuffer(path.read_bytes(), np.uint8)
+        if found:
+            plan.writer.write_frames(found)
+    return [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"] if missing else []

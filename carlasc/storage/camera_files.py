@@ -1,0 +1,203 @@
+"""The cameras of a sequence: cameras.json, their images, and where each camera was in a frame."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.cameras import CameraModel
+from carlasc.core.geometry import Transform, invert, slerp
+from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.storage import layout
+from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.metadata import Axes, check_format
+from carlasc.storage.protocol import Sequence
+
+_FORMAT = 1
+_SAME_TIME_S = 1e-6
+
+
+def cameras_to_json(cameras: Iterable[CameraModel]) -> bytes:
+    """Return the bytes of cameras.json."""
+    return to_json({"format": _FORMAT, "cameras": [camera.to_dict() for camera in cameras]})
+
+
+def cameras_of(sequence: Sequence) -> dict[str, CameraModel]:
+    """Return the cameras of a sequence by name, in the order of cameras.json; none if the file does not exist.
+
+    Raises:
+        FormatError: the file is damaged, two cameras have one name, or a camera's place does not fit the axes of the scans.
+    """
+    if layout.CAMERAS not in sequence.documents():
+        return {}
+    where = f"{sequence.location}/{layout.CAMERAS}"
+    return cameras_from_json(sequence.read_document(layout.CAMERAS), where, sequence.metadata.axes)
+
+
+def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraModel]:
+    """Return the cameras of cameras.json by name.
+
+    Args:
+        data: the bytes of the file.
+        where: the file, for errors.
+        axes: handedness of the scans.
+
+    Raises:
+        FormatError: the file is damaged, two cameras have one name, or a camera's place does not fit the axes of the scans.
+    """
+    values = parse_json(data, where)
+    check_format(values.get("format", 1), where)
+    listed = values.get("cameras")
+    if not isinstance(listed, list):
+        raise FormatError(where, expected="a list of cameras", found=type(listed).__name__)
+    cameras: dict[str, CameraModel] = {}
+    for about in listed:
+        camera = CameraModel.from_dict(about, where)
+        if camera.name in cameras:
+            raise FormatError(where, expected="a name for each camera", found=f"two called {camera.name}")
+        if (np.linalg.det(camera.sensor_T_camera[:3, :3]) > 0) != (axes == "right"):
+            expected = "a rotation" if axes == "right" else "a reflection, as the scans are left-handed"
+            raise FormatError(f"{where}: {camera.name}", expected=f"{expected} in sensor_T_camera", found="the other")
+        cameras[camera.name] = camera
+    return cameras
+
+
+def camera_named(sequence: Sequence, name: str) -> CameraModel:
+    """Return a camera of a sequence.
+
+    Raises:
+        MissingDataError: the sequence has no such camera.
+    """
+    cameras = cameras_of(sequence)
+    if name not in cameras:
+        found = ", ".join(cameras) or f"no {layout.CAMERAS}"
+        raise MissingDataError(sequence.location, expected=f"the camera {name}", found=found)
+    return cameras[name]
+
+
+def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transform | None:
+    """Return (4, 4), from the camera's frame when it took the image of a frame to the frame of the scan; None if it took none.
+
+    The motion of the vehicle between the two times is that of poses.txt.
+
+    Raises:
+        FormatError: there is more than a frame between the two times.
+    """
+    documents = sequence.documents()
+    if camera.times is None or not {layout.TIMES, layout.POSES} <= set(documents):
+        return camera.sensor_T_camera
+    times, poses = sequence.times, sequence.poses
+    line = sequence.line_of(frame, len(times), layout.TIMES)
+    where = f"{sequence.location}/{layout.CAMERAS}: {camera.name}, frame {frame}"
+    if len(camera.times) != len(times):
+        raise FormatError(where, expected=f"{len(times)} times, as in times.txt", found=str(len(camera.times)))
+    seconds = float(camera.times[line])
+    if np.isnan(seconds):
+        return None
+    period = float(np.median(np.diff(times))) if len(times) > 1 else layout.FRAME_PERIOD_S
+    if not abs(seconds - times[line]) <= period:
+        found = f"{seconds - times[line]:+.3f} s"
+        raise FormatError(where, expected=f"an image within a frame ({period:.3f} s) of the scan", found=found)
+    if abs(seconds - times[line]) < _SAME_TIME_S or len(poses) != len(times):
+        return camera.sensor_T_camera
+    near = slice(max(0, line - 1), line + 2)
+    first_T_then = slerp(poses[near], times[near], np.array([seconds]))[0]
+    return np.asarray(invert(sequence.read_pose(frame)) @ first_T_then @ camera.sensor_T_camera)
+
+
+def image_fields(sequence: Sequence, folder: str = "images") -> dict[str, str]:
+    """Return the field of each camera's images, by the name of the camera.
+
+    Args:
+        sequence: the sequence.
+        folder: one of `carlasc.storage.layout.IMAGE_FOLDERS`.
+    """
+    names = sorted(name for name in sequence.fields() if name.startswith(f"{folder}."))
+    return {name.partition(".")[2].rpartition(".")[0]: name for name in names}
+
+
+def has_image(sequence: Sequence, camera: CameraModel, frame: int) -> bool:
+    """Whether there is an image of a frame, in the folder of images or where cameras.json says."""
+    field = image_fields(sequence).get(camera.name)
+    return bool(camera.images and _reference(sequence, camera, frame)) or (
+        field is not None and frame in sequence.frames(field)
+    )
+
+
+def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images") -> NDArray[Any]:
+    """Return the image of a frame: (H, W, 3) uint8 RGB, or (H, W) whole numbers of classes, instances or depths.
+
+    Args:
+        sequence: the sequence.
+        camera: one of its cameras.
+        frame: the frame.
+        folder: one of `carlasc.storage.layout.IMAGE_FOLDERS`.
+
+    Raises:
+        MissingDataError: there is no such image.
+        FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
+        DependencyError: Pillow is not installed.
+    """
+    field = image_fields(sequence, folder).get(camera.name)
+    if field is not None and frame in sequence.frames(field):
+        where = f"{sequence.location}/{layout.field_named(field).file(frame)}"
+        data = sequence.read(field, frame).tobytes()
+    elif folder == "images" and (reference := _reference(sequence, camera, frame)):
+        path = Path(sequence.location) / reference
+        where = str(path)
+        if not path.is_file():
+            raise MissingDataError(where, expected=f"an image of the camera {camera.name}", found="no file")
+        data = path.read_bytes()
+    else:
+        raise MissingDataError(
+            sequence.location,
+            expected=f"{folder}/{camera.name}/{frame:06d}.jpg or .png",
+            found="none",
+            advice="convert with --images copy or link",
+        )
+    return decode_image(data, where, camera, color=folder == "images")
+
+
+def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> NDArray[Any]:
+    """Return the pixels of a JPEG or PNG of a camera, as `read_image` does.
+
+    Raises:
+        FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
+    """
+    image = import_extra("PIL.Image", "render")
+    try:
+        with image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
+            if picture.size != (camera.width, camera.height):
+                expected = f"{camera.width} x {camera.height} pixels, as camera {camera.name} is calibrated"
+                raise FormatError(where, expected=expected, found=f"{picture.size[0]} x {picture.size[1]}")
+            pixels = np.asarray(picture.convert("RGB") if color else picture)
+    except FormatError:
+        raise
+    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
+        raise FormatError(where, expected="a whole JPEG or PNG", found="something else", advice=str(error)) from error
+    if not color and (pixels.ndim != 2 or pixels.dtype.kind not in "iu"):
+        raise FormatError(where, expected="a PNG with one whole number per pixel", found=f"shape {pixels.shape}")
+    return pixels
+
+
+def encode_image(pixels: NDArray[np.unsignedinteger], kind: str, quality: int = 90) -> NDArray[np.uint8]:
+    """Return an image as the bytes of a file: "JPEG" of (H, W, 3) uint8, or "PNG" of (H, W, 3) uint8 or (H, W) uint8 or uint16.
+
+    Raises:
+        DependencyError: Pillow is not installed.
+    """
+    buffer = io.BytesIO()
+    options: Mapping[str, Any] = {"quality": quality} if kind == "JPEG" else {"compress_level": 1}
+    import_extra("PIL.Image", "render").fromarray(pixels).save(buffer, kind, **options)
+    return np.frombuffer(buffer.getvalue(), np.uint8)
+
+
+def _reference(sequence: Sequence, camera: CameraModel, frame: int) -> str:
+    if camera.images is None:
+        return ""
+    return camera.images[sequence.line_of(frame, len(camera.images), layout.CAMERAS)]
