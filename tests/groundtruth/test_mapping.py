@@ -10,10 +10,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import carlasc
 from carlasc import GridSpec, Run
+from carlasc.core.axes import mirror_voxels
 from carlasc.core.geometry import relative_to, transform_points
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.groundtruth import Voting
+from carlasc.groundtruth.maps.map_files import MapCells
 from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.storage import layout
 
@@ -223,3 +225,45 @@ def test_an_interrupted_run_leaves_nothing(drive, tmp_path, steps):
     with pytest.raises(KeyboardInterrupt):
         make(drive, tmp_path / "map.ply", frames="0:2", run=Run(workers=1, progress=progress))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("lower", "size", "message"),
+    [
+        ((0, 0, 0), (0.4, 0.4, 0.375), r"out: expected cubic voxels for OctoMap, found 0.4 x 0.4 x 0.375 m"),
+        (
+            (0.1, 0, 0),
+            (0.4, 0.4, 0.4),
+            r"out: expected voxels that begin at multiples of 0.4 m for OctoMap, found 0.1, 0, 0",
+        ),
+    ],
+)
+def test_octomap_holds_only_cubes_at_multiples_of_their_size(tmp_path, lower, size, message):
+    cells = MapCells(np.zeros((1, 3), np.int64), np.ones(1, np.uint8), np.array(lower, float), np.array(size))
+    with pytest.raises(ArgumentError, match=message):
+        cells.write_octomap(tmp_path / "map.bt")
+    assert not (tmp_path / "map.bt").exists()
+
+
+@pytest.mark.slow
+def test_octomaps_library_reads_maps_and_grids(drive, tmp_path):
+    pyoctomap = pytest.importorskip("pyoctomap", reason="OctoMap's library is not installed")
+    (sequence,) = carlasc.open(drive).sequences().values()
+    grid = mirror_voxels(sequence.grid(GRID, 3))
+    make(drive, tmp_path / "grid.bt", grid=GRID)
+    tree = pyoctomap.OcTree(0.1)
+    assert tree.readBinary(str(tmp_path / "grid.bt")) and tree.getResolution() == pytest.approx(0.4)
+    centers = grid.spec.centers().reshape(-1, 3)
+    found = [tree.search(center.tolist()) for center in centers]
+    known, occupied = grid.known.reshape(-1), (grid.labels > 0).reshape(-1)
+    assert_array_equal([node is not None for node in found], known)
+    assert_array_equal([tree.isNodeOccupied(node) for node in found if node is not None], occupied[known])
+
+    make(drive, tmp_path / "map.bt", frames="0:2")
+    make(drive, tmp_path / "map.npz", frames="0:2")
+    tree = pyoctomap.OcTree(0.1)
+    assert tree.readBinary(str(tmp_path / "map.bt"))
+    points = np.load(tmp_path / "map.npz")["points"].astype(np.float64)
+    assert all(tree.isNodeOccupied(tree.search(point.tolist())) for point in points[:2000])
+    leaves = sum(round(leaf.getSize() / 0.1) ** 3 for leaf in tree.begin_leafs())
+    assert leaves == len(points)
