@@ -34,6 +34,7 @@ from .groundtruth import Voting as Voting
 from .groundtruth import refine as refine
 from .groundtruth import regrid as regrid
 from .inspection import CardDetails as CardDetails
+from .inspection import audit as audit
 from .inspection import card as card
 from .inspection import doctor as doctor
 from .inspection import info as info
