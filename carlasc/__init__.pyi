@@ -36,6 +36,7 @@ from .groundtruth import map as map
 from .groundtruth import refine as refine
 from .groundtruth import regrid as regrid
 from .inspection import CardDetails as CardDetails
+from .inspection import audit as audit
 from .inspection import card as card
 from .inspection import doctor as doctor
 from .inspection import info as info

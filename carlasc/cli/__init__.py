@@ -34,6 +34,7 @@ _COMMANDS = (  # in the order of `--help`, which is that in which a new user nee
     "info",
     "stats",
     "validate",
+    "audit",
     "report",
     "card",
     "evaluate",

@@ -236,7 +236,7 @@ class WindowFlags(Flags):
 
     def _given(self) -> dict[str, Any]:
         motion = None if self.motion is None else carlasc.motion.MotionOptions(self.motion)
-        window = None if self.window is None else _parse_window(self.window)
+        window = None if self.window is None else parse_window(self.window)
         return {"window": window, "dynamic": self.dynamic, "motion": motion}
 
 
@@ -274,13 +274,14 @@ class ScanFlags(WindowFlags):
         return super()._given() | others | {"own_path": False if self.no_own_path else None}
 
 
-def _parse_window(text: str) -> tuple[int, int]:
+def parse_window(text: str, option: str = "window") -> tuple[int, int]:
+    """Return the first and the last scan of a window from "A:B"; `option` is named in errors."""
     first, _, last = text.partition(":")
     try:
         return int(first), int(last)
     except ValueError:
         raise ArgumentError(
-            "window", expected="A:B, in frames relative to the current one, such as -30:30", found=repr(text)
+            option, expected="A:B, in frames relative to the current one, such as -30:30", found=repr(text)
         ) from None
 
 

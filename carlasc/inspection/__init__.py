@@ -1,4 +1,4 @@
-"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `holdout`), how it was made (`report`), and all of that to publish (`card`); and what is installed (`doctor`)."""
+"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `audit`, `holdout`), how it was made (`report`), and all of that to publish (`card`); and what is installed (`doctor`)."""
 
 import lazy_loader
 

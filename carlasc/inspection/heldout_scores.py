@@ -110,7 +110,7 @@ class HeldOutScores:
             ArgumentError: the grid is cylindrical.
         """
         spec, occupied = grid.spec, grid.known & (grid.labels != 0)
-        ground = _lowest(occupied) if labels is None else np.isin(grid.labels, sorted(classes.ground))
+        ground = lowest_of_columns(occupied) if labels is None else np.isin(grid.labels, sorted(classes.ground))
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
         voxels = spec.flat_index(points)
         inside = (voxels >= 0) & np.any(points != 0, axis=1)
@@ -233,7 +233,7 @@ def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArra
     return swept
 
 
-def _lowest(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def lowest_of_columns(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (X, Y, Z) bool: the lowest occupied voxel of each column, and the one above it."""
     lowest = occupied & (occupied.cumsum(axis=2) == 1)
     above = np.zeros_like(lowest)

@@ -190,8 +190,8 @@ def pair_grids(
     Raises:
         MissingDataError: a side has no grid, or a predicted sequence has no ground truth.
     """
-    truths = {grids.path: grids for grids in _open_grids(truth, truth_grid, "truth")}
-    predictions = list(_open_grids(source, grid or truth_grid, "prediction"))
+    truths = {grids.path: grids for grids in open_grids(truth, truth_grid, "truth")}
+    predictions = list(open_grids(source, grid or truth_grid, "prediction"))
     if len(predictions) == len(truths) == 1:
         pairs = [Pair(predictions[0], next(iter(truths.values())))]
     else:
@@ -224,7 +224,17 @@ def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridF
     return same_name[0]
 
 
-def _open_grids(place: Place, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
+def open_grids(place: Place, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
+    """Yield the grids of a place that `evaluate` reads: a data set, the folder of a grid, or files of another benchmark.
+
+    Args:
+        place: where they are.
+        grid: name of the grid; None takes `evaluation`, or the only grid of a sequence.
+        role: whether they are predictions, which may be in other folders of a benchmark.
+
+    Raises:
+        MissingDataError: there is none.
+    """
     if not isinstance(place, Source):
         folder = Path(place)
         if (folder / layout.PARAMS).is_file():  # the folder of one grid: its sequence is the folder above
