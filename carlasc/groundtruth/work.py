@@ -199,15 +199,14 @@ def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, G
     if plan.voting.min_confidence and counts is not None and evidence is not None:
         confident = is_confident(evidence.occupied, plan.voting.min_confidence)
         labels, counts = labels * confident, counts * confident
-    outputs: Outputs = {**data.fields, f"{plan.grid}/labels": labels}
-    if counts is not None:
-        outputs[f"{plan.grid}/counts"] = counts
+    outputs: Outputs = data.fields | {f"{plan.grid}/labels": labels}
+    outputs |= {} if counts is None else {f"{plan.grid}/counts": counts}
     if plan.voting.keep and data.votes is not None:
         outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
     if plan.voting.keep_evidence and evidence is not None:
         outputs |= {f"{plan.grid}/{part}": getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
     if plan.voting.keep_actors and data.actors is not None:
-        actors = data.actors if labels is data.grid.labels else data.actors.within(labels > 0)
+        actors = data.actors.within(labels > 0)  # confidence may have made voxels unknown
         outputs |= {f"{plan.grid}/{part}": getattr(actors, part) for part in layout.ACTOR_FIELDS}
     return outputs, Grid(plan.spec, labels, counts)
 
