@@ -199,7 +199,7 @@ def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, G
     if plan.voting.min_confidence and counts is not None and evidence is not None:
         confident = is_confident(evidence.occupied, plan.voting.min_confidence)
         labels, counts = labels * confident, counts * confident
-    outputs: Outputs = data.fields | {f"{plan.grid}/labels": labels}
+    outputs: Outputs = {**data.fields, f"{plan.grid}/labels": labels}
     outputs |= {} if counts is None else {f"{plan.grid}/counts": counts}
     if plan.voting.keep and data.votes is not None:
         outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
