@@ -12,7 +12,7 @@ import typer
 import carlasc
 from carlasc.cli.common import echo, parse_numbers
 from carlasc.cli.flags import Flags
-from carlasc.core.choices import Complete, Coordinates, Dynamic, Preset, VoteRule
+from carlasc.core.choices import Complete, Coordinates, Dynamic, Preset, Rays, VoteRule
 from carlasc.errors import ArgumentError
 
 _FEW = 8  # voxels along an axis, of a grid that is unusual
@@ -264,12 +264,19 @@ class ScanFlags(WindowFlags):
             help="Do not count the space that the recording vehicle drove through as free. By default it is free, which removes ghost trails there.",
         ),
     ] = False
+    rays: Annotated[
+        Rays | None,
+        typer.Option(
+            help="Which rays of other scans are followed. all (default); enough: a part of those near the sensor, where they are dense."
+        ),
+    ] = None
     min_range_m: Annotated[float | None, typer.Option(help="Leave out nearer points, in metres.")] = None
     max_range_m: Annotated[float | None, typer.Option(help="Leave out farther points, in metres.")] = None
 
     def _given(self) -> dict[str, Any]:
         others = {
-            name: getattr(self, name) for name in ("window_m", "stride", "complete", "min_range_m", "max_range_m")
+            name: getattr(self, name)
+            for name in ("window_m", "stride", "complete", "rays", "min_range_m", "max_range_m")
         }
         return super()._given() | others | {"own_path": False if self.no_own_path else None}
 

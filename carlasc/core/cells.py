@@ -141,3 +141,29 @@ def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
                 break
             slot = (slot + 1) & (size - 1)
     return first
+
+
+def count_points(
+    points: NDArray[np.floating], grid_T_points: Transform, spec: GridSpec, counts: NDArray[np.int32] | None = None
+) -> NDArray[np.int32]:
+    """Return the number of points in each voxel, (V,): those that `GridSpec.flat_index` finds, without an array for each step.
+
+    Args:
+        points: (N, 3) metres.
+        grid_T_points: (4, 4), from the frame of the points to the grid's.
+        spec: geometry of the grid.
+        counts: (V,) numbers to which they are added; it is changed, and returned. None: zeros.
+    """
+    counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
+    _count(np.ascontiguousarray(points), as_pose(grid_T_points), Cells.of(spec), counts)
+    return counts
+
+
+@cached
+def _count(points: NDArray[np.floating], pose: Pose, cells: Cells, counts: NDArray[np.int32]) -> None:
+    for i in range(len(points)):
+        point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        x, y, z = transform(pose, point[0], point[1], point[2])
+        voxel = find_voxel(x, y, z, cells)
+        if voxel < len(counts):
+            counts[voxel] += 1

@@ -20,6 +20,9 @@ Dynamic = Literal["align", "current", "drop", "tube"]
 Complete = Literal["seen", "mirror", "body"]
 """What happens to the parts of an actor that no scan saw."""
 
+Rays = Literal["all", "enough"]
+"""Which rays are followed where scans are merged."""
+
 TrafficLevel = Literal["light", "medium", "heavy"]
 """Amount of simulated traffic."""
 

@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.wording import count
 from carlasc.errors import FormatError
+
+_TURN = 65_000  # steps of azimuth, of 0.1 mrad: they fit 16 bits
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,85 @@ def _starts(origins: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return where each run of equal rows begins."""
     changes = (origins[1:] != origins[:-1]).any(axis=1)
     return np.concatenate([np.zeros(min(len(origins), 1), np.int64), np.flatnonzero(changes) + 1])
+
+
+@dataclass(frozen=True)
+class RaysFromPlace:
+    """Those rays of a scan that began at one place.
+
+    Attributes:
+        part: the points of the scan to which they go.
+        sensor_T_place: (4, 4), from the place where they began, in the axes of the sensor, to the sensor's frame.
+        points: (M, 3) float32, the same points seen from there, metres.
+        order: (M,) int32, indices of `points` by increasing azimuth.
+        azimuth: (M,) uint16, their azimuths in this order, in steps of which `_TURN` are a full circle, from -pi.
+    """
+
+    part: slice
+    sensor_T_place: Transform
+    points: NDArray[np.float32]
+    order: NDArray[np.int32]
+    azimuth: NDArray[np.uint16]
+
+    @classmethod
+    def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> RaysFromPlace:
+        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan, which are given as seen from there."""
+        own = points[part]
+        azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
+        order = np.argsort(azimuth, kind="stable").astype(np.int32)  # of 16 bits: by their digits
+        return cls(part, translation(origin), own, order, azimuth[order])
+
+    def through(
+        self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
+    ) -> NDArray[np.int32]:
+        """Return the indices of the points whose rays, from where they began to the point, intersect a box.
+
+        Args:
+            box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is axis-aligned.
+            lower: (3,) lower corner.
+            upper: (3,) upper corner.
+        """
+        candidates = self._in_view_of(box_T_sensor, lower, upper)
+        origin = box_T_sensor[:3, 3]
+        rays = transform_points(box_T_sensor, self.points[candidates]) - origin
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = (lower - origin) / rays, (upper - origin) / rays
+        # A ray that lies in a face gives 0/0 there: fmin and fmax ignore the NaN.
+        enter = np.fmin(one, other).max(axis=1)
+        leave = np.fmax(one, other).min(axis=1)
+        return candidates[(enter <= leave) & (leave >= 0) & (enter <= 1)]
+
+    def _in_view_of(
+        self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
+    ) -> NDArray[np.int32]:
+        """Return the indices of the points in the range of azimuths that a box covers."""
+        origin = box_T_sensor[:3, 3]
+        if ((origin > lower) & (origin < upper))[:2].all():  # the sensor is above, below or inside the box
+            return self.order
+        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
+        seen = transform_points(invert(box_T_sensor), corners)
+        angles = np.arctan2(seen[:, 1], seen[:, 0])
+        middle = np.arctan2(np.sin(angles).sum(), np.cos(angles).sum())
+        half = np.abs((angles - middle + np.pi) % (2 * np.pi) - np.pi).max() + 1e-6
+        if half > np.pi / 2:  # the corners surround the sensor
+            return self.order
+        low, high = np.floor(_steps(middle - half)) - 1, np.ceil(_steps(middle + half)) + 1
+        parts = [
+            self.order[slice(*np.searchsorted(self.azimuth, np.clip([low + turn, high + turn + 1], 0, _TURN + 1)))]
+            for turn in (0, _TURN, -_TURN)
+        ]
+        return np.concatenate(parts)
+
+
+def _steps(azimuth_rad: Any) -> Any:
+    """Return azimuths in steps, counted from -pi, not rounded."""
+    return (azimuth_rad + np.pi) * (_TURN / (2 * np.pi))
+
+
+def lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the (N,) lengths of (N, 3) vectors, in their type."""
+    x, y, z = vectors.T
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def check_finite(points: NDArray[np.floating], name: str) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import Rays as Rays  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, check_choice
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
@@ -36,6 +37,8 @@ class FromScans:
         own_path: count what the recording vehicle drove through as free space.
         motion: what tells which points move, and how.
         poses: where poses come from. Those of a sequence without any are estimated from its scans, unless `PoseOptions("file")` is given.
+        rays: which rays of other scans than the frame's own are followed. "all"; "enough": near the sensor, where they are dense, one of
+            up to four, which counts as these. With the rule "ray" only.
         min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
         max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no limit.
 
@@ -51,6 +54,7 @@ class FromScans:
     own_path: bool = True
     motion: MotionOptions = MotionOptions()  # noqa: RUF009 (frozen)
     poses: PoseOptions = PoseOptions()  # noqa: RUF009 (frozen)
+    rays: Rays = "all"
     min_range_m: float | None = None
     max_range_m: float | None = None
 
@@ -64,6 +68,7 @@ class FromScans:
             raise ArgumentError("window_m", expected="a positive number of metres", found=str(self.window_m))
         check_choice("dynamic", self.dynamic, Dynamic)
         check_choice("complete", self.complete, Complete)
+        check_choice("rays", self.rays, Rays)
         for name, options in (("motion", MotionOptions), ("poses", PoseOptions)):
             if not isinstance(value := getattr(self, name), options):
                 raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))

@@ -113,6 +113,18 @@ def look_up(
 
 
 @inlined
+def _first_above(least, lo, hi, slope):  # type: ignore[no-untyped-def]
+    """Return the first return from `lo` to `hi` whose slope is not below `least`; `hi` if there is none."""
+    while lo < hi:
+        mid = (lo + hi) >> 1
+        if slope[mid] < least:
+            lo = mid + 1
+        else:
+            hi = mid
+    return lo
+
+
+@inlined
 def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no-untyped-def]
     """Return FREE, HIT or 0 for a direction and a distance."""
     half = _SIDE_M / flat + _SIDE_RAD
@@ -120,19 +132,19 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
     near, beyond = far - _DEPTH_M - _DEPTH_SHARE * far, far + _DEPTH_M + _DEPTH_SHARE * far
     first = math.floor((azimuth - half + math.pi) * _PER_RAD)
     last = math.floor((azimuth + half + math.pi) * _PER_RAD)
+    # Most places are occupied, and most of them show it in the middle: this column is looked at first.
+    middle = math.floor((azimuth + math.pi) * _PER_RAD) % _COLUMNS
+    lo, end = _first_above(steep - high, start[middle], start[middle + 1], slope), start[middle + 1]
+    while lo < end and slope[lo] <= steep + high:
+        if near <= distance[lo] <= beyond:
+            return HIT
+        lo += 1
     passed, hidden = 0, 0
     below, above = -1e9, 1e9
     below_range, above_range = 0.0, 0.0
     for c in range(first, last + 1):
         column = (c + _COLUMNS) % _COLUMNS
-        lo, hi = start[column], start[column + 1]
-        end = hi
-        while lo < hi:  # first return at or above the window
-            mid = (lo + hi) >> 1
-            if slope[mid] < steep - high:
-                lo = mid + 1
-            else:
-                hi = mid
+        lo, end = _first_above(steep - high, start[column], start[column + 1], slope), start[column + 1]
         if lo > start[column] and slope[lo - 1] > below:
             below, below_range = slope[lo - 1], distance[lo - 1]
         while lo < end and slope[lo] <= steep + high:

@@ -27,8 +27,8 @@ IDS = {"road": "Road", "building": "Building", "vegetation": "Vegetation", "pole
 LABELS = np.array([0, *(CARLA.id_of(IDS.get(kind, "Vehicle")) for kind in KINDS[1:])], np.uint32)
 
 
-def feed_of(folder: Path, full: bool) -> ScanFeed:
-    """Write a drive of 31 scans of 57,600 rays, or of 3 small ones, and return what reads them."""
+def feed_of(folder: Path, full: bool, **options: Any) -> ScanFeed:
+    """Write a drive of 31 scans of 57,600 rays, or of 3 small ones, and return what reads them, merged with options."""
     drive = SimulatedDrive(frames=31, channels=32, columns=1800) if full else SimulatedDrive(frames=3)
     with FolderSink(folder) as sink, sink.sequence("cartesian") as writer:
         for frame in range(drive.frames):
@@ -39,7 +39,7 @@ def feed_of(folder: Path, full: bool) -> ScanFeed:
         poses = drive.world_T_vehicle(drive.times) @ mount
         writer.write_document(layout.POSES, layout.encode_poses(np.linalg.inv(poses[0]) @ poses))
     (sequence,) = FolderSource(folder).sequences().values()
-    return ScanFeed(sequence, FromScans(motion=MotionOptions("none")))
+    return ScanFeed(sequence, FromScans(motion=MotionOptions("none"), **options))
 
 
 @pytest.mark.parametrize("keep_evidence", [False, True], ids=["grid", "and evidence"])
@@ -61,3 +61,27 @@ def test_a_frame_from_merged_scans(benchmark: Any, tmp_path: Path, res: float, k
     tracemalloc.stop()
     merged, votes = benchmark.pedantic(make, rounds=3 if benchmark.enabled else 1)
     assert merged.grid.known.any() and len(votes)
+
+
+@pytest.mark.parametrize("places", [1, 20], ids=["one place", "turning"])
+@pytest.mark.parametrize("rays", ["all", "enough"])
+@pytest.mark.parametrize("res", [0.4, 0.2])
+def test_a_frame_with_a_part_of_the_rays(benchmark: Any, tmp_path: Path, res: float, rays: Any, places: int) -> None:
+    feed = feed_of(tmp_path, benchmark.enabled, rays=rays)
+    if places > 1:  # the LiDAR turns while the vehicle moves: a step of a centimetre each
+        with FolderSink(tmp_path) as sink, sink.sequence("cartesian") as writer:
+            for frame in feed.frames.tolist():
+                part = np.arange(len(feed.sequence.read("points", frame)), dtype=np.float32) * places
+                steps = np.floor(part / len(part)) - places // 2
+                writer.write("origins", frame, np.outer(steps, [0.01, 0, 0]).astype(np.float32))
+        (feed.sequence,) = FolderSource(tmp_path).sequences().values()
+    spec = GridSpec.published().with_resolution(res)
+    plan = GridPlan(spec, "evaluation", feed.options, Voting(), FrameRange())
+    frame = int(feed.frames[len(feed.frames) // 2])
+
+    def make() -> MergedFrame:
+        return merge_frame(plan, feed, MovingActors(), frame, feed.window_of(frame))
+
+    make()  # compiled, and the scans are read
+    assert len(feed.read(frame).rays) == places
+    assert benchmark.pedantic(make, rounds=3 if benchmark.enabled else 1).grid.known.any()

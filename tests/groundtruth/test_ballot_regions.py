@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, FormatError
 from carlasc.groundtruth.voting.ballot import NOWHERE, Ballot, Observation, count_votes
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
@@ -109,3 +109,45 @@ def test_regions_that_do_not_fit_are_refused():
         Ballot(SPEC, rule="ray", regions=np.zeros(SPEC.num_voxels + 1, np.uint16))
     with pytest.raises(ArgumentError, match="observation: expected no region, as the ballot has none"):
         count_votes([observation(free_region=0)], SPEC)
+
+
+@pytest.mark.parametrize("few", [True, False], ids=["few voxels apart", "many"])
+def test_samples_outside_of_a_region_are_put_back_or_not_counted(few):
+    regions = np.zeros(SPEC.num_voxels, np.uint16)
+    regions[:: 20 if few else 3] = 1
+    free = [tally([observation(seed)], "ray").free.reshape(-1) for seed in range(3)]
+    regional = tally([observation(0), observation(1, free_region=0), observation(2, free_region=1)], "ray", regions)
+    expected = free[0] + np.where(regions == 0, free[1], 0) + np.where(regions == 1, free[2], 0)
+    assert (regional.free.reshape(-1) == expected).all()
+
+
+@pytest.mark.parametrize("region", [None, 0])
+def test_a_ray_that_stands_for_others_has_their_votes(region):
+    weights = np.random.default_rng(5).integers(1, 5, 500).astype(np.uint8)
+    sure = np.random.default_rng(6).choice([0.25, 0.5, 1.0], 500).astype(np.float32)
+    one, regions = observation(sure=sure), np.arange(SPEC.num_voxels, dtype=np.uint16) % 40 // 39
+    many = [np.repeat(values, weights, axis=0) for values in (one.points, one.labels, sure)]
+    weighed = tally([observation(sure=sure, weights=weights, free_region=region)], "ray", regions)
+    repeated = tally([Observation(many[0], many[1], np.eye(4), sure=many[2], free_region=region)], "ray", regions)
+    assert (weighed.free == repeated.free).all() and weighed.free.any()
+    assert (weighed.occupied == repeated.occupied).all() and weighed.occupied["votes"].max() > 4
+
+
+def test_voters_of_one_observation_vote_as_observations_do():
+    poses = np.stack([np.eye(4), np.eye(4), np.eye(4)])
+    poses[1:, :3, 3] = (1.0, 0.5, 0.2), (-2.0, 0.1, 0.0)
+    one, ends = observation(), np.array([200, 200, 500])
+    parts = [
+        Observation(one.points[a:b], one.labels[a:b], pose)
+        for pose, a, b in zip(poses, [0, *ends[:-1]], ends, strict=True)
+    ]
+    for rule in ("sensor", "ray"):
+        together, apart = tally([Observation(one.points, one.labels, poses, ends=ends)], rule), tally(parts, rule)
+        assert (together.free == apart.free).all() and (together.occupied == apart.occupied).all()
+
+
+@pytest.mark.parametrize("ends", [None, [200], [200, 499], [600, 500]])
+def test_the_ends_of_voters_fit_poses_and_points(ends):
+    poses, one = np.stack([np.eye(4)] * 2), observation()
+    with pytest.raises(FormatError, match="ends"):
+        Observation(one.points, one.labels, poses, ends=None if ends is None else np.array(ends))

@@ -201,7 +201,7 @@ def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
     merging.scan_of(20).points[1] += np.float32([0.0, 0.3, 0.1])
     now = instant(15)
     for mirrored, plain in zip(
-        each_voter(merging.mirrored(now, [20], regions_of(merging).actors)),
+        each_voter(merging.in_bodies(now, [20], regions_of(merging).actors, mirror=True)),
         observe(merging, window=[20])[1],
         strict=True,
     ):
@@ -210,7 +210,7 @@ def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
         other = transform_points(actor_T_grid @ mirrored.grid_T_sensor, mirrored.points)
         assert np.abs(one * [1, -1, 1] - other).max() < 1e-5
         assert mirrored.hit_region == mirrored.free_region == 1
-    assert not list(merger(PEDESTRIAN).mirrored(now, FRAMES, regions_of(merger(PEDESTRIAN)).actors))
+    assert not list(merger(PEDESTRIAN).in_bodies(now, FRAMES, regions_of(merger(PEDESTRIAN)).actors, mirror=True))
 
 
 def test_what_passes_is_where_it_was_seen_and_frees_nothing():
@@ -335,3 +335,41 @@ def test_all_points_of_an_actor_vote_for_its_class():
         assert merger.labels(frame).tolist() == [ROAD, VEHICLE, 1]
     assert scans[1].labels.tolist() == [ROAD, PEDESTRIAN, 1]  # the scan keeps its own
     assert Merger(scans.__getitem__, actors, CARLA, "tube").labels(1).tolist() == [ROAD, PEDESTRIAN, 1]
+
+
+def dense_scan(frame, count=40_000):
+    rng = np.random.default_rng(7)
+    directions = rng.normal(size=(count, 3)) * (1, 1, 0.1)
+    points = directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(2, 50, (count, 1))
+    return PreparedScan.of(frame, points.astype(np.float32), np.ones(count, np.uint16), np.eye(4))
+
+
+def test_enough_rays_are_a_part_of_those_near_the_sensor_and_count_for_all():
+    one = dense_scan(3)
+    chosen, weights = one.enough
+    distance = np.linalg.norm(one.points, axis=1)
+    assert len(chosen) < 0.95 * len(distance)
+    assert np.array_equal(chosen[weights == 1], np.flatnonzero(distance > np.sqrt(len(distance) * 0.004 / 2)))
+    near = distance <= np.sqrt(len(distance) * 0.004 / 4)
+    assert (weights[near[chosen]] == 4).all() and near[chosen].sum() == pytest.approx(near.sum() / 4, rel=0.02)
+    assert int(weights.sum()) == pytest.approx(len(distance), rel=0.01)
+
+
+def test_which_rays_are_enough_depends_on_frame_and_ray_alone():
+    chosen = dense_scan(3).enough[0]
+    assert np.array_equal(chosen, dense_scan(3).enough[0])
+    others = dense_scan(4).enough[0]
+    assert not np.array_equal(chosen, others)
+
+
+@pytest.mark.parametrize("rays", ["all", "enough"])
+def test_the_frames_own_rays_all_vote(rays):
+    scans = {frame: dense_scan(frame) for frame in (14, 15)}
+    merging = Merger(scans.__getitem__, MovingActors(), CARLA, "align")
+    merging.rays = rays
+    other, own = merging.observations(instant(15), (14, 15), {})
+    assert len(own) == 40_000 and own.weights is None
+    assert (len(other) < 40_000) == (rays == "enough")
+    if rays == "enough":
+        assert np.array_equal(other.points, scans[14].points[scans[14].enough[0]])
+        assert other.hits.shape == other.labels.shape == other.weights.shape

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, thin
 from carlasc.core.grids import GridSpec
-from carlasc.core.scans import Scan, check_finite, sorted_by_origin
+from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
@@ -320,7 +320,7 @@ class ScanFeed:
         """
         scan, pose = self._voting_points(frame), self.pose(frame)
         explained = np.zeros(len(scan), np.bool_)
-        for segment in self.segments(frame, boxes).segments:
+        for segment in self._segments(frame, scan, boxes):
             explained[segment.members] = True
         ground = np.isin(_labels(scan), sorted(self.classes.ground)) if self.names_ground or self.finds_ground else None
         labels = _labels(scan) if self.has_labels else None
@@ -334,19 +334,20 @@ class ScanFeed:
             frame: frame number.
             boxes: the tracks of the sequence's boxes.
         """
-        scan, pose = self._voting_points(frame), self.pose(frame)
-        found: list[Segment] = []
-        standing = Standing.empty(frame)
-        if "boxes" in self.motion:
-            found = segment_by_boxes(frame, scan, pose, boxes, ground=self.classes.ground)
-        elif "instances" in self.motion:
-            found = segment_by_instances(frame, scan, pose, ground=self.classes.ground)
-        elif "flow" in self.motion:
-            speed = self.options.motion.min_speed_m_s
-            found = segment_by_flow(frame, scan, pose, min_speed_m_s=speed)
-            standing = standing_points(frame, scan, pose, self.classes.movable, min_speed_m_s=speed)
-        thinned = [replace(segment, points=thin(segment.points, _SIGHTING_POINTS)) for segment in found]
-        return ScanMotion(frame, tuple(thinned), standing)
+        scan, standing, speed = self._voting_points(frame), Standing.empty(frame), self.options.motion.min_speed_m_s
+        if self.motion[:1] == ("flow",):
+            standing = standing_points(frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed)
+        found = self._segments(frame, scan, boxes)
+        return ScanMotion(frame, tuple(replace(s, points=thin(s.points, _SIGHTING_POINTS)) for s in found), standing)
+
+    def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
+        """Return the actors of a scan with all of their points."""
+        pose, ground, by = self.pose(frame), self.classes.ground, [*self.motion, ""][0]
+        if by == "flow":
+            return segment_by_flow(frame, scan, pose, min_speed_m_s=self.options.motion.min_speed_m_s)
+        if by == "instances":
+            return segment_by_instances(frame, scan, pose, ground=ground)
+        return segment_by_boxes(frame, scan, pose, boxes, ground=ground) if by == "boxes" else []
 
     def _voting_points(self, frame: int) -> Scan:
         """Read a scan without the points that do not vote: unlabelled, too near or too far. Points with one origin are together."""
@@ -370,7 +371,7 @@ class ScanFeed:
         """Return (N,) which points are neither too near to where their rays began nor too far away; those that are not finite are not."""
         origins = scan.others.get("origins")
         with np.errstate(invalid="ignore", over="ignore"):
-            distance = np.sqrt(np.square(scan.points if origins is None else scan.points - origins).sum(axis=1))
+            distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
 
     def _with_ground(self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:

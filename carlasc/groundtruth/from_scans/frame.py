@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import count_points
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.body_regions import BodyRegions
@@ -30,7 +30,6 @@ from carlasc.groundtruth.voting.certainty import (
     probability,
 )
 from carlasc.groundtruth.voting.consensus import ClassConsensus, agree
-from carlasc.groundtruth.voting.kernel import mark
 from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.motion.tracks import MovingActors
 
@@ -75,6 +74,8 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     """
     merger, now, options, classes = feed.merger(actors, frame), feed.instant(frame), feed.options, feed.classes
 
+    merger.rays = options.rays if plan.rule == "ray" else "all"
+
     # The static scene votes everywhere, and each moving actor in the voxels of its body.
     regions = BodyRegions.at(merger, now, window, plan.spec)
     steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
@@ -99,7 +100,7 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     # Actors are completed by their mirror images, then by the usual shapes of vehicles.
     completing = list[Iterator[Observation]]()
     if bodies and options.complete != "seen":
-        completing.append(merger.mirrored(now, window, bodies))
+        completing.append(merger.in_bodies(now, window, bodies, mirror=True))
         if options.complete == "body":
             completing.append(merger.shells(now, bodies))
     completed = list[tuple[NDArray[np.int64], NDArray[Any]]]()
@@ -335,11 +336,10 @@ class _FrameSteps:
             return
         spec, scan = self.plan.spec, self.feed.read(self.now.frame)
         points = scan.points if self.merger.dynamic != "drop" else scan.points[self.merger.static(self.now.frame)]
-        found = spec.flat_index(transform_points(self.now.grid_T_world @ scan.world_T_sensor, points))
-        returned, returns = np.unique(found[found >= 0], return_counts=True)
-        is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
-        lost = returned[is_lost]
-        is_single = (returns[is_lost] == 1) & ~_have_neighbours(lost, returned, spec)
+        returns = count_points(points, self.now.grid_T_world @ scan.world_T_sensor, spec)
+        returned = np.flatnonzero(returns)
+        lost = returned[(made.labels[returned] == 0) & (consensus.labels[returned] > 0)]
+        is_single = (returns[lost] == 1) & ~_have_neighbours(lost, returned, spec)
         rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
@@ -354,14 +354,16 @@ class _FrameSteps:
         apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-        path = np.zeros(self.plan.spec.num_voxels, np.bool_)
+        path = np.zeros(self.plan.spec.num_voxels, np.int32)
         for other in self.window:
             if other != self.now.frame:
-                mark(body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path)
-        voxels = np.flatnonzero(path & (made.labels > 0))
+                count_points(body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path)
+        voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
         there_now = self.in_body  # and where the frame's own scan has points
         if self.now.frame in self.window:
             scan = self.feed.read(self.now.frame)
-            there_now = there_now | mark(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec)
+            there_now = there_now | (
+                count_points(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec) > 0
+            )
         return voxels[solid & ~there_now[voxels]]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, transform_points, translation
-from carlasc.core.scans import runs_of_origins
-from carlasc.groundtruth.options import Dynamic
+from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
+from carlasc.groundtruth.options import Dynamic, Rays
 from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
@@ -29,7 +29,8 @@ _RECENT_S = 0.25  # what scans saw within this time before and after a frame is 
 # What is so near to an actor's body may be a part of it that its path puts elsewhere: metres along, across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
 _MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
-_TURN = 65_000  # steps of azimuth, of 0.1 mrad: they fit 16 bits
+_POINT_M2 = 0.004  # area of a sphere around the sensor, over the number of points, in which one ray is enough
+_GOLDEN, _SILVER = 2654435769, 1779033703  # multiples of them, modulo 2 ** 32, are evenly spread
 
 
 @dataclass(frozen=True)
@@ -50,74 +51,6 @@ class Instant:
     def grid_T_world(self) -> Transform:
         """(4, 4), the inverse of the grid's pose."""
         return invert(self.world_T_grid)
-
-
-@dataclass(frozen=True)
-class RaysFromPlace:
-    """Those rays of a scan that began at one place.
-
-    Attributes:
-        part: the points of the scan to which they go.
-        sensor_T_place: (4, 4), from the place where they began, in the axes of the sensor, to the sensor's frame.
-        points: (M, 3) float32, the same points seen from there, metres.
-        order: (M,) int32, indices of `points` by increasing azimuth.
-        azimuth: (M,) uint16, their azimuths in this order, in steps of which `_TURN` are a full circle, from -pi.
-    """
-
-    part: slice
-    sensor_T_place: Transform
-    points: NDArray[np.float32]
-    order: NDArray[np.int32]
-    azimuth: NDArray[np.uint16]
-
-    @classmethod
-    def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> RaysFromPlace:
-        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan, which are given as seen from there."""
-        own = points[part]
-        azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
-        order = np.argsort(azimuth, kind="stable").astype(np.int32)  # of 16 bits: by their digits
-        return cls(part, translation(origin), own, order, azimuth[order])
-
-    def through(
-        self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
-    ) -> NDArray[np.int32]:
-        """Return the indices of the points whose rays, from where they began to the point, intersect a box.
-
-        Args:
-            box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is axis-aligned.
-            lower: (3,) lower corner.
-            upper: (3,) upper corner.
-        """
-        candidates = self._in_view_of(box_T_sensor, lower, upper)
-        origin = box_T_sensor[:3, 3]
-        rays = transform_points(box_T_sensor, self.points[candidates]) - origin
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one, other = (lower - origin) / rays, (upper - origin) / rays
-        # A ray that lies in a face gives 0/0 there: fmin and fmax ignore the NaN.
-        enter = np.fmin(one, other).max(axis=1)
-        leave = np.fmax(one, other).min(axis=1)
-        return candidates[(enter <= leave) & (leave >= 0) & (enter <= 1)]
-
-    def _in_view_of(
-        self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
-    ) -> NDArray[np.int32]:
-        """Return the indices of the points in the range of azimuths that a box covers."""
-        origin = box_T_sensor[:3, 3]
-        if ((origin > lower) & (origin < upper))[:2].all():  # the sensor is above, below or inside the box
-            return self.order
-        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
-        seen = transform_points(invert(box_T_sensor), corners)
-        angles = np.arctan2(seen[:, 1], seen[:, 0])
-        middle = np.arctan2(np.sin(angles).sum(), np.cos(angles).sum())
-        half = np.abs((angles - middle + np.pi) % (2 * np.pi) - np.pi).max() + 1e-6
-        if half > np.pi / 2:  # the corners surround the sensor
-            return self.order
-        low, high = np.floor(_steps(middle - half)) - 1, np.ceil(_steps(middle + half)) + 1
-        parts = [
-            self.order[slice(*np.searchsorted(self.azimuth, np.clip([low + turn, high + turn + 1], 0, _TURN + 1)))]
-            for turn in (0, _TURN, -_TURN)
-        ]
-        return np.concatenate(parts)
 
 
 @dataclass(frozen=True)
@@ -173,7 +106,7 @@ class PreparedScan:
             origins: (N, 3) where the ray to each point began, metres; None: all at the sensor. Points with one origin are next to each other.
             probabilities: (N, 6) the field of the scan; None: labels are sure.
         """
-        reach = float(np.sqrt(np.square(points).sum(axis=1).max(initial=0.0)))
+        reach = float(lengths(points).max(initial=0.0))
         moving = np.empty(0, np.int64) if moving is None else moving
         sure = None
         if probabilities is not None:  # labels that it does not name first were found by carlasc
@@ -189,31 +122,27 @@ class PreparedScan:
         places = np.stack([rays.sensor_T_place for rays in self.rays])
         return self.world_T_sensor @ places if len(places) > 1 or places[0, :3, 3].any() else self.world_T_sensor
 
-    def observation(
-        self,
-        grid_T_world: Transform,
-        hits: NDArray[np.bool_] | None = None,
-        *,
-        labels: NDArray[np.uint16] | None = None,
-        free_region: int | None = None,
-    ) -> Observation:
-        """Return the votes of the scan: those of a voter for each place where rays began.
+    @cached_property
+    def enough(self) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+        """(M,) indices of rays that are enough, and how many rays each stands for: of up to four near the sensor, where points are dense.
+
+        Which ones depends on the number of the frame and of the ray alone, so that scans of one place differ.
+        """
+        crowd = len(self.ends) * _POINT_M2 / np.maximum(np.square(lengths(self.ends)), np.float32(1e-3))
+        power = ((crowd >= 2).astype(np.uint32) + (crowd >= 4)).astype(np.uint32)
+        turn = np.arange(len(power), dtype=np.uint32) * np.uint32(_GOLDEN) + np.uint32(self.frame * _SILVER % 2**32)
+        chosen = np.flatnonzero(turn <= np.uint32(2**32 - 1) >> power)
+        return chosen, np.left_shift(1, power[chosen]).astype(np.uint8)
+
+    def votes_of(self, labels: NDArray[np.uint16], hits: NDArray[np.bool_] | None) -> dict[str, Any]:
+        """Return what the scan votes for, as `Observation` takes it: all but the poses of the places where rays began, and regions.
 
         Args:
-            grid_T_world: (4, 4).
+            labels: (N,) the classes that points vote for.
             hits: (N,) bool, points that vote for their class; None: all.
-            labels: (N,) the classes that they vote for; None: their own.
-            free_region: region of the grid in which rays vote; None for the whole grid.
         """
-        return Observation(
-            self.ends,
-            self.labels if labels is None else labels,
-            grid_T_world @ self.world_T_places,
-            hits,
-            free_region=free_region,
-            sure=self.sure,
-            ends=None if self.world_T_places.ndim == 2 else np.array([rays.part.stop for rays in self.rays]),
-        )
+        ends = None if self.world_T_places.ndim == 2 else np.array([rays.part.stop for rays in self.rays])
+        return {"points": self.ends, "labels": labels, "hits": hits, "sure": self.sure, "ends": ends}
 
     def through(
         self, world_T_box: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
@@ -244,14 +173,16 @@ class Merger:
         self, scan_of: Callable[[int], PreparedScan], actors: MovingActors, classes: ClassTable, dynamic: Dynamic
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
+        self.rays: Rays = "all"
         self._static: dict[int, NDArray[np.bool_]] = {}
         self._labels: dict[int, NDArray[np.uint16]] = {}
         self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
+        self._sampled: dict[int, dict[str, Any]] = {}
         self._moving: dict[int, tuple[NDArray[np.float32], NDArray[np.uint16]]] = {}
 
     def forget_before(self, frame: int) -> None:
         """Remove what is kept of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving):
+        for kept in (self._static, self._labels, self._moving, self._sampled):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
@@ -274,34 +205,43 @@ class Merger:
             hits = None if everything else self.static(other)
             if everything and self.actors.own:  # the recording vehicle is no part of the scene
                 hits = ~self.actors.is_own(scan.points)
-            yield scan.observation(grid_T_world, hits, labels=self.labels(other), free_region=None if own else STATIC)
+            sampled = self.rays == "enough" and not own
+            votes = self._enough(scan, hits) if sampled else scan.votes_of(self.labels(other), hits)
+            places = grid_T_world @ scan.world_T_places
+            yield Observation(grid_T_sensor=places, free_region=None if own else STATIC, **votes)
         yield from self.in_bodies(now, window, bodies)
 
-    def in_bodies(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield the second part of `observations`."""
-        window = list(window)
-        for region, number in bodies.items():
-            pose = self.actors.tracks[number].pose(now.frame)
-            if pose is not None:
-                yield from self._in_body(number, region, [other for other in window if other != now.frame], now, pose)
+    def _enough(self, scan: PreparedScan, hits: NDArray[np.bool_] | None) -> dict[str, Any]:
+        """Return what a part of a scan's rays votes for: prepared once, for all frames that use it."""
+        if scan.frame not in self._sampled:
+            votes, (chosen, weights) = scan.votes_of(self.labels(scan.frame), hits), scan.enough
+            ends = votes.pop("ends")
+            parts = {name: None if values is None else values[chosen] for name, values in votes.items()}
+            parts["ends"] = None if ends is None else np.searchsorted(chosen, ends)
+            self._sampled[scan.frame] = {**parts, "weights": weights}
+        return self._sampled[scan.frame]
 
-    def mirrored(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield what the scans of actors would have seen if they had looked at the actors' other side.
+    def in_bodies(
+        self, now: Instant, window: Iterable[int], bodies: Mapping[int, int], *, mirror: bool = False
+    ) -> Iterator[Observation]:
+        """Yield what scans saw in each actor's body: one observation, with a voter for each place where rays began.
 
-        Vehicles are symmetric: their points and rays are reflected in the vertical plane through the middle of the body, if that is known.
+        Args:
+            now: the frame.
+            window: frames of the scans.
+            bodies: number of the actor by region, for the actors that vote in their bodies.
+            mirror: what scans would have seen if they had looked at the actors' other side. Vehicles are symmetric: their points and rays are
+                reflected in the vertical plane through the middle of the body, if that is known. The frame's own scan is used for this only.
         """
+        window = [other for other in window if mirror or other != now.frame]
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            if track.rigid and pose is not None and any(track.extent.known):
-                yield from self._in_body(number, region, window, now, pose, mirror=True)
-
-    def _in_body(
-        self, number: int, region: int, window: Iterable[int], now: Instant, pose: Transform, mirror: bool = False
-    ) -> Iterator[Observation]:
-        """Yield what the scans of a window saw in an actor's body, if they did: one observation, with a voter for each place where rays began."""
-        seen = [carried for other in window for carried in self._carry(number, other, now)]
-        if seen:
+            if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
+                continue
+            seen = [carried for other in window for carried in self._carry(number, other, now)]
+            if not seen:
+                continue
             points = np.concatenate([carried.points for carried in seen])
             places = np.stack([carried.grid_T_sensor for carried in seen])
             grid_T_actor = now.grid_T_world @ pose
@@ -387,11 +327,6 @@ class Merger:
                     labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
                     found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
         return self._carried.setdefault((number, other), tuple(found))
-
-
-def _steps(azimuth_rad: Any) -> Any:
-    """Return azimuths in steps, counted from -pi, not rounded."""
-    return (azimuth_rad + np.pi) * (_TURN / (2 * np.pi))
 
 
 def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:

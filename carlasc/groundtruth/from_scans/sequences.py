@@ -207,6 +207,7 @@ class ScanSequence(StoredSequence):
             record |= {"complete": options.complete}
         if not options.own_path:
             record |= {"own_path": False}
+        record |= {"rays": options.rays} if options.rays != "all" else {}
         record |= {"poses": "kiss-icp"} if self.estimates_poses else {}
         record |= {"refine": options.poses.refine} if self.refines else {}
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}

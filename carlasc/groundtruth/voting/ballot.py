@@ -24,7 +24,8 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
-_ALL, _ALL_SURE, _NONE = np.empty(0, np.bool_), np.empty(0, np.float32), np.empty(0, np.int64)
+_ALL, _ALL_ONE = np.empty(0, np.bool_), np.empty(0, np.uint8)
+_ALL_SURE, _NONE = np.empty(0, np.float32), np.empty(0, np.int64)
 _FEW = 8  # so many times fewer voxels are few
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
@@ -49,6 +50,7 @@ class Observation:
         free_region: region of the grid in which the rays vote; None for the whole grid.
         sure: (N,) float32, probability of the class of each point; None: 1.
         ends: (K,) int64, behind the last point of each voter; None: there is one.
+        weights: (N,) uint8, number of rays that each ray stands for, where votes are not one per voxel; None: 1.
 
     Raises:
         FormatError: points and labels differ in length, have another shape or type, or the transform is not rigid.
@@ -62,6 +64,7 @@ class Observation:
     free_region: int | None = None
     sure: NDArray[np.float32] | None = None
     ends: NDArray[np.int64] | None = None
+    weights: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -75,11 +78,10 @@ class Observation:
         if self.hits is not None and self.hits.shape != self.labels.shape:
             raise FormatError("observation hits", expected=f"shape ({len(self.points)},)", found=str(self.hits.shape))
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
-        voters, ends = np.shape(self.grid_T_sensor)[:-2], np.array([len(self)]) if self.ends is None else self.ends
-        if (voters or (1,)) != ends.shape or [*ends[-1:]] != [len(self)] * len(ends[-1:]) or (np.diff(ends) < 0).any():
-            raise FormatError(
-                "observation ends", expected=f"shape {voters or (1,)}, rising to {len(self)}", found=str(ends)
-            )
+        poses, ends = np.shape(self.grid_T_sensor)[:-2], self.ends
+        voters = () if ends is None else ends.shape
+        if poses != voters or (ends is not None and ([0, *ends][-1] != len(self) or (np.diff(ends) < 0).any())):
+            raise FormatError("observation ends", expected=f"shape {poses}, rising to {len(self)}", found=str(ends))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -193,13 +195,17 @@ class Ballot:
             )
         ends = np.array([len(observation)]) if observation.ends is None else observation.ends
         self._make_room(len(observation))
-        kernel.vote(
+        cast = kernel.Voters(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
             np.require(observation.labels, np.uint16, ["C", "A", "W"]),
             _ALL if observation.hits is None else np.require(observation.hits, np.bool_, ["C", "A", "W"]),
             _ALL_SURE if observation.sure is None else np.require(observation.sure, np.float32, ["C", "A", "W"]),
+            _ALL_ONE if observation.weights is None else np.require(observation.weights, np.uint8, ["C", "A", "W"]),
             np.ascontiguousarray(observation.grid_T_sensor, np.float64).reshape(-1, 16)[:, :12].copy(),
             ends,
+        )
+        kernel.vote(
+            cast,
             self._cells,
             self.free_step_m,
             self.num_observations,

@@ -81,7 +81,8 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     dtype = field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE
     if not len(votes):
         return ClassConsensus(labels, np.empty(0, dtype), 0.0)
-    present, own = np.unique(votes["label"], return_inverse=True)
+    counted = np.bincount(votes["label"]) > 0
+    present, own = np.flatnonzero(counted), (np.cumsum(counted) - 1)[votes["label"]]
     begins = np.append(np.flatnonzero(np.diff(votes["voxel"], prepend=-1)), len(votes))
     voxels = votes["voxel"][begins[:-1]]
     rows = np.full(spec.num_voxels, -1, np.int32)
@@ -279,7 +280,10 @@ def _explain(
     for _ in range(_SHARES):
         left[:] = _PRIOR * likeliest
         for row in range(begins[i], begins[i + 1]):
-            of_class = shares * confusion[:, own[row]]
-            left += weight[row] * of_class / of_class.sum()
+            whole = 0.0
+            for c in range(len(left)):
+                whole += shares[c] * confusion[c, own[row]]
+            for c in range(len(left)):
+                left[c] += weight[row] * (shares[c] * confusion[c, own[row]]) / whole
         for c in range(len(left)):
             shares[c] = left[c] / (total + _PRIOR)

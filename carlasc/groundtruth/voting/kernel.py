@@ -13,10 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Cells, Pose, as_pose, find_voxel, transform
+from carlasc.core.cells import Cells, Pose, transform
 from carlasc.core.compiling import cached, inlined, jit
-from carlasc.core.geometry import Transform
-from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
     DOUBTFUL,
@@ -84,6 +82,28 @@ class Tally(NamedTuple):
     viewers: NDArray[np.int32]
 
 
+class Voters(NamedTuple):
+    """What one observation votes with.
+
+    Attributes:
+        points: (3 N,) float32, metres, x, y, z of each point, from where its ray began, on the axes of the sensor.
+        labels: (N,) uint16; points labelled 0 and their rays do not vote.
+        hits: (N,) which points vote for their class; empty if all do.
+        sure: (N,) float32, probability of these classes; empty if all are 1.
+        weights: (N,) uint8, votes that each point and each sample of its ray has; empty if all have one, as with `Tally.once`.
+        poses: (K, 12) grid_T_place of the places where rays began, each of which is a voter.
+        ends: (K,) behind the last point of each place.
+    """
+
+    points: NDArray[np.float32]
+    labels: NDArray[np.uint16]
+    hits: NDArray[np.bool_]
+    sure: NDArray[np.float32]
+    weights: NDArray[np.uint8]
+    poses: NDArray[np.float64]
+    ends: NDArray[np.int64]
+
+
 @inlined
 def count_view(voxel: int, voter: int, tally: Tally) -> None:
     """Count that an observation saw a voxel, if views are counted."""
@@ -98,6 +118,7 @@ def vote_occupied(
     labels: NDArray[np.uint16],
     hits: NDArray[np.bool_],
     sure: NDArray[np.float32],
+    weights: NDArray[np.uint8],
     rays: RayBlock,
     voxels: NDArray[np.int32],
     pose: Pose,
@@ -115,19 +136,20 @@ def vote_occupied(
         if voxel == DOUBTFUL or rays.state[i] == UNSURE:
             _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
         if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
+            weight = int(weights[i]) if len(weights) else 1
             if voxel != last or labels[i] != label:
                 last, label = voxel, labels[i]
-                entry = vote_for(voxel, label, voter, tally)
+                entry = vote_for(voxel, label, weight, voter, tally)
                 count_view(voxel, voter, tally)
             elif not tally.once:  # neighbours are often in one voxel
-                tally.candidates[entry].votes += 1
+                tally.candidates[entry].votes += weight
             if len(sure):
-                tally.candidates[entry].doubt += np.float32(1) - sure[i]
+                tally.candidates[entry].doubt += np.float32(weight) * (np.float32(1) - sure[i])
 
 
 @inlined
-def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> int:
-    """Add a vote for a class to a voxel, and return the index of its candidate."""
+def vote_for(voxel: int, label: int, weight: int, voter: int, tally: Tally) -> int:
+    """Add votes for a class to a voxel, and return the index of its candidate."""
     candidates = tally.candidates
     entry = tally.heads[voxel]
     while entry != NONE and candidates[entry].label != label:
@@ -144,7 +166,7 @@ def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> int:
         tally.heads[voxel] = entry
     # Without the branch, with a sum of conditions, the whole kernel takes half as long again.
     if not tally.once or candidates[entry].voter != voter:
-        candidates[entry].votes += 1
+        candidates[entry].votes += weight
         candidates[entry].voters += candidates[entry].voter != voter
         candidates[entry].voter = voter
     return int(entry)
@@ -154,6 +176,7 @@ def vote_for(voxel: int, label: int, voter: int, tally: Tally) -> int:
 def vote_free(
     points: NDArray[np.float32],
     labels: NDArray[np.uint16],
+    weights: NDArray[np.uint8],
     rays: RayBlock,
     pose: Pose,
     view: GridView,
@@ -170,10 +193,10 @@ def vote_free(
     """
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
+        weight = np.uint32(weights[i]) if len(weights) else np.uint32(1)
         if rays.state[i] == UNSURE:
-            vote_free_by_rule(
-                points[3 * i], points[3 * i + 1], points[3 * i + 2], pose, view, cells, free_step_m, counted, tally
-            )
+            point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
+            vote_free_by_rule(point, weight, pose, view, cells, free_step_m, counted, tally)
         if rays.state[i] != SURE:
             continue
         x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
@@ -202,10 +225,11 @@ def vote_free(
                     tally.passed[np.uint32(voxels[j])] = 1
             elif counted == ANYWHERE:
                 for j in range(number):
-                    tally.free[np.uint32(voxels[j])] += 1
+                    tally.free[np.uint32(voxels[j])] += weight
             else:
                 for j in range(number):
-                    tally.free[np.uint32(voxels[j])] += tally.regions[np.uint32(voxels[j])] == counted
+                    if tally.regions[np.uint32(voxels[j])] == counted:
+                        tally.free[np.uint32(voxels[j])] += weight
             if len(tally.views):
                 for j in range(number):
                     if region == ANYWHERE or tally.regions[voxels[j]] == region:
@@ -215,9 +239,8 @@ def vote_free(
 
 @jit
 def vote_free_by_rule(
-    x: np.float32,
-    y: np.float32,
-    z: np.float32,
+    point: tuple[np.float32, np.float32, np.float32],
+    weight: np.uint32,
     pose: Pose,
     view: GridView,
     cells: Cells,
@@ -226,6 +249,7 @@ def vote_free_by_rule(
     tally: Tally,
 ) -> None:
     """Add the votes of one ray's free samples by the rule alone, clipped to the grid with a wide margin."""
+    x, y, z = point
     norm, ux, uy, uz = unit_ray(x, y, z)
     starts = transform(view.pose, x, y, z)
     units = transform(view.pose, ux, uy, uz)
@@ -242,18 +266,13 @@ def vote_free_by_rule(
         if tally.once:
             tally.passed[voxel] = 1
         elif region == ANYWHERE or tally.regions[voxel] == region:
-            tally.free[voxel] += 1
+            tally.free[voxel] += weight
         step += 1.0
 
 
 @cached
 def vote(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint16],
-    hits: NDArray[np.bool_],
-    sure: NDArray[np.float32],
-    poses: NDArray[np.float64],
-    ends: NDArray[np.int64],
+    cast: Voters,
     cells: Cells,
     free_step_m: float,
     voter: int,
@@ -265,12 +284,7 @@ def vote(
     """Add the votes of one observation.
 
     Args:
-        points: (3 N,) float32, metres, x, y, z of each point, from where its ray began, on the axes of the sensor.
-        labels: (N,) uint16; points labelled 0 and their rays do not vote.
-        hits: (N,) which points vote for their class; empty if all do.
-        sure: (N,) float32, probability of these classes; empty if all are 1.
-        poses: (K, 12) grid_T_place of the places where rays began, each of which is a voter.
-        ends: (K,) behind the last point of each place.
+        cast: the observation.
         cells: the cells of the grid.
         free_step_m: distance between two free samples, metres.
         voter: number of the first voter.
@@ -279,6 +293,7 @@ def vote(
         apart: (A,) voxels outside of `free_region`, if they are so few that their votes are better put back than not counted; or empty.
         tally: the votes so far, with room for N more candidates.
     """
+    points, labels, hits, sure, weights, poses, ends = cast
     rays, found, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
     kept = tally.free[apart]
     for place in range(len(ends)):
@@ -290,23 +305,12 @@ def vote(
             corner, block = points[3 * begin : 3 * end], labels[begin:end]
             clip(corner, block, free_step_m, view, rays)
             place_points(rays, view, found[: end - begin])
-            own, likely = hits[begin:end], sure[begin:end]
-            vote_occupied(corner, block, own, likely, rays, found, pose, cells, voter + place, hit_region, tally)
+            own, likely, count = hits[begin:end], sure[begin:end], weights[begin:end]
+            now = voter + place
+            vote_occupied(corner, block, own, likely, count, rays, found, pose, cells, now, hit_region, tally)
             if free_region != NOT_AT_ALL:
                 counted = ANYWHERE if len(apart) else free_region
-                vote_free(
-                    corner,
-                    block,
-                    rays,
-                    pose,
-                    view,
-                    cells,
-                    free_step_m,
-                    voter + place,
-                    free_region,
-                    counted,
-                    tally,
-                )
+                vote_free(corner, block, count, rays, pose, view, cells, free_step_m, now, free_region, counted, tally)
             begin = end
         if tally.once:
             count_passed(free_region, tally)
@@ -392,28 +396,3 @@ def interleave(free: NDArray[Any], rows: NDArray[Any], votes: NDArray[Any], most
             votes[end].voxel, votes[end].label = voxel, rows[row].label
             votes[end].votes = min(rows[row].votes, most)
             row, end = row + 1, end + 1
-
-
-def mark(
-    points: NDArray[np.floating], grid_T_points: Transform, spec: GridSpec, marked: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
-    """Return which voxels have points, (V,) bool: what `GridSpec.flat_index` finds, without an array for each step.
-
-    Args:
-        points: (N, 3) metres.
-        grid_T_points: (4, 4), from the frame of the points to the grid's.
-        spec: geometry of the grid.
-        marked: (V,) bool, voxels that are marked already; it is changed, and returned. None: no voxel is.
-    """
-    marked = np.zeros(spec.num_voxels, np.bool_) if marked is None else marked
-    _mark(np.ascontiguousarray(points, np.float64), as_pose(grid_T_points), Cells.of(spec), marked)
-    return marked
-
-
-@cached
-def _mark(points: NDArray[np.float64], pose: Pose, cells: Cells, marked: NDArray[np.bool_]) -> None:
-    for i in range(len(points)):
-        x, y, z = transform(pose, points[i, 0], points[i, 1], points[i, 2])
-        voxel = find_voxel(x, y, z, cells)
-        if voxel < len(marked):
-            marked[voxel] = True
