@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from carlasc import Dataset, Flip, GridSpec
+from carlasc.cli import app
 from carlasc.dataset import ACTOR_FIELDS
 from carlasc.dataset.transforms import flip
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.inspection import validate
+from carlasc.inspection import info, stats, validate
 from carlasc.storage import FolderSink, field_files
 from carlasc.testing.data import params
 
@@ -121,3 +123,16 @@ def test_validate_names_repeated_voxels_actors_in_free_voxels_and_grids_of_anoth
     assert len(found) == 1 and "192 bytes (4 x 6 x 2 uint32)" in found[0].expected
     with pytest.raises(FormatError, match="000000.instance"):
         sample_of(root)
+
+
+def test_stats_count_the_voxels_of_actors(tmp_path):
+    found = stats(write(tmp_path)).total
+    assert (found.actor_voxels, found.moving_voxels) == (3, 2)
+    assert stats(tmp_path).to_dict()["total"]["moving_voxels"] == 2
+    result = CliRunner().invoke(app, ["stats", str(tmp_path)])
+    assert "3 voxels belong to actors, 2 move" in result.output
+
+
+def test_info_lists_both_fields(tmp_path):
+    (sequence,) = info(write(tmp_path)).sequences
+    assert {"instance", "velocity"} <= set(sequence.grids[0].parts)
