@@ -75,6 +75,8 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
     if total.grids:
         text = f"{total.known_share:.1%} of voxels known ({total.grids} grids); shares of voxels are shares of the known voxels; class 0 of points is unlabelled"
         out.print(line(text))
+    if total.actor_voxels:
+        out.print(line(f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} move"))
 
 
 def _class_table(

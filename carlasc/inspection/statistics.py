@@ -17,7 +17,7 @@ from carlasc.core.tables import benchmark_remap, remap_named, remaps_between, to
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
-from carlasc.storage import as_source
+from carlasc.storage import as_source, layout
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
 
@@ -42,6 +42,8 @@ class Histogram:
         unknown: number of unknown voxels (count 0).
         scans: number of scans counted.
         grids: number of grids counted.
+        actor_voxels: number of voxels that belong to an actor, where grids say it.
+        moving_voxels: number of voxels that move, where grids say it.
     """
 
     points: NDArray[np.int64]
@@ -49,6 +51,8 @@ class Histogram:
     unknown: int = 0
     scans: int = 0
     grids: int = 0
+    actor_voxels: int = 0
+    moving_voxels: int = 0
 
     @classmethod
     def empty(cls, classes: ClassTable) -> Histogram:
@@ -63,6 +67,8 @@ class Histogram:
             self.unknown + other.unknown,
             self.scans + other.scans,
             self.grids + other.grids,
+            self.actor_voxels + other.actor_voxels,
+            self.moving_voxels + other.moving_voxels,
         )
 
     def of(self, kind: Kind) -> NDArray[np.int64]:
@@ -157,6 +163,7 @@ class Statistics:
             counts = {kind: self.named(histogram.of(kind)) for kind in KINDS}
             remapped = {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS} if self.remap else {}
             figures = {"unknown_voxels": histogram.unknown, "scans": histogram.scans, "grids": histogram.grids}
+            figures |= {name: getattr(histogram, name) for name in ("actor_voxels", "moving_voxels")}
             share = histogram.known_share
             return counts | remapped | figures | {"known_share": None if np.isnan(share) else share}
 
@@ -269,7 +276,12 @@ def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable
         labels, unknown = labels[known], int(np.count_nonzero(~known))
     else:
         unknown = 0
-    return Histogram(nothing, np.bincount(labels, minlength=classes.num_channels), unknown, grids=1)
+    grid, who = field.removesuffix("labels"), list[int]()
+    for part in layout.ACTOR_FIELDS:
+        has = f"{grid}{part}" in sequence.fields() and frame in sequence.frames(f"{grid}{part}")
+        array = sequence.read(f"{grid}{part}", frame) if has else np.empty(0, np.uint8)
+        who.append(len(array) if part == "velocity" else int(np.count_nonzero(array)))
+    return Histogram(nothing, np.bincount(labels, minlength=classes.num_channels), unknown, 0, 1, *who)
 
 
 def _table_of(sequence: Sequence, field: str) -> ClassTable:

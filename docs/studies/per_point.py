@@ -1,4 +1,4 @@
-"""Which points move, without labels: `python docs/studies/per_point.py [WORK]` prints the rows of docs/commands/label.md.
+"""Which points move, without labels: `python docs/studies/per_point.py [WORK]` prints the figures of docs/ground-truth.md.
 
 Simulated drives are given as points and poses only, and `carlasc label --from motion` says which points move: those with a velocity above
 0.5 m/s. The truth is the flow of the recording. The IoU is over all points of every fifth scan. The worlds are the town and the street of
