@@ -10,7 +10,7 @@ code that has changed must be removed (WORK/scores). The default is a temporary 
     --town, --street SEED ...   other drives (61 to 65 and 261 to 265)
     --workers N   processes (2)
 
-The rows with DUFOMap need the extra `study` (Python 3.12 or older).
+The rows with DUFOMap need the extra `study` (Python 3.12 or older). SA, DA and AA of maps, those of other programs too: `maps.py`.
 """
 
 from __future__ import annotations

@@ -20,6 +20,8 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source
 from carlasc.storage.protocol import Source
 
+_LEAST_CELL_M = 0.001  # less is finer than float32 positions are
+
 
 @dataclass(frozen=True)
 class MapResult:
@@ -90,8 +92,8 @@ def map(
         StorageError: a file cannot be written.
     """
     began = time.perf_counter()
-    if not (math.isfinite(cell_m) and cell_m > 0):
-        raise ArgumentError("cell_m", expected="a positive number of metres", found=str(cell_m))
+    if not (math.isfinite(cell_m) and cell_m >= _LEAST_CELL_M):
+        raise ArgumentError("cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m))
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
     files = MapFiles.of(out, mesh, distance, movers, grid)
