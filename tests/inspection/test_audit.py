@@ -19,7 +19,9 @@ from carlasc.core.geometry import invert, rotation_z
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth import FromScans, Observation, count_votes
 from carlasc.inspection import write_audit_page
+from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.running import Part
+from carlasc.storage import layout
 
 FRAMES, SPEC = 16, GridSpec.published()
 LIDAR = Lidar(channels=24, points=12_000, range_m=40.0)
@@ -59,7 +61,7 @@ MOVED = {
 }
 
 
-QUICK = ("half x", "mirrored", "classes")
+QUICK = ("half x", "mirrored", "classes", "elsewhere")
 
 
 def some(names):
@@ -76,7 +78,13 @@ def test_a_shift_is_named_with_its_size(town, tmp_path, name):
         assert found[check].low - 1e-6 <= size <= found[check].high + 1e-6
 
 
+def elsewhere(_sequence, _frame, labels, counts):
+    """Return what no shift that is tried explains, as grids of another sequence."""
+    return np.roll(labels, (40, 25), axis=(0, 1)), counts
+
+
 WRONG = {
+    "elsewhere": ({"change": elsewhere}, "fit", "of the points of scans are in occupied voxels"),
     "mirrored": ({"change": planted.mirrored}, "axes", "y mirrored"),
     "axes": ({"change": planted.swapped_axes}, "axes", "x, y, z of the grid are y, x, z of the scans"),
     "late": ({"late": 1}, "lag", "1 frame (0.10 s) late"),
@@ -241,3 +249,22 @@ def test_scans_without_poses_tell_less_and_say_so(town, tmp_path):
     assert any("no poses" in note for note in result.notes)
     states = {verdict.check: verdict.state for verdict in result.verdicts["cartesian"]}
     assert states["height drift"] == states["ghost trails"] == "undetermined"
+
+
+@pytest.mark.slow
+def test_a_drift_of_five_centimetres_a_second_is_named(tmp_path):
+    scans, drifting, spec = tmp_path / "town", tmp_path / "drifting", GridSpec.published("fine")
+    capture = carlasc.captures.SimulatedCapture(
+        count=51, first_frame=20, sensors=1, seed=6, traffic="light", lidar=LIDAR, bev=False
+    )
+    carlasc.regrid(capture, SPEC, scans, run=Run(workers=1))
+    shutil.copytree(scans, drifting, ignore=shutil.ignore_patterns("evaluation"))
+    poses = planted.sequence_of(scans).poses.copy()
+    poses[:, 2, 3] += 0.05 * 0.1 * np.arange(len(poses))
+    next(drifting.rglob("poses.txt")).write_bytes(layout.encode_poses(poses))
+    observe = FromScans((-25, 25), motion=MotionOptions("flow"), poses=PoseOptions("file", "never"))
+    for folder, wanted in ((drifting, {"height drift": 0.05}), (scans, {})):
+        made = tmp_path / f"{folder.name}-grids"
+        carlasc.regrid(folder, spec, made, observe=observe, frames=(20, 31), name="evaluation", run=Run(workers=1))
+        found = faults(made, scans)
+        assert {check: verdict.value for check, verdict in found.items()} == pytest.approx(wanted, abs=0.011)

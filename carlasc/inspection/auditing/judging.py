@@ -27,7 +27,7 @@ _GAIN, _FEWER = (
 _ALIKE = 0.02  # axes and lags whose shares differ by less are not told apart
 _SAME = 0.25  # of the gain: corrections whose gains differ by less are not told apart
 _FLAT = 0.006  # values whose shares differ by less are equal
-_BELONGS = 0.5  # share of points below which scans and grids do not belong together
+_BELONGS = 0.75  # share of points below which scans and grids do not belong together
 _LEAST = {
     "shift": 0.2,
     "yaw": 0.4,
