@@ -33,6 +33,10 @@ class CameraFlags(Flags):
         ),
     ] = None
     orbit: Annotated[bool, typer.Option("--orbit", help="Circle the scene once (a film).")] = False
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Draw the grid over the images of this camera of the recording, and nothing else."),
+    ] = None
     still: Annotated[
         bool, typer.Option("--still", help="The camera does not follow the ego vehicle (needs poses).")
     ] = False
@@ -146,6 +150,9 @@ def render(
     scenes = [scene.scene(source, panels.palette) for source in sources]
     if len(scenes) > 1 and not panels.grid_of:
         raise ArgumentError("SOURCE", expected="one", found=str(len(scenes)), advice="draw several with --grid-of")
+    if camera.camera is not None:
+        _draw_over_images(scenes[0], camera, out, fps, overwrite, as_json)
+        return
     taken, looks = camera.options(), style.options()
     with work.spread("Rendering", "pictures") as run:
         result = carlasc.render(
@@ -166,4 +173,17 @@ def render(
     if result.legend is not None:
         echo(f"{result.legend}: the legend")
     shown = f"{', '.join(result.what)} of {result.sequence}, {describe_frames(result.frames)}"
+    echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")
+
+
+def _draw_over_images(
+    scene: carlasc.Scene, camera: CameraFlags, out: Path | None, fps: float | None, overwrite: bool, as_json: bool
+) -> None:
+    """Draw a grid over the images of a camera of the recording."""
+    target = Path(f"{camera.camera}.png") if out is None else out
+    result = carlasc.viewing.overlay(scene, camera.camera or "", target, fps=fps, overwrite=overwrite)
+    if as_json:
+        print_json(result)
+        return
+    shown = f"grid over {camera.camera} of {result.sequence}, {describe_frames(result.frames)}"
     echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")

@@ -20,11 +20,13 @@ from carlasc.converting import (
     Trajectory,
     VoxelContent,
 )
+from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, check_rigid, inverse_of, multiply
 from carlasc.core.tables import REMAPS, SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc_converters.files import read_bytes
+from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
     Calibration,
@@ -115,6 +117,20 @@ class KittiRecording(Recording):
             advice='copy calib.txt of the KITTI odometry data, estimate poses from the scans with `poses="kiss-icp"`, or, if the'
             " poses are those of the LiDAR, accept them with `force=True`",
         )
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the rectified cameras of calib.txt; none without that file, or without Tr in it."""
+        path = self.folder / "calib.txt"
+        found = Calibration.read(path) if path.is_file() else None
+        if found is None or "Tr" not in found.values:
+            return ()
+
+        def image_of(name: str, frame: int) -> Path:
+            return self.folder / name / f"{frame:06d}.png"
+
+        projections = {f"image_{number}": f"P{number}" for number in range(4)}
+        numbers = [frame.number for frame in self.frames]
+        return rectified_cameras(found, found.transform("Tr"), projections, image_of, numbers)
 
     def times(self) -> NDArray[np.float64] | None:
         """Return the lines of times.txt."""

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW
+from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
     Calibration,
@@ -127,6 +129,20 @@ class RawDrive(Recording):
     def times(self) -> NDArray[np.float64] | None:
         """Return the times at which the scanner looked forward, seconds after the first."""
         return self._times.seconds
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the rectified cameras; none without the date's calib_cam_to_cam.txt and calib_velo_to_cam.txt."""
+        paths = [self.folder.parent / f"calib_{name}.txt" for name in ("cam_to_cam", "velo_to_cam")]
+        if not all(path.is_file() for path in paths):
+            return ()
+        cameras, lidar = map(Calibration.read, paths)
+        rectified_T_lidar = cameras.rotation("R_rect_00") @ lidar.rotation_and_translation()
+
+        def image_of(name: str, frame: int) -> Path:
+            return self.folder / name / "data" / f"{frame:010d}.png"
+
+        projections = {f"image_0{number}": f"P_rect_0{number}" for number in range(4)}
+        return rectified_cameras(cameras, rectified_T_lidar, projections, image_of, self._numbers)
 
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of tracklet_labels.xml. They exist in the view of the camera only."""

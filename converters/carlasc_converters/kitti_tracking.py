@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
-from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW, BoxRows, class_of

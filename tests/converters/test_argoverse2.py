@@ -381,3 +381,26 @@ def test_the_road_of_the_real_sample_is_in_the_grid_and_each_lidar_casts_its_own
         assert (sequence.grid(name, frame).labels == CARLA.ground_id).sum() > 1000
         calibrated = len(sequence.metadata.extra["sensors"]) == 2
         assert ("origins" in sequence.fields()) == calibrated
+
+
+def test_points_of_the_real_sample_are_in_view_of_as_many_cameras_as_a_plain_projection_says(sample):
+    from carlasc_converters.feather import read_columns
+
+    from carlasc.core.geometry import invert, transform_points
+
+    recording, without = Argoverse2(sample).sequences()
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
+    table = read_columns(recording.folder / "calibration/intrinsics.feather", names, ("sensor_name",))
+    points = np.concatenate([cloud.points[:, :3] for cloud in recording.frames[0].read()]).astype(np.float64)
+    cameras = recording.cameras()
+    assert len(cameras) == 9 and not without.cameras()
+    for row, camera in enumerate(cameras):
+        fx, fy, cx, cy, k1, k2, k3, width, height = (float(table[name][row]) for name in names)
+        x, y, z = transform_points(invert(camera.sensor_T_camera), points).T
+        x, y, ahead = x / z, y / z, z > 0
+        squared = x * x + y * y
+        factor = 1 + k1 * squared + k2 * squared**2 + k3 * squared**3
+        u, v = fx * x * factor + cx, fy * y * factor + cy
+        inside = ahead & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+        found = camera.contains(camera.project(transform_points(invert(camera.sensor_T_camera), points)))
+        assert camera.name == table["sensor_name"][row] and inside.sum() == found.sum() > 10_000
