@@ -251,7 +251,7 @@ def test_any_sink_will_do(tmp_path):
     assert {(name, frame) for name, frame in kept.fields} == {
         (name, frame) for name in ("points", "labels", "flow", "instances") for frame in range(3)
     }
-    assert {"poses.txt", "times.txt", "carlasc.json"} == set(kept.texts)
+    assert {"poses.txt", "times.txt", "carlasc.json", "cameras.json"} == set(kept.texts)
     with pytest.raises(ArgumentError, match="convert to a folder or a .zarr store"):
         convert("kitti", tmp_path / "in", sink)
 

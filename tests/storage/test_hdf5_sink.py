@@ -40,7 +40,7 @@ class TestHDF5Sink(SinkContract):
 def test_h5py_with_hdf5plugin_reads_the_same_numbers_as_the_page_says(
     published: Path, store: Path, tmp_path: Path
 ) -> None:
-    page = (Path(__file__).parents[2] / "docs/storage.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/packed-format.md").read_text()
     code = next(block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import h5py" in block)
     reference = FolderSource(published).sequences()[WHOLE]
     frames = {*reference.frames("points").tolist()} & {*reference.frames("evaluation/labels").tolist()}
