@@ -11,6 +11,7 @@ import carlasc
 from carlasc.cli.common import FAILED, FramesOption, Json, console, echo, file_option, line, place_argument, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import parse_window
+from carlasc.core.wording import count
 
 if TYPE_CHECKING:
     from carlasc.inspection import AuditResult
@@ -88,5 +89,5 @@ def _print(result: AuditResult, *, everything: bool) -> None:
                 advice = f": {verdict.advice}" if verdict.advice else ""
                 text = f"  {verdict.state:<12} {verdict.check}: {verdict.text}{advice}"
                 out.print(line(text, _COLORS[verdict.state]), soft_wrap=True)
-    state = "sound, as far as the drives tell" if result.ok else f"not sound ({len(result.faults)} faults)"
+    state = "sound, as far as the drives tell" if result.ok else f"not sound ({count(len(result.faults), 'fault')})"
     out.print(line(f"{result.grids}: {state}", "bold"), soft_wrap=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.core.notebook import describe
+from carlasc.core.wording import count
 from carlasc.inspection.auditing.audit import frame_errors
 from carlasc.inspection.auditing.verdicts import STATES, AuditResult, Verdict
 from carlasc.inspection.texts import fill
@@ -37,7 +38,7 @@ def write_audit_page(result: AuditResult, out: str | Path) -> None:
         parts.append(f"<h2>{escape(path)}</h2><p>{about}</p>{table}")
     notes = "".join(f"<br>{escape(note)}" for note in result.notes)
     failed = "".join(f"<br>{escape(f'{f.where}: frame {f.frame}: {f.message}')}" for f in result.failures)
-    state = "sound, as far as the drives tell" if result.ok else f"{len(result.faults)} faults"
+    state = "sound, as far as the drives tell" if result.ok else count(len(result.faults), "fault")
     text = f"Compared with the scans of {escape(result.scans)}: <b>{state}</b>.{notes}{failed}"
     title = f"Audit of {escape(result.grids)}"
     page = fill("audit.html", title=title, summary=text, sequences="".join(parts), pictures=_pictures(result))
