@@ -12,6 +12,7 @@ from carlasc.cli.capture import OutArgument, SensorFlags
 from carlasc.cli.common import Json, console, print_frames, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import GridFlags
+from carlasc.core.wording import count as count_of  # `count` is an option
 
 
 def simulate(
@@ -52,9 +53,14 @@ def simulate(
 def _print_capture(result: carlasc.captures.SimulationResult) -> None:
     from rich.table import Table
 
-    table = Table("class", "points", "share", title=f"{result.out}: {result.count} frames of {result.sensors} sensors")
+    table = Table(
+        "class",
+        "points",
+        "share",
+        title=f"{result.out}: {count_of(result.count, 'frame')} of {count_of(result.sensors, 'sensor')}",
+    )
     total = sum(result.classes.values())
     for name, points_of_class in sorted(result.classes.items(), key=lambda item: -item[1]):
         table.add_row(name, f"{points_of_class:,}", f"{points_of_class / total:.2%}")
     console().print(table)
-    console().print(f"{result.written} frames written, {result.count - result.written} existed already")
+    console().print(f"{count_of(result.written, 'frame')} written, {result.count - result.written} existed already")
