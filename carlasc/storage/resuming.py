@@ -215,9 +215,16 @@ def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
     for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
         for name in sorted(sequence.fields() & layout.SCAN_FIELDS.keys()):
             if frames[row] in sequence.frames(name):
-                with suppress(CarlascError):  # one that cannot be read is reported when its grid is made
-                    digest.update(np.ascontiguousarray(sequence.read(name, int(frames[row]))).tobytes())
+                digest.update(_bytes_of(sequence, name, int(frames[row])))
     return digest.hexdigest()
+
+
+def _bytes_of(sequence: Sequence, name: str, frame: int) -> bytes:
+    """Return the bytes of a field; none if it cannot be read, which is reported when its grid is made."""
+    for _ in range(2):  # an error that passes does not make another scan
+        with suppress(CarlascError):
+            return np.ascontiguousarray(sequence.read(name, frame)).tobytes()
+    return b""
 
 
 def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **settings: Any) -> str:
