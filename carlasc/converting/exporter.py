@@ -60,6 +60,21 @@ class Exporter(ABC):
         """The values that the content of the files depends on, for JSON. A run does not continue one with other settings."""
         return vars(self)
 
+    def check_output(self, source: str, root: Path) -> tuple[int, list[str]] | None:
+        """Check what `root` holds instead of an export, if an option asks for it.
+
+        Args:
+            source: the place that was given, which need not be of the layout.
+            root: folder of the other data set.
+
+        Returns:
+            The number of files, and what users must know, one line each; None to export.
+
+        Raises:
+            CarlascError: something is wrong in `root`.
+        """
+        return None
+
     @abstractmethod
     def folders(self, names: Sequence[str]) -> dict[str, str]:
         """Return the folder of each sequence of a source, by the sequence's name, relative to the root of the other data set."""

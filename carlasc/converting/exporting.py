@@ -65,7 +65,11 @@ def export(
     start = time.perf_counter()
     kind = load_exporter(name)
     exporter = kind(**read_options(kind, options))
-    opened, root = storage.as_source(source), Path(out)
+    root = Path(out)
+    place = source.location if isinstance(source, storage.Source) else os.fspath(source)
+    if (checked := exporter.check_output(place, root)) is not None:
+        return ExportResult(root, {}, 0, checked[0], (), tuple(checked[1]), time.perf_counter() - start)
+    opened = storage.as_source(source)
     check_outside(root, opened.location)
     every = _by_name(opened)
     folders = exporter.folders(list(every))  # of all sequences: a folder's name does not depend on which are exported

@@ -160,7 +160,9 @@ def test_what_cannot_be_exported_is_named(tmp_path):
         export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
     with pytest.raises(ArgumentError, match="name: expected one of kitti, .*, found 'poss'"):
         export("poss", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    with pytest.raises(ArgumentError, match="options: expected one of grid, predictions, labels, found every"):
+    with pytest.raises(
+        ArgumentError, match="options: expected one of grid, predictions, labels, check, zip, found every"
+    ):
         export("kitti", tmp_path / "in", tmp_path / "out", options={"every": 5}, run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 

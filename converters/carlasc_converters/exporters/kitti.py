@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,12 @@ from carlasc.converting import VOXEL_FILES, Files, FrameExporter
 from carlasc.core.axes import mirror_grid, mirror_poses, mirror_spec
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
-from carlasc.errors import FormatError, MissingDataError, check_choice
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 from carlasc_converters.exporters.grid_exporter import choose_grid, number_folders, read_points, scan_occupancy
 from carlasc_converters.exporters.occlusion import occluded_voxels
+from carlasc_converters.exporters.submission import Task, check_archive, check_submission, pack_submission
 from carlasc_converters.kitti import CLASS_PARTS, STANDING
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 
@@ -69,9 +71,37 @@ class KittiExporter(FrameExporter):
             Literal["semantic", "moving"],
             "moving: the labels of moving-object segmentation, 9 for what stands, 251 for what moves.",
         ] = "semantic",
+        check: Annotated[
+            Task | None,
+            "Export nothing: check the predictions in OUT for a task, as SemanticKITTI's script does. SOURCE is the benchmark's data.",
+        ] = None,
+        zip: Annotated[str | None, "With --check: also pack OUT for the benchmark into this file."] = None,
     ) -> None:
         check_choice("labels", labels, ("semantic", "moving"))
+        if zip is not None:
+            if check is None:
+                raise ArgumentError("zip", expected="`check` too", found="only `zip`")
+            check_archive(Path(zip))
         self.grid, self.predictions, self.labels = grid, predictions, labels
+        self.task: Task | None = check
+        self.archive = zip
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The options that the files depend on."""
+        return {"grid": self.grid, "predictions": self.predictions, "labels": self.labels}
+
+    def check_output(self, source: str, root: Path) -> tuple[int, list[str]] | None:
+        """Check, and pack, the predictions in `root` if an option asks for it."""
+        if self.task is None:
+            return None
+        ids = set(TO_PREDICTED[SEMANTICKITTI.name].values()) if self.task == "completion" else set(SEMANTICKITTI.names)
+        files = check_submission(root, Path(source), self.task, ids)
+        notes = [f"{root} is what SemanticKITTI's benchmark takes for {self.task}: {len(files)} files"]
+        if self.archive is not None:
+            pack_submission(root, files, Path(self.archive))
+            notes.append(f"{self.archive} holds them")
+        return len(files), notes
 
     @property
     def product(self) -> str:
