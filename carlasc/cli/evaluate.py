@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -24,11 +25,12 @@ from carlasc.cli.common import (
     starting_with,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.core.choices import Voxels
+from carlasc.core.choices import Around, Voxels
 from carlasc.core.wording import count
+from carlasc.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from carlasc.metrics import Evaluation
+    from carlasc.metrics import Evaluation, FigureTable
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,13 @@ def evaluate(
     all_conventions: Annotated[
         bool, typer.Option("--all-conventions", help="Print one row for each convention instead of the tables.")
     ] = False,
+    forecast: Annotated[
+        Around | None,
+        typer.Option(
+            help="Score forecasts: grids named by how far ahead they are, such as forecast_1s. They are around the sensor of the frame that"
+            " they are made in (present), or of the frame that they predict (future)."
+        ),
+    ] = None,
     compare: Annotated[
         str | None,
         place_option(
@@ -148,6 +157,20 @@ def evaluate(
 
         check_plot(output.plot)  # before anything is counted
     name, common = name or Path(source).name, vars(choice)
+    if forecast is not None:
+        alone = {
+            "all_conventions": all_conventions,
+            "compare": compare,
+            "per_frame": output.per_frame,
+            "plot": output.plot,
+        }
+        if other_options := [option for option, value in alone.items() if value]:
+            raise ArgumentError(other_options[0], expected="no such option with --forecast", found="both")
+        common |= {"convention": convention, "around": forecast}
+        with work.spread("Scoring", usual=1) as run:
+            by_time = carlasc.metrics.evaluate_forecasts(source, truth, scoring=scoring.options(), run=run, **common)
+        _print_forecasts(by_time, name, output)
+        return
     if all_conventions:
         with work.spread("Scoring", usual=1) as run:
             found = carlasc.metrics.evaluate_by_all_conventions(source, truth, name=name, run=run, **common)
@@ -190,6 +213,16 @@ class _Region:
         return band & field_of_view(spec, math.radians(self.fov))
 
 
+def _print_tables(tables: Sequence[FigureTable], remark: str, output: OutputFlags) -> None:
+    from carlasc.cli.tables import print_table
+
+    if output.latex or output.csv:
+        echo("\n".join(table.to_latex() if output.latex else table.to_csv() for table in tables), nl=False)
+        return
+    for table in tables:
+        print_table(console(), table.header, table.texts(), title=f"{table.title} ({remark})")
+
+
 def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) -> None:
     comparison = None if other is None else result.compare(other)
     if output.as_json:
@@ -198,15 +231,10 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
             values["comparison"] = {"with": other.name, **comparison.to_dict()}
         print_json(values)
         return
+    _print_tables(result.tables(), f"percent, {count(result.frames, 'frame')}, voxels: {result.voxels}", output)
     if output.latex or output.csv:
-        echo("\n".join(table.to_latex() if output.latex else table.to_csv() for table in result.tables()), nl=False)
         return
-    from carlasc.cli.tables import print_table
-
     out = console()
-    for table in result.tables():
-        title = f"{table.title} (percent, {count(result.frames, 'frame')}, voxels: {result.voxels})"
-        print_table(out, table.header, table.texts(), title=title)
     if (interval := result.interval()) is not None:
         out.print(
             line(
@@ -227,6 +255,19 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
         out.print(line(f"velocity of moving voxels: off by {result.actors.velocity_m_s:.2f} m/s in the mean ({bands})"))
     for note in result.notes:
         echo(f"note: {note}", err=True)
+
+
+def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: OutputFlags) -> None:
+    """Print the tables with a row for each time ahead."""
+    results = list(by_time.values())
+    if output.as_json:
+        print_json({"name": name, "forecasts": [{"horizon_s": t, **result.to_dict()} for t, result in by_time.items()]})
+    else:
+        tables = carlasc.metrics.semantic_table(results), carlasc.metrics.geometric_table(results)
+        frames = ", ".join(str(result.frames) for result in results)
+        _print_tables(tables, f"percent, {name}, frames: {frames}, voxels: {results[0].voxels}", output)
+    failures = [failure for result in results for failure in result.failures]
+    report_failures(failures, sum(result.frames for result in results) + len(failures))
 
 
 def _print_conventions(found: Any, as_json: bool) -> None:

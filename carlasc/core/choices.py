@@ -35,6 +35,9 @@ FlowSource = Literal["auto", "none"]
 Voxels = Literal["known", "all"]
 """Which voxels are scored."""
 
+Around = Literal["present", "future"]
+"""Whose sensor the grids of forecasts are around: that of the frame that they are made in, or that of the frame that they predict."""
+
 Images = Literal["none", "link", "copy"]
 """What a conversion does with the images of cameras."""
 

@@ -12,6 +12,7 @@ from .conventions import convention_named as convention_named
 from .conventions import own_convention as own_convention
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluate_by_all_conventions as evaluate_by_all_conventions
+from .forecasts import evaluate_forecasts as evaluate_forecasts
 from .grids import VoxelOutcome as VoxelOutcome
 from .grids import compare_grids as compare_grids
 from .leaderboard import ScoreTable as ScoreTable
@@ -41,8 +42,6 @@ from .results import geometric_table as geometric_table
 from .results import semantic_table as semantic_table
 from .scoring import Scoring as Scoring
 from .temporal import Consistency as Consistency
-from .temporal import Forecasting as Forecasting
-from .temporal import ForecastScore as ForecastScore
 from .temporal import moved_grid as moved_grid
 from .temporal import shape_consistency as shape_consistency
 from .tracking import TrackingQuality as TrackingQuality

@@ -266,9 +266,27 @@ def evaluate(
         FormatError: the grids or the classes of the two sides cannot be compared.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
+    return score_pairs(pairs, convention, source_classes, scoring, frames, name or _name_of(source), run, notes)
+
+
+def score_pairs(
+    pairs: list[Pair],
+    convention: str | Convention | None,
+    source_classes: str | None,
+    scoring: Scoring,
+    frames: Frames,
+    name: str,
+    run: Run,
+    notes: tuple[str, ...],
+) -> Evaluation:
+    """Return the scores of predicted grids against the true ones that they are paired with.
+
+    Raises:
+        CarlascError: no frame can be scored.
+    """
     scorer = Scorer(convention, pairs, source_classes, scoring)
     _score_frames([scorer], pairs, frames, run)
-    result = scorer.result(name or _name_of(source), notes)
+    result = scorer.result(name, notes)
     if isinstance(result, CarlascError):
         raise result
     return result

@@ -1,9 +1,8 @@
-"""Scores over time: the consistency of consecutive frames, and the accuracy of predicted future frames."""
+"""Scores over time: the consistency of consecutive frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import Self
 
 import numpy as np
@@ -13,8 +12,6 @@ from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import ConfusionMatrix
-
-HORIZONS_S = (1.0, 2.0, 3.0)
 
 
 def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
@@ -114,73 +111,3 @@ def shape_consistency(earlier: NDArray[np.bool_], later: NDArray[np.bool_]) -> f
         raise FormatError("later", expected=f"shape {earlier.shape}", found=str(later.shape))
     union = int(np.count_nonzero(earlier | later))
     return np.count_nonzero(earlier & later) / union if union else float("nan")
-
-
-@dataclass(frozen=True)
-class ForecastScore:
-    """Scores of one horizon.
-
-    Attributes:
-        miou: mean IoU over the classes, free left out.
-        iou: IoU of occupied against free.
-    """
-
-    miou: float
-    iou: float
-
-
-class Forecasting:
-    """Adds up the scores of predicted future frames for each horizon.
-
-    Attributes:
-        matrices: confusion matrix of each horizon, in seconds.
-    """
-
-    def __init__(self, num_classes: int, *, free: int = 0, horizons_s: Iterable[float] = HORIZONS_S) -> None:
-        self.matrices = {float(horizon): ConfusionMatrix(num_classes, free=free) for horizon in horizons_s}
-
-    def update(self, horizon_s: float, prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
-        """Add the future of one frame: the prediction for the time `horizon_s` later, and the truth at that time.
-
-        Args:
-            horizon_s: how far ahead the prediction is, seconds.
-            prediction: predicted classes, shape (X, Y, Z).
-            truth: true classes at that time, same shape.
-            mask: the voxels that count, same shape; None for all.
-
-        Raises:
-            ArgumentError: the horizon is not one of those of the metric.
-            FormatError: the shapes do not match, or an id is out of range.
-        """
-        if float(horizon_s) not in self.matrices:
-            raise ArgumentError(
-                "horizon_s", expected=f"one of {', '.join(f'{h:g}' for h in self.matrices)}", found=f"{horizon_s:g}"
-            )
-        counted = None if mask is None else np.asarray(mask)
-        self.matrices[float(horizon_s)].update(np.asarray(prediction), np.asarray(truth), counted)
-        return self
-
-    def compute(self) -> Mapping[float, ForecastScore]:
-        """Return the scores of each horizon."""
-        return {
-            horizon: ForecastScore(matrix.mean_iou(with_free=False, absent="skip"), matrix.completeness().iou)
-            for horizon, matrix in self.matrices.items()
-        }
-
-    def reset(self) -> None:
-        """Remove everything that was added."""
-        self.matrices = {h: ConfusionMatrix(m.num_classes, free=m.free) for h, m in self.matrices.items()}
-
-    def merge(self, other: Forecasting) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
-
-        Raises:
-            ArgumentError: its settings differ.
-        """
-        if set(other.matrices) != set(self.matrices):
-            raise ArgumentError(
-                "forecasting", expected=f"horizons {sorted(self.matrices)}", found=str(sorted(other.matrices))
-            )
-        for horizon, matrix in other.matrices.items():
-            self.matrices[horizon] += matrix
-        return self

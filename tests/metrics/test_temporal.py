@@ -8,7 +8,7 @@ import pytest
 from carlasc import Grid, GridSpec
 from carlasc.core import translation
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics import Consistency, Forecasting, moved_grid, shape_consistency
+from carlasc.metrics import Consistency, moved_grid, shape_consistency
 
 SPEC = GridSpec("cartesian", (10, 8, 2), (-5.0, -4.0, -1.0), (5.0, 4.0, 1.0))
 
@@ -66,16 +66,3 @@ def test_shapes_are_compared_as_sets_of_voxels():
     both = one | np.roll(one, 1, 0)
     assert shape_consistency(one, both) == 0.5
     assert math.isnan(shape_consistency(one & False, one & False))
-
-
-def test_forecasts_are_scored_by_horizon():
-    truth = grid(4).labels
-    metric = Forecasting(4).update(1.0, truth, truth).update(3.0, np.zeros_like(truth), truth)
-    scores = metric.compute()
-    assert (scores[1.0].miou, scores[1.0].iou) == (1.0, 1.0)
-    assert (scores[3.0].miou, scores[3.0].iou) == (0.0, 0.0)
-    assert math.isnan(scores[2.0].iou)
-    merged = Forecasting(4).merge(metric).merge(metric)
-    assert merged.matrices[1.0].total == 2 * truth.size
-    with pytest.raises(ArgumentError, match="one of 1, 2, 3, found 1.5"):
-        metric.update(1.5, truth, truth)

@@ -1,0 +1,159 @@
+"""Scoring forecasts: grids that predict what will be seen some time after the frame that they are made in."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.choices import Around
+from carlasc.core.frames import Frames
+from carlasc.core.geometry import invert
+from carlasc.core.grids import Grid
+from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.metrics.conventions import Convention
+from carlasc.metrics.evaluation import score_pairs
+from carlasc.metrics.grids import GridFrames, SequenceGrid
+from carlasc.metrics.pairs import Pair, Place, pair_grids
+from carlasc.metrics.results import Evaluation
+from carlasc.metrics.scoring import Scoring
+from carlasc.metrics.temporal import moved_grid
+from carlasc.running.spreading import Run
+from carlasc.storage import as_source, layout
+
+_NAMED = re.compile(r"(.+)_(\d+(?:\.\d+)?)s")  # a grid of forecasts: a name, and how far ahead they are
+_TOLERANCE_S = 0.05  # of the time of a later frame: half the period of most LiDARs
+
+
+class FutureGrid(GridFrames):
+    """The grids of a sequence as they are some time later, by the frames in which they are to be predicted."""
+
+    def __init__(self, grid: SequenceGrid, horizon_s: float, around: Around) -> None:
+        """Find the later frame of each frame.
+
+        Args:
+            grid: the grids of the sequence.
+            horizon_s: how much later, seconds.
+            around: whose sensor the result is around: that of the frame ("present"), or that of the later frame ("future").
+
+        Raises:
+            MissingDataError: no frame has a later one, or the poses are missing that move it to the present.
+        """
+        self.grid, self.around = grid, around
+        self.path, self.location, self.spec, self.classes = grid.path, grid.location, grid.spec, grid.classes
+        numbers, sequence = grid.frames(), grid.sequence
+        timed = layout.TIMES in sequence.documents()
+        times = np.array([sequence.read_time(n) if timed else n * layout.FRAME_PERIOD_S for n in numbers.tolist()])
+        apart = np.abs(times[None] - times[:, None] - horizon_s)
+        later = apart.argmin(axis=1) if len(times) else np.zeros(0, np.int64)
+        near = apart.min(axis=1, initial=np.inf) <= _TOLERANCE_S
+        self.later = dict(zip(numbers[near].tolist(), numbers[later[near]].tolist(), strict=True))
+        if not self.later:
+            found = f"frames of {np.ptp(times):g} s" if len(times) else "none"
+            raise MissingDataError(self.location, expected=f"frames that are {horizon_s:g} s apart", found=found)
+        if around == "present" and layout.POSES not in sequence.documents():
+            raise MissingDataError(
+                sequence.location, expected=f"{layout.POSES}, which moves later frames to the present", found="none",
+                advice="score grids around the later frame's sensor with `around=future`",
+            )  # fmt: skip
+
+    def frames(self) -> NDArray[np.int64]:
+        """Return the sorted frames that have a later one."""
+        return np.array(sorted(self.later), np.int64)
+
+    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+        """Return (X, Y, Z) the labels of the later frame."""
+        return self._later(frame).labels
+
+    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
+        """Return (X, Y, Z) which voxels the later frame knows; None for a camera, whose view does not move with the grid."""
+        if seen_by == "camera" or f"{self.grid.grid}/counts" not in self.grid.sequence.fields():
+            return None
+        return self._later(frame).known
+
+    def _later(self, frame: int) -> Grid:
+        sequence, later = self.grid.sequence, self.later[frame]
+        grid = sequence.grid(self.grid.grid, later)
+        if self.around == "future":
+            return grid
+        return moved_grid(grid, invert(sequence.read_pose(frame)) @ sequence.read_pose(later))
+
+
+def evaluate_forecasts(
+    source: Place,
+    truth: Place,
+    *,
+    around: Around = "present",
+    convention: str | Convention | None = None,
+    grid: str | None = None,
+    truth_grid: str | None = None,
+    source_classes: str | None = None,
+    scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
+    frames: Frames = None,
+    run: Run = Run(workers=1),  # noqa: B008 (frozen)
+) -> Mapping[float, Evaluation]:
+    """Score forecasts against what came, apart for each time ahead.
+
+    The forecasts are grids of `source` whose names end with how far ahead they are: frame 10 of `forecast_1.5s` is what was predicted in
+    frame 10 for the instant 1.5 s later. The frame that is 1.5 s later, within 0.05 s, is found by times.txt (ten frames a second without
+    it). Frames without a later one are left out.
+
+    Args:
+        source: the forecasts: a data set in the layout, in any store.
+        truth: the ground truth, likewise, with poses.txt.
+        around: whose sensor the grids are around: that of the frame that they are made in ("present"), to which the later grid is moved
+            by the poses, or that of the later frame ("future"). Voxels that the moved grid does not cover are unknown.
+        convention: as in `evaluate`.
+        grid: name of the forecasts without the time: `forecast`; None takes the only one.
+        truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
+        source_classes: as in `evaluate`.
+        scoring: which voxels count. Rays, actors and motion are not scored.
+        frames: the frames whose forecasts are scored.
+        run: how the work is spread, and who is told of its progress.
+
+    Returns:
+        The scores by time ahead, seconds, the smallest first.
+
+    Raises:
+        ArgumentError: an argument has an unknown value, or asks for rays, actors or motion.
+        MissingDataError: no grid of forecasts exists, or no later frame.
+        FormatError: the grids or the classes of the two sides cannot be compared.
+    """
+    if scoring.rays or scoring.actors or "motion" in scoring.by:
+        asked = "rays" if scoring.rays else "actors" if scoring.actors else "by motion"
+        raise ArgumentError("scoring", expected="classes, by distance, height or visibility for forecasts", found=asked)
+    results = {}
+    for horizon_s, name in _horizons(source, grid).items():
+        pairs, notes = pair_grids(source, truth, name, truth_grid)
+        pairs = [Pair(pair.prediction, _future(pair.truth, horizon_s, around)) for pair in pairs]
+        results[horizon_s] = score_pairs(
+            pairs, convention, source_classes, scoring, frames, f"{horizon_s:g} s", run, notes
+        )
+    return results
+
+
+def _horizons(source: Place, grid: str | None) -> dict[float, str]:
+    """Return the grids of forecasts by their times ahead, sorted.
+
+    Raises:
+        MissingDataError: there are none.
+        ArgumentError: there are several forecasts for one time.
+    """
+    opened, found = as_source(source), dict[float, str]()
+    names = sorted({name for sequence in opened.sequences().values() for name in sequence.grids})
+    for match in filter(None, map(_NAMED.fullmatch, names)):
+        if match[1] == (grid or match[1]) and (other := found.setdefault(float(match[2]), match[0])) != match[0]:
+            raise ArgumentError("grid", expected="the name of one of the forecasts", found=f"{other} and {match[0]}")
+    if not found:
+        expected = f"grids of forecasts such as {grid or 'forecast'}_1s"
+        raise MissingDataError(opened.location, expected=expected, found=", ".join(names) or "no grid")
+    return dict(sorted(found.items()))
+
+
+def _future(truth: GridFrames, horizon_s: float, around: Around) -> FutureGrid:
+    if not isinstance(truth, SequenceGrid):
+        raise MissingDataError(truth.location, expected="a sequence with poses and times", found="files of grids")
+    return FutureGrid(truth, horizon_s, around)
