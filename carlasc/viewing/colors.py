@@ -42,6 +42,16 @@ ERRORS = ClassTable(
 """Names and colours of the outcomes of comparing a prediction with the ground truth."""
 
 STATIC = (188, 191, 196)
+_ACTORS = (  # by number, again and again
+    *((10, 176, 245), (213, 70, 0), (10, 165, 88), (138, 86, 194), (240, 200, 40), (200, 20, 10)),
+    *((22, 208, 192), (230, 103, 176), (16, 69, 190), (154, 106, 47), (122, 201, 67), (94, 82, 83)),
+)
+ACTORS = ClassTable(
+    "actors",
+    {0: "free", 1: "no actor"} | {2 + k: f"actors {k or 12}, {(k or 12) + 12}, ..." for k in range(len(_ACTORS))},
+    {0: (255, 255, 255), 1: STATIC} | dict(enumerate(_ACTORS, 2)),
+)
+"""Names and colours of actors by their numbers: `actor_ids` returns the ids."""
 ARROW = (20, 20, 24)
 EGO, GLASS = (250, 250, 250), (120, 132, 148)
 UNLABELLED = (150, 150, 150)
@@ -63,6 +73,11 @@ _GROUPS: dict[int, Color] = {  # by id in the paper's eleven classes
 _RAMP = np.array(  # viridis at five positions: lightness increases from the first to the last
     [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], np.float64
 )
+
+
+def actor_ids(instances: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """Return the id in `ACTORS` of each number of an actor, of any shape; 0, no actor, has the id 1."""
+    return np.where(instances > 0, 2 + instances.astype(np.int64) % len(_ACTORS), 1).astype(np.uint8)
 
 
 class Entry(NamedTuple):

@@ -23,7 +23,7 @@ from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage.metadata import Axes
-from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
+from carlasc.viewing.colors import ACTORS, ERRORS, PALETTES, ClassColors, PaletteName, actor_ids
 from carlasc.viewing.finding import (
     FoundSequence,
     RemappedSequence,
@@ -158,10 +158,10 @@ class GridPanel:
     """One of the grids that are shown side by side.
 
     Attributes:
-        title: "prediction", "truth", "errors"; or the size of the grid if there is only one.
+        title: "prediction", "truth", "errors"; or the size of the grid if there is only one; "actors" for its voxels by actor.
         spec: geometry.
         colors: colours of its labels.
-        name: "prediction", "truth", "errors"; or "grid" if there is only one.
+        name: "prediction", "truth", "errors"; or "grid" if there is only one; "actors".
     """
 
     title: str
@@ -175,7 +175,8 @@ class FrameContent:
     """What a viewer shows of one frame.
 
     Attributes:
-        grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.VoxelOutcome`).
+        grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.VoxelOutcome`); where
+            it is "actors", ids of `carlasc.viewing.colors.ACTORS`.
         scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
         time_s: seconds since the first frame, or None if the sequence has no times.
         boxes: tracked boxes, sensor frame; None where the frame was not annotated.
@@ -201,6 +202,7 @@ class SceneReader:
         palette: "class", "colorblind" or "height".
         notes: what was chosen where the scene left a choice, one sentence each.
         mirrored: whether y is mirrored: what `right_handed` returns for left-handed data.
+        by_actor: whether the voxels of the grid are also shown by actor, in a panel of their own: what `with_actors` returns.
     """
 
     data: RemappedSequence
@@ -210,6 +212,7 @@ class SceneReader:
     palette: PaletteName = "class"
     notes: tuple[str, ...] = ()
     mirrored: bool = False
+    by_actor: bool = False
 
     @property
     def name(self) -> str:
@@ -237,6 +240,10 @@ class SceneReader:
         """Return a reader of the same frames in right-handed axes, for programs that know no others: y points to the left."""
         return replace(self, mirrored=True) if self.left_handed else self
 
+    def with_actors(self) -> SceneReader:
+        """Return a reader of the same frames that also shows the voxels by actor, if the grid says who is in them."""
+        return replace(self, by_actor=self.has(f"{self.data.grid}/instance"))
+
     def has(self, field: str) -> bool:
         """Whether some frame of the sequence has a field, such as "points" or "flow" (see `carlasc.storage.layout`)."""
         return field in self.data.sequence.fields()
@@ -257,13 +264,13 @@ class SceneReader:
         if not self.data.grid:
             return ()
         spec = mirror_spec(self.data.spec) if self.mirrored else self.data.spec
-        if self.truth is None:
-            return (GridPanel(str(spec), spec, self.colors),)
-        return (
-            GridPanel("prediction", spec, self.colors, "prediction"),
-            GridPanel("truth", spec, self.colors, "truth"),
-            GridPanel("errors", spec, ClassColors(ERRORS), "errors"),
-        )
+        panels = [GridPanel(str(spec), spec, self.colors)]
+        if self.truth is not None:
+            panels = [GridPanel(name, spec, self.colors, name) for name in ("prediction", "truth")]
+            panels.append(GridPanel("errors", spec, ClassColors(ERRORS), "errors"))
+        if self.by_actor:
+            panels.append(GridPanel("actors", spec, ClassColors(ACTORS), "actors"))
+        return tuple(panels)
 
     def read(self, frame: int) -> FrameContent:
         """Read a frame.
@@ -306,9 +313,10 @@ class SceneReader:
             return None
         moving = data.sequence.read(name, frame)
         points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(np.float32)
-        numbered = frame in data.frames_with(f"{data.grid}/instance")
-        actors = data.read_part("instance", frame).reshape(-1)[moving["voxel"]] if numbered else None
-        found = Scan(points, flow=moving["velocity"].astype(np.float32), instances=actors)
+        labels, actors = (
+            a.reshape(-1)[moving["voxel"]] for a in (data.read_grid(frame).labels, self._instances(frame))
+        )
+        found = Scan(points, labels.astype(np.uint32), moving["velocity"].astype(np.float32), actors)
         return mirror_scan(found) if self.mirrored else found
 
     def read_time(self, frame: int) -> float | None:
@@ -343,6 +351,12 @@ class SceneReader:
             return None
         return self.data.sequence.read("bev", frame).tobytes()
 
+    def _instances(self, frame: int) -> NDArray[np.uint32]:
+        """Return the number of the actor of each voxel, in the shape of the grid; zeros where the frame does not say it."""
+        if frame not in self.data.frames_with(f"{self.data.grid}/instance"):
+            return np.zeros(self.data.spec.size, np.uint32)
+        return self.data.read_part("instance", frame)
+
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:
         if not self.data.grid:
             return ()
@@ -350,4 +364,7 @@ class SceneReader:
         if self.truth is not None:
             truth = self.truth.read_grid(frame)
             grids += [truth, Grid(truth.spec, compare_grids(grids[0], truth), truth.counts)]
+        if self.by_actor:
+            ids = actor_ids(self._instances(frame))
+            grids.append(replace(grids[0], labels=np.where(grids[0].labels > 0, ids, 0).astype(np.uint8)))
         return tuple(map(mirror_voxels, grids) if self.mirrored else grids)

@@ -39,7 +39,7 @@ def write_recording(
     """Write a scene as a recording; see `carlasc.viewing.view` for the arguments and errors."""
     started = time.monotonic()
     check_target(out, RECORDINGS, overwrite)
-    reader = scene.open().right_handed()
+    reader = scene.open().right_handed().with_actors()
     if scene.frames is None:
         frames, more = first_frames(reader.frames)
         reader = replace(reader, frames=frames, notes=reader.notes + more)

@@ -2,83 +2,37 @@
 
 from __future__ import annotations
 
-import importlib
 import os
-import re
-import shutil
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.geometry import invert, transform_points
 from carlasc.core.scans import Scan
-from carlasc.errors import DependencyError, import_extra
+from carlasc.errors import DependencyError
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import Entry
+from carlasc.viewing.open3d_loading import PAGE_ADVICE, import_open3d
+from carlasc.viewing.open3d_shapes import Shapes
+from carlasc.viewing.rendering.actor_boxes import box_lines
 from carlasc.viewing.rendering.drawings import ego_vehicle, grid_extent, motion_arrows, scan_extent
-from carlasc.viewing.rendering.meshes import QuadMesh, arrows, grid_mesh
-from carlasc.viewing.scene import FrameContent, Scene, SceneReader
+from carlasc.viewing.rendering.meshes import arrows, grid_mesh
+from carlasc.viewing.scene import FrameContent, GridPanel, Scene, SceneReader
+from carlasc.viewing.trails import Trail, Trails
 
-PAGE_ADVICE = 'or write a page instead with `out="page.html"`'
-
-_DEBIAN = {  # shared library -> its package in Debian and Ubuntu
-    "libEGL.so.1": "libegl1",
-    "libGL.so.1": "libgl1",
-    "libGLX.so.0": "libglx0",
-    "libX11.so.6": "libx11-6",
-    "libudev.so.1": "libudev1",
-    "libusb-1.0.so.0": "libusb-1.0-0",
-    "libidn2.so.0": "libidn2-0",
-    "libgomp.so.1": "libgomp1",
-    "libstdc++.so.6": "libstdc++6",
-    "libz.so.1": "zlib1g",
-}
-
-
-def import_open3d() -> ModuleType:
-    """Import Open3D.
-
-    Raises:
-        DependencyError: Open3D is not installed, or a system library is missing; the advice says what to install.
-    """
-    try:
-        return importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
-        missing = missing_library(str(error))
-        if missing is None and isinstance(error, ImportError):
-            return import_extra("open3d", "view")  # says that it is not installed, or what the loader said
-        problem = str(error) if missing is None else f"{missing} is missing"
-        raise DependencyError("open3d", problem=f"cannot be loaded: {problem}", advice=advice(missing)) from error
-
-
-def missing_library(message: str) -> str | None:
-    """Return the shared library that is missing according to a loader's message, or None."""
-    match = re.search(r"(\S+\.so[.0-9]*): cannot open shared object file", message)
-    return match[1] if match else None
-
-
-def advice(library: str | None) -> str:
-    """Return what to install for a library, or what to do if its package is not known."""
-    package = _DEBIAN.get(library or "")
-    if package is None:
-        return f"install the library that the message names, {PAGE_ADVICE}"
-    root = "sudo " if shutil.which("sudo") else ""
-    return f"{root}apt-get install {package} (Debian, Ubuntu), {PAGE_ADVICE}"
-
-
-LAYERS = {"g": "grid", "p": "points", "f": "flow", "b": "boxes", "v": "vehicle"}
+LAYERS = {"g": "grid", "p": "points", "f": "flow", "b": "boxes", "k": "tracks", "v": "vehicle"}
 KEYS = {
     "right, left": "next or previous frame",
     "space": "play or stop",
-    "g p f b v": "show or hide the grid, points, flow, boxes, vehicle",
-    "t": "switch between prediction, truth and errors",
+    "g p f b k v": "show or hide the grid, points, flow, boxes, tracks, vehicle",
+    "t": "switch between the grid, prediction, truth and errors, and its actors",
     "1 .. 9 0": "show or hide one of classes 1 to 10; with Shift 11 to 20, with Ctrl 21 to 30",
     "a": "show all classes",
     "r": "reset the camera",
@@ -86,13 +40,8 @@ KEYS = {
 }
 _RIGHT, _LEFT, _SPACE = 262, 263, 32  # key codes of GLFW
 _PRESSED, _SHIFT, _CONTROL = 1, 1, 2
-_SUN = np.array([-0.38, -0.5, 0.78]) / np.linalg.norm([0.38, 0.5, 0.78])
 _BACKGROUND = (0.96, 0.965, 0.972)
-_BOX_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-_BOX_EDGES = np.array(
-    [(a, b) for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)]
-)  # corners that differ in one axis
-_EDGE = 0.8  # brightness of the edges of voxels, relative to their faces
+_RIM = (140, 148, 161)
 
 
 @dataclass
@@ -136,12 +85,13 @@ class Window:
         Raises:
             DependencyError: Open3D or a library that it needs is missing, or there is no screen.
         """
-        self.reader = reader = reader.right_handed()  # as Open3D is
+        self.reader = reader = reader.right_handed().with_actors()  # right-handed, as Open3D is
         self.state, self.report = WindowState(), report or (lambda _: None)
         if reader.panels:
             self.state.layers.discard("points")
         self.o3d = import_open3d()
-        self._content = self._read()
+        self._shapes, self._trails = Shapes(self.o3d), Trails()
+        self._read()
         self._shown: dict[str, Any] = {}
         self._due = time.monotonic()
         self._visualizer = self.o3d.visualization.VisualizerWithKeyCallback()
@@ -162,7 +112,7 @@ class Window:
     def step(self, by: int) -> None:
         """Go forward by a number of frames; after the last frame follows the first."""
         self.state.position = (self.state.position + by) % len(self.reader.frames)
-        self._content = self._read()
+        self._read()
         self._draw()
         if not self.state.playing:
             self.report(f"frame {self.reader.frames[self.state.position]}")
@@ -191,7 +141,7 @@ class Window:
         self._draw()
 
     def next_panel(self) -> None:
-        """Switch to the next of prediction, truth and errors."""
+        """Switch to the next panel of the scene: prediction, truth and errors, or the grid, and its voxels by actor."""
         if len(self.reader.panels) > 1:
             self.state.panel = (self.state.panel + 1) % len(self.reader.panels)
             self.state.hidden.clear()
@@ -201,8 +151,7 @@ class Window:
     @property
     def classes(self) -> list[Entry]:
         """The classes that can be hidden: all classes of the panel's table except free. `order` is the class id."""
-        reader = self.reader
-        colors = reader.panels[self.state.panel].colors if reader.panels else reader.colors
+        colors = self.reader.colors if self._panel is None else self._panel.colors
         return colors.entries(colors.table.names)
 
     def picture(self) -> NDArray[np.uint8]:
@@ -215,8 +164,15 @@ class Window:
         """Close the window."""
         self._visualizer.destroy_window()
 
-    def _read(self) -> FrameContent:
-        return self.reader.read(self.reader.frames[self.state.position])
+    @property
+    def _panel(self) -> GridPanel | None:
+        return self.reader.panels[self.state.panel] if self.reader.panels else None
+
+    def _read(self) -> None:
+        position, frame = self.state.position, self.reader.frames[self.state.position]
+        self._content: FrameContent = self.reader.read(frame)
+        self._moving = self.reader.read_motion(frame, self._content.scan)
+        self._ways: tuple[Trail, ...] = self._trails.follow(position, self._content, self._moving)
 
     def _open(self, size: tuple[int, int]) -> None:
         no_screen = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -240,9 +196,8 @@ class Window:
         lower, upper = corners.min(0), corners.max(0)
         rim = np.array([(x, y, lower[2]) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], np.float64)
         rim[:, :2] = lower[:2] + rim[:, :2] * (upper - lower)[:2]
-        lines = self._lines(rim, np.array([(0, 1), (1, 2), (2, 3), (3, 0)]))
-        lines.paint_uniform_color((0.55, 0.58, 0.63))
-        self._visualizer.add_geometry(lines)
+        ends = np.stack([rim, np.roll(rim, -1, axis=0)], axis=1)
+        self._visualizer.add_geometry(self._shapes.lines(ends, np.array(_RIM)))
         self._reset_camera()
 
     def _reset_camera(self) -> None:
@@ -275,13 +230,17 @@ class Window:
 
     def _draw(self) -> None:
         """Draw the current state."""
-        layers, content = self.state.layers, self._content
+        draw: dict[str, Callable[[], Any]] = {
+            "grid": self._grid,
+            "points": self._points,
+            "flow": self._flow,
+            "boxes": self._boxes,
+            "tracks": self._tracks,
+            "vehicle": lambda: self._shapes.mesh(ego_vehicle()),
+        }
         self._replace("edges", None)
-        self._replace("grid", self._grid() if content.grids and "grid" in layers else None)
-        self._replace("points", self._points() if content.scan is not None and "points" in layers else None)
-        self._replace("flow", self._flow() if "flow" in layers else None)
-        self._replace("boxes", self._boxes() if content.boxes is not None and "boxes" in layers else None)
-        self._replace("vehicle", self._mesh(ego_vehicle()) if "vehicle" in layers else None)
+        for layer, function in draw.items():
+            self._replace(layer, function() if layer in self.state.layers else None)
 
     def _replace(self, name: str, geometry: Any) -> None:
         if (old := self._shown.pop(name, None)) is not None:
@@ -291,85 +250,62 @@ class Window:
             self._shown[name] = geometry
 
     def _grid(self) -> Any:
-        grid, colors = self._content.grids[self.state.panel], self.reader.panels[self.state.panel].colors.by_id
+        if self._panel is None:
+            return None
+        grid = self._content.grids[self.state.panel]
         drawn = (grid.labels > 0) & ~np.isin(grid.labels, list(self.state.hidden))
         if not drawn.any():
             return None
-        mesh = grid_mesh(grid.spec, colors[grid.labels], drawn)
-        self._replace("edges", self._edges(mesh))
-        return self._mesh(mesh)
-
-    def _edges(self, mesh: QuadMesh) -> Any:
-        """Return the edges of voxels as lines, darker than their faces and slightly in front of them."""
-        face, side = np.nonzero(mesh.edges)
-        corners = mesh.corners + 4e-3 * mesh.normals[:, None]
-        ends = np.stack([corners[face, side], corners[face, (side + 1) % 4]], axis=1)
-        lines = self._lines(ends, np.arange(2 * len(face)))
-        lines.colors = self.o3d.utility.Vector3dVector(
-            mesh.colors[face] * (_EDGE / 255.0) * self._light(mesh)[face, None]
-        )
-        return lines
+        mesh = grid_mesh(grid.spec, self._panel.colors.by_id[grid.labels], drawn)
+        self._replace("edges", self._shapes.edges(mesh))
+        return self._shapes.mesh(mesh)
 
     def _points(self) -> Any:
-        scan, colors = self._content.scan, self.reader.colors.by_id.copy()
-        colors[0] = palette.UNLABELLED
+        """Return the points in the colours of their classes, or of their actors where the panel shows these."""
+        scan = self._content.scan
         if scan is None:
             return None
-        labels = np.zeros(len(scan), np.uint8) if scan.labels is None else scan.labels
-        # hidden ids in the panel of errors are outcomes, not classes of points
-        hidden = self.state.hidden if not self.reader.panels or self.state.panel < 2 else set[int]()
-        shown = ~np.isin(labels, list(hidden))
-        cloud = self.o3d.geometry.PointCloud(self._vectors(scan.points[shown]))
-        cloud.colors = self.o3d.utility.Vector3dVector(colors[labels[shown]] / 255.0)
-        return cloud if shown.any() else None
+        panel, colors, ids = self._panel, self.reader.colors, scan.labels
+        if panel is not None and panel.name == "actors" and scan.instances is not None:
+            colors, ids = panel.colors, palette.actor_ids(scan.instances)
+        ids = np.zeros(len(scan), np.uint8) if ids is None else ids
+        hidden = self.state.hidden if panel is None or panel.colors is colors else set[int]()  # ids of the panel
+        shown, by_id = ~np.isin(ids, list(hidden)), colors.by_id.copy()
+        by_id[0] = palette.UNLABELLED
+        return self._shapes.points(scan.points[shown], by_id[ids[shown]]) if shown.any() else None
 
     def _flow(self) -> Any:
-        moving = self.reader.read_motion(self.reader.frames[self.state.position], self._content.scan)
-        if moving is None:
+        if self._moving is None:
             return None
-        tails, vectors = motion_arrows(moving)
-        if self.reader.panels and "points" not in self.state.layers:  # no arrows where nothing else is drawn
-            spec = self.reader.panels[0].spec
-            _, inside = spec.index(spec.to_axes(tails * [1, 1, 0] + [0, 0, (spec.lower[2] + spec.upper[2]) / 2]))
-            tails, vectors = tails[inside], vectors[inside]
-        return self._mesh(arrows(tails, vectors, palette.ARROW, 0.24)) if len(tails) else None
+        tails, vectors = motion_arrows(self._moving)
+        inside = self._within(tails)
+        return self._shapes.mesh(arrows(tails[inside], vectors[inside], palette.ARROW, 0.24)) if inside.any() else None
+
+    def _within(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which of (N, 3) places are where something else is drawn: above or below the grid if points are not shown."""
+        if self._panel is None or "points" in self.state.layers:
+            return np.ones(len(places), np.bool_)
+        spec = self._panel.spec
+        middle = (spec.lower[2] + spec.upper[2]) / 2
+        return spec.index(spec.to_axes(places * [1, 1, 0] + [0, 0, middle]))[1]
 
     def _boxes(self) -> Any:
-        """Return the edges of the boxes as lines in the colours of their classes."""
+        """Return the edges of the boxes, and a bar to the front of each, in the colours of their classes."""
         boxes = self._content.boxes
         if boxes is None or not len(boxes):
             return None
-        corners = boxes.centers[:, None] + np.einsum(
-            "nij,nkj->nki", boxes.sensor_T_box[:, :3, :3], _BOX_CORNERS * boxes.sizes[:, None] / 2
-        )
-        edges = 8 * np.arange(len(boxes))[:, None, None] + _BOX_EDGES
-        lines = self._lines(corners, edges)
-        colors = np.repeat(self.reader.colors.by_id[boxes.labels], len(_BOX_EDGES), axis=0)
-        lines.colors = self.o3d.utility.Vector3dVector(colors / 255.0)
-        return lines
+        ends = box_lines(boxes)
+        return self._shapes.lines(ends, np.repeat(self.reader.colors.by_id[boxes.labels], len(ends) // len(boxes), 0))
 
-    def _mesh(self, mesh: QuadMesh) -> Any:
-        """Return a mesh for Open3D, with the light of sun and sky in the colours of its corners."""
-        corners, triangles = mesh.triangles()
-        light = self._light(mesh)[:, None] * mesh.openness
-        colors = np.clip(mesh.colors[:, None, :] / 255.0 * light[..., None], 0, 1)
-        shown = self.o3d.geometry.TriangleMesh(
-            self._vectors(corners), self.o3d.utility.Vector3iVector(triangles.astype(np.int32))
-        )
-        shown.vertex_colors = self.o3d.utility.Vector3dVector(colors.reshape(-1, 3))
-        return shown
-
-    def _light(self, mesh: QuadMesh) -> NDArray[np.floating]:
-        """Return the brightness of each face in the sun; a level face without shade has exactly its own colour."""
-        lit = np.clip(mesh.normals @ _SUN, 0, None) / _SUN[2]
-        return 0.58 + 0.42 * np.minimum(lit, 1.25)
-
-    def _lines(self, corners: NDArray[np.floating], ends: NDArray[np.integer]) -> Any:
-        pairs = self.o3d.utility.Vector2iVector(ends.reshape(-1, 2).astype(np.int32))
-        return self.o3d.geometry.LineSet(self._vectors(corners.reshape(-1, 3)), pairs)
-
-    def _vectors(self, points: NDArray[np.floating]) -> Any:
-        return self.o3d.utility.Vector3dVector(np.asarray(points, np.float64))
+    def _tracks(self) -> Any:
+        """Return the ways of the actors, in the colours of their classes."""
+        if not self._ways or self._content.pose is None:
+            return None
+        ends = np.concatenate([np.stack([way.points[:-1], way.points[1:]], axis=1) for way in self._ways])
+        labels = np.repeat([way.label for way in self._ways], [len(way.points) - 1 for way in self._ways])
+        ends = transform_points(invert(self._content.pose), ends.reshape(-1, 3)).reshape(-1, 2, 3)
+        inside = self._within(ends[:, 1])
+        return self._shapes.lines(ends[inside], self.reader.colors.by_id[labels[inside]]) if inside.any() else None
 
 
 def show_window(scene: Scene, *, report: Callable[[str], None] | None = None) -> None:

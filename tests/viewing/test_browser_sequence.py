@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from helpers.displays.browser import Page, serve_folder
 from helpers.readers.pixels import middle_of, red_pixels
-from helpers.scenes.road_blocks import add_evidence, add_poses, write_blocks
+from helpers.scenes.road_blocks import add_actors, add_evidence, add_poses, write_blocks
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
 from carlasc.storage import FolderSink
-from carlasc.storage.field_files import VELOCITY_DTYPE
 from carlasc.viewing import Scene, view
 
 pytestmark = pytest.mark.slow
@@ -420,11 +419,7 @@ def actors(tmp_path_factory):
         pose = translation((10.0 + frame, 5, 0))[None]
         box = Boxes.from_poses(np.array([7], np.uint32), np.array([4], np.uint32), pose, np.array([[3.0, 3, 3]]))
         writer.write("boxes", frame, box.to_table())
-        labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32)
-        writer.write("evaluation/instance", frame, np.where(labels == 4, 7, 0).astype(np.uint32).reshape(64, 64, 4))
-        velocity = np.zeros(np.count_nonzero(labels == 4), VELOCITY_DTYPE)
-        velocity["voxel"], velocity["velocity"] = np.flatnonzero(labels == 4), (6, 0, 0)
-        writer.write("evaluation/velocity", frame, velocity)
+    add_actors(folder, number=7, speed_m_s=6.0)
     return folder
 
 

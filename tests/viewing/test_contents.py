@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 from helpers.readers.page_arrays import unpack_arrays
-from helpers.readers.pixels import BLUE, RED
-from helpers.scenes.road_blocks import write_blocks
+from helpers.readers.pixels import BLUE
+from helpers.scenes.road_blocks import add_actors, write_blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -10,8 +10,6 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.storage import FolderSink
-from carlasc.storage.field_files import VELOCITY_DTYPE
 from carlasc.viewing import Scene
 from carlasc.viewing.page.contents import (
     OFFSET_STEPS,
@@ -123,22 +121,16 @@ def test_boxes_and_tracks_are_lines_in_the_frame_of_the_sensor():
 
 @pytest.fixture
 def moving_grid(tmp_path):
-    """A grid whose red block is actor 70,001 and moves at 3 m/s; the blue one is actor 5 and stands. There are no points."""
+    """A grid whose red block is actor 70,003 and moves at 3 m/s; the blue one is actor 5 and stands. There are no points."""
     folder = write_blocks(tmp_path / "cartesian", frames=1, points=False)
-    labels = np.fromfile(folder / "evaluation/000000.label", np.uint32)
-    writer = FolderSink(folder.parent).sequence(folder.name)
-    instance = np.select([labels == RED, labels == BLUE], [70_001, 5], 0).astype(np.uint32).reshape(64, 64, 4)
-    writer.write("evaluation/instance", 0, instance)
-    velocity = np.zeros(np.count_nonzero(labels == RED), VELOCITY_DTYPE)
-    velocity["voxel"], velocity["velocity"] = np.flatnonzero(labels == RED), (3, 0, 0)
-    writer.write("evaluation/velocity", 0, velocity)
+    add_actors(folder, frames=1)
     return folder
 
 
 def test_voxels_have_actors_and_arrows_where_no_point_has_flow(moving_grid):
     content = open_content(Scene(moving_grid), 0.2)
     arrays, _ = content.read(0)
-    assert set(np.unique(arrays["panel0/instance"]).tolist()) == {0, 5, 70_001}
+    assert set(np.unique(arrays["panel0/instance"]).tolist()) == {0, 5, 70_003}
     assert np.array_equal(arrays["panel0/instance"] == 5, arrays["panel0/label"] == BLUE)
     (arrow,) = arrays["actors/arrows"].reshape(-1, 6)
     assert np.allclose(arrow[:2], (10, 5), atol=0.5) and np.allclose(arrow[3:], (3, 0, 0))
@@ -151,5 +143,5 @@ def test_voxels_have_actors_and_arrows_where_no_point_has_flow(moving_grid):
 def test_pictures_colour_voxels_by_actor(moving_grid):
     drawing = evidence_drawing(Scene(moving_grid).open("grid").data, 0, "actor", ego=False)
     colors = {tuple(color) for color in np.unique(drawing.mesh.colors, axis=0).tolist()}
-    assert len(colors) == 3  # no actor, and two
+    assert len(colors) == 4  # the floor, no actor, and two
     assert [entry.name for entry in drawing.legend] == ["no actor", "an actor, each in a colour of its own"]

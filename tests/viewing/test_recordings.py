@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.readers.pixels import BLUE, RED
 from helpers.readers.recorded import POINT, read_mcap, read_metadata, read_rrd, verify_rrd, voxels_of
-from helpers.scenes.road_blocks import ROAD, write_blocks
+from helpers.scenes.road_blocks import ROAD, add_actors, add_poses, write_blocks
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, rotations_of, translation
@@ -21,7 +21,7 @@ from carlasc.errors import ArgumentError, ConflictError, DependencyError, Storag
 from carlasc.metrics import VoxelOutcome
 from carlasc.storage import FolderSink, layout
 from carlasc.viewing import Scene, ViewResult, view
-from carlasc.viewing.colors import ERRORS, PATH, UNLABELLED
+from carlasc.viewing.colors import ACTORS, ERRORS, PATH, UNLABELLED, actor_ids
 from carlasc.viewing.recordings.content import class_surfaces, record_frames, thin_scan
 from carlasc.viewing.rendering.meshes import grid_mesh
 from carlasc.viewing.viewer import RECORDINGS
@@ -48,7 +48,7 @@ def drive(tmp_path_factory):
 
 
 def color_of(label, table=CARLA):
-    red, green, blue = table.colors[label]
+    red, green, blue = table.colors[int(label)]
     return red << 24 | green << 16 | blue << 8 | 255  # as Rerun keeps it
 
 
@@ -437,6 +437,64 @@ def test_actors_without_boxes_are_followed_by_their_instances(tmp_path):
     (trail,) = frames[2].trails
     assert (trail.actor, trail.label) == (9, RED)
     np.testing.assert_allclose(trail.points, [(10 + i, -5, 0) for i in range(3)], atol=0.1)
+
+
+@pytest.fixture(scope="module")
+def actors(tmp_path_factory):
+    """A grid whose red block is actor 70,003, drives ahead at 3 m/s, and has no points; the blue one is actor 5 and stands."""
+    folder = write_blocks(tmp_path_factory.mktemp("actors") / "cartesian", points=False)
+    add_actors(folder)
+    add_poses(folder, [0.0] * 3, step_m=0.0)
+    return folder
+
+
+def test_velocities_of_voxels_are_arrows_and_tracks(actors, tmp_path):
+    entities, _ = read_rrd(view(actors, tmp_path / "a.rrd").out)
+    topics = read_mcap(view(actors, tmp_path / "a.mcap").out)
+    for frame in range(3):
+        flow = entities["/world/ego/flow"][frame]
+        np.testing.assert_allclose(flow["Arrows3D:vectors"], [(3, 0, 0)], atol=1e-3)
+        np.testing.assert_allclose(flow["Arrows3D:origins"][0][:2], (10 + frame, -5), atol=0.3)
+        ((arrow,),) = [entity.arrows for entity in topics["/flow"][frame].message.entities]
+        assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((10 + frame, -5), abs=0.3)
+        assert arrow.shaft_length + arrow.head_length == pytest.approx(3, abs=1e-3)
+    (way,) = entities["/world/tracks"][2]["LineStrips3D:strips"]
+    np.testing.assert_allclose(np.array(way)[:, :2], [(10, -5), (11, -5), (12, -5)], atol=0.3)
+    assert entities["/world/tracks"][2]["LineStrips3D:class_ids"] == [RED]
+    ((line,),) = [entity.lines for entity in topics["/tracks"][2].message.entities]
+    assert len(line.points) == 3
+
+
+def test_voxels_are_shown_by_actor_too(actors, tmp_path):
+    entities, _ = read_rrd(view(actors, tmp_path / "a.rrd").out)
+    (labels,) = (grid.labels for grid in Scene(actors).open().right_handed().read(1).grids)
+    cells, _, _ = voxels_of(read_mcap(view(actors, tmp_path / "a.mcap").out)["/actors"][1].message)
+    names = {path.rsplit("/", 1)[1] for path in entities if path.startswith("/world/ego/actors/")}
+    assert len(names) == 3
+    for label, actor in ((RED, 70_003), (BLUE, 5), (ROAD, 0)):
+        color = ACTORS.palette[actor_ids(np.array(actor))]
+        assert (cells["rgba"][labels == label][:, :3] == color).all()
+        parts = [entities[path][1] for path in entities if path.startswith("/world/ego/actors/")]
+        (part,) = [
+            part for part in parts if part["VoxelGridMap:colors"] == [color_of(actor_ids(np.array(actor)), ACTORS)]
+        ]
+        assert len(part["VoxelGridMap:voxel_indices"]) == np.count_nonzero(labels == label)
+    assert read_metadata(tmp_path / "a.mcap")["actors"]["1"] == "no actor"
+
+
+def test_points_have_the_numbers_of_their_actors(tmp_path):
+    folder = write_blocks(tmp_path / "cartesian", frames=1)
+    labels = np.fromfile(folder / "labels/000000.label", np.uint32)
+    numbers = np.where(labels == RED, 9, 0).astype(np.uint32)
+    FolderSink(folder.parent).sequence(folder.name).write("instances", 0, numbers)
+    points = read_rrd(view(folder, tmp_path / "a.rrd").out)[0]["/world/ego/instances"][0]
+    assert len(points["Points3D:positions"]) == np.count_nonzero(numbers)
+    assert set(points["Points3D:colors"]) == {color_of(actor_ids(np.array(9)), ACTORS)}
+    cloud = read_mcap(view(folder, tmp_path / "a.mcap").out)["/points"][0].message
+    field = {f.name: (f.offset, f.type) for f in cloud.fields}["instance"]
+    found = np.frombuffer(cloud.data, [*POINT.descr, ("instance", "<u4")])
+    assert field == (18, 5) and cloud.point_stride == found.itemsize
+    np.testing.assert_array_equal(found["instance"], numbers)
 
 
 LONG = """

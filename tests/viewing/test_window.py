@@ -11,7 +11,7 @@ import pytest
 from helpers.displays.browser import OUTPUT
 from helpers.displays.virtual_screen import virtual_screen
 from helpers.readers.pixels import blue_pixels, middle_of, red_pixels
-from helpers.scenes.road_blocks import write_blocks
+from helpers.scenes.road_blocks import add_actors, add_poses, write_blocks
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, translation
@@ -19,7 +19,8 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, DependencyError
 from carlasc.storage import FolderSink
 from carlasc.viewing import Scene, Window
-from carlasc.viewing.window import KEYS, advice, help_lines, import_open3d, missing_library
+from carlasc.viewing.open3d_loading import advice, import_open3d, missing_library
+from carlasc.viewing.window import KEYS, help_lines
 
 STEPS = """
 import json, sys
@@ -141,8 +142,15 @@ def test_keys_do_what_the_help_says(blocks, open_window):
     assert window.state.playing
     press(" ")
     assert not window.state.playing
-    assert window.state.layers == {"grid", "flow", "boxes", "vehicle"}
-    for key, layer in (("G", "grid"), ("P", "points"), ("F", "flow"), ("B", "boxes"), ("V", "vehicle")):
+    assert window.state.layers == {"grid", "flow", "boxes", "tracks", "vehicle"}
+    for key, layer in (
+        ("G", "grid"),
+        ("P", "points"),
+        ("F", "flow"),
+        ("B", "boxes"),
+        ("K", "tracks"),
+        ("V", "vehicle"),
+    ):
         before = set(window.state.layers)
         press(key)
         assert window.state.layers ^ before == {layer}
@@ -253,12 +261,58 @@ def test_boxes_are_drawn_where_they_are_in_the_colours_of_their_classes(tmp_path
     drawn_arrays(window)
     press("B")
     corners, colors = drawn_arrays(window)
-    np.testing.assert_allclose(corners.min(0), (9, -7, -0.75), atol=1e-6)  # right-handed: y points to the left
-    np.testing.assert_allclose(corners.max(0), (11, -3, 0.75), atol=1e-6)
-    assert len(colors) == 12 and np.allclose(colors, np.array(CARLA.colors[4]) / 255)
+    np.testing.assert_allclose(corners[:24].min(0), (9, -7, -0.75), atol=1e-6)  # right-handed: y points to the left
+    np.testing.assert_allclose(corners[:24].max(0), (11, -3, 0.75), atol=1e-6)
+    np.testing.assert_allclose(corners[24:], [(10, -5, -0.75), (10, -7.8, -0.75)], atol=1e-6)  # a bar to its front
+    assert len(colors) == 13 and np.allclose(colors, np.array(CARLA.colors[4]) / 255)
     ends = window.o3d.utility.Vector2iVector.call_args.args[0]
     lengths = np.linalg.norm(corners[ends[:, 0]] - corners[ends[:, 1]], axis=1)
-    assert sorted(np.round(lengths, 6).tolist()) == [1.5] * 4 + [2.0] * 4 + [4.0] * 4
+    assert sorted(np.round(lengths[:12], 6).tolist()) == [1.5] * 4 + [2.0] * 4 + [4.0] * 4
+
+
+@pytest.fixture
+def actors(tmp_path):
+    """A vehicle that stands, and a grid whose red block is actor 70,003 and drives a metre in each of three frames. There are no boxes."""
+    folder = write_blocks(tmp_path / "Town01_Light" / "cartesian")
+    add_actors(folder)
+    add_poses(folder, [0.0] * 3, step_m=0.0)
+    return folder
+
+
+def test_tracks_are_drawn_to_where_their_actors_are(actors, open_window):
+    window, press, _ = open_window(actors)
+    writer = FolderSink(actors.parent).sequence(actors.name)
+    for frame in range(3):
+        labels = np.fromfile(actors / "labels" / f"{frame:06d}.label", np.uint32)
+        writer.write("instances", frame, np.where(labels == 4, 9, 0).astype(np.uint32))
+    window, press, _ = open_window(actors)
+    for key in "GFV":
+        press(key)
+    press(262)
+    drawn_arrays(window)
+    press(262)
+    ends, colors = drawn_arrays(window)
+    np.testing.assert_allclose(ends, [(x, -5, 0) for x in (10, 11, 11, 12)], atol=0.1)
+    assert np.allclose(colors, np.array(CARLA.colors[4]) / 255)
+    press(263)  # backwards: the way up to there
+    ends, _ = drawn_arrays(window)
+    assert len(ends) == 2
+    press("K")
+    assert drawn_arrays(window) == []
+
+
+def test_the_panel_key_shows_the_grid_by_actor(actors, open_window):
+    window, press, said = open_window(actors)
+    for key in "FKV":
+        press(key)
+    drawn_arrays(window)
+    press("T")
+    assert said[-1] == "actors" and window.state.panel == 1
+    seen = {tuple(color) for color in np.round(255 * drawn_arrays(window)[3]).astype(int).tolist()}
+    assert len(seen) >= 3  # no actor, and two
+    assert [entry.name for entry in window.classes][:2] == ["no actor", "actors 12, 24, ..."]
+    press("T")
+    assert window.state.panel == 0
 
 
 @pytest.mark.parametrize(

@@ -26,10 +26,10 @@ from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.finding import SceneSource, find_truth
-from carlasc.viewing.recordings.content import Trail, Trails
 from carlasc.viewing.rendering.actor_boxes import box_lines
 from carlasc.viewing.rendering.drawings import motion_arrows
 from carlasc.viewing.scene import FrameContent, Scene, SceneReader
+from carlasc.viewing.trails import Trail, Trails
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -261,7 +261,7 @@ class PageContent:
         moving = self.reader.read_motion(frame, content.scan)
         if content.scan is not None:
             arrays |= {f"scan/{name}": array for name, array in encode_scan(content.scan, self.thin_m).items()}
-        ways = trails.follow(content) if trails is not None else ()
+        ways = trails.follow(self.frames.index(frame), content, moving) if trails is not None else ()
         arrays |= {f"actors/{name}": array for name, array in encode_actors(content, moving, ways).items()}
         return arrays, self._score(grids)
 
@@ -284,7 +284,7 @@ class PageContent:
             "hasPoints": reader.has("points"),
             "hasFlow": reader.has_motion,
             "hasBoxes": reader.has("boxes"),
-            "hasTracks": bool(poses) and (reader.has("boxes") or reader.has("instances")),
+            "hasTracks": bool(poses) and any(map(reader.has, ("boxes", "instances", f"{reader.data.grid}/instance"))),
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
         }

@@ -19,9 +19,9 @@ from carlasc.storage.files import write_output, writing
 from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content, pack_arrays
-from carlasc.viewing.recordings.content import Trails
 from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import ViewResult, check_target, first_frames
+from carlasc.viewing.trails import Trails
 
 SCRIPTS = (
     "interface.js",

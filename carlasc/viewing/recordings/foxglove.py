@@ -3,9 +3,9 @@
 Topics, all in right-handed axes with z up; times are seconds since the first frame:
 
     /tf                      FrameTransforms: `ego`, the sensor, in `world`, the frame of the first scan
-    /points                  PointCloud: colours and class ids
+    /points                  PointCloud: colours, class ids, and numbers of actors where there are some
     /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid; with a ground truth
-                             /prediction, /truth and /errors
+                             /prediction, /truth and /errors; /actors: its voxels by actor
     /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the ways of the actors
     /path                    SceneUpdate: the way of the vehicle through the whole recording
     /picture                 CompressedImage: the bird's-eye camera picture
@@ -54,7 +54,7 @@ class FoxgloveWriter:
         self._output = _Output(path)
         self._writer = foxglove.open_mcap(self._output, context=self._context)
         self._writer.write_metadata("carlasc", {"sequence": reader.name, "classes": reader.table.name})
-        tables = {panel.colors.table.name: panel.colors for panel in reader.panels if panel.name == "errors"}
+        tables = {panel.colors.table.name: panel.colors for panel in reader.panels if panel.colors is not reader.colors}
         for name, colors in {"classes": reader.colors, **tables}.items():
             names = {str(entry.order): entry.name for entry in colors.entries(colors.table.names)}
             self._writer.write_metadata(name, names)
@@ -144,17 +144,21 @@ class FoxgloveWriter:
     def _points(self, scan: Scan) -> dict[str, Any]:
         """Return a scan as the content of a PointCloud."""
         m = self._messages
-        points = np.zeros(len(scan), _POINT)
+        numbered = scan.instances is not None
+        points = np.zeros(len(scan), [*_POINT.descr, ("instance", "<u4")] if numbered else _POINT)
+        if numbered:
+            points["instance"] = scan.instances
         points["xyz"], points["rgba"] = scan.points, 255
         points["rgba"][:, :3] = point_colors(scan, self._reader.colors.by_id)
         points["label"] = 0 if scan.labels is None else scan.labels
         float32 = m.PackedElementFieldNumericType.Float32
         axes = [m.PackedElementField(name=name, offset=4 * i, type=float32) for i, name in enumerate("xyz")]
         label = m.PackedElementField(name="label", offset=16, type=self._uint(2))
+        numbers = [m.PackedElementField(name="instance", offset=18, type=self._uint(4))] if numbered else []
         return {
             "pose": self._pose(np.eye(4)),
-            "point_stride": _POINT.itemsize,
-            "fields": [*axes, *self._color_fields(12), label],
+            "point_stride": points.itemsize,
+            "fields": [*axes, *self._color_fields(12), label, *numbers],
             "data": points.tobytes(),
         }
 
@@ -236,7 +240,7 @@ class FoxgloveWriter:
 
     def _uint(self, size: int) -> Any:
         types = self._messages.PackedElementFieldNumericType
-        return types.Uint8 if size == 1 else types.Uint16
+        return {1: types.Uint8, 2: types.Uint16, 4: types.Uint32}[size]
 
 
 class _Output:

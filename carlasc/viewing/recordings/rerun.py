@@ -8,7 +8,8 @@ Entities, all in right-handed axes with z up:
     world/ego                    the pose of the sensor; everything below is in its frame
     world/ego/vehicle            a plain car
     world/ego/points, flow, boxes
-    world/ego/PANEL/CLASS        the voxels of each class: `grid`, or `prediction`, `truth` and `errors`
+    world/ego/instances          the points of actors, in a colour for each actor
+    world/ego/PANEL/CLASS        the voxels of each class: `grid`, or `prediction`, `truth` and `errors`; `actors`: by actor
     picture                      the bird's-eye camera picture
 """
 
@@ -144,6 +145,10 @@ class RerunWriter:
         if frame.scan is not None:
             labels = np.zeros(len(frame.scan), np.uint16) if frame.scan.labels is None else frame.scan.labels
             log("world/ego/points", rr.Points3D(frame.scan.points, class_ids=labels, radii=[_POINT_RADIUS_M]))
+            if (numbers := frame.scan.instances) is not None:
+                colors = palette.ACTORS.palette[palette.actor_ids(numbers[numbers > 0])]
+                points = frame.scan.points[numbers > 0]
+                log("world/ego/instances", rr.Points3D(points, colors=colors, radii=[_POINT_RADIUS_M]))
         if self._reader.has_motion:
             log("world/ego/flow", rr.Arrows3D(origins=frame.tails, vectors=frame.vectors, colors=[palette.ARROW]))
         if self._reader.has("boxes"):
@@ -240,10 +245,11 @@ class RerunWriter:
         blueprint, reader = self._rr.blueprint, self._reader
         names = [panel.name for panel in reader.panels]
         grids = [
-            self._view(panel.title, ["points", *(f"{n}/**" for n in names if n != panel.name)])
+            self._view(panel.title, ["points", "instances", *(f"{n}/**" for n in names if n != panel.name)])
             for panel in reader.panels
         ]
-        others = [self._view("points", [f"{name}/**" for name in names])] if reader.has("points") else []
+        clouds = [name for name in ("points", "instances") if reader.has(name)]
+        others = [self._view(name, [*(f"{n}/**" for n in names), *(n for n in clouds if n != name)]) for name in clouds]
         if reader.has("bev"):
             others.append(blueprint.Spatial2DView(origin="/picture", name="picture"))
         if len(grids) == 1 and others:

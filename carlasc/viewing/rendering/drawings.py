@@ -33,10 +33,6 @@ GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags", "actor": "instance"}
 _SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
-_ACTORS = (  # by number, again and again
-    *((10, 176, 245), (213, 70, 0), (10, 165, 88), (138, 86, 194), (240, 200, 40), (200, 20, 10)),
-    *((22, 208, 192), (230, 103, 176), (16, 69, 190), (154, 106, 47), (122, 201, 67), (94, 82, 83)),
-)
 _ORIGINS = (
     Entry("seen in this frame", (0, 114, 178), 0),
     Entry("seen in other frames", (190, 196, 204), 1),
@@ -313,8 +309,7 @@ def evidence_drawing(data: RemappedSequence, frame: int, color: GridColor, *, eg
     grid = data.read_grid(frame)
     values = data.read_part(_PARTS[color], frame)
     numbers, legend = _classify(values, color)
-    table = [palette.STATIC, *_ACTORS] if color == "actor" else [entry.color for entry in legend]
-    colors = np.array(table, np.uint8)
+    colors = palette.ACTORS.palette if color == "actor" else np.array([entry.color for entry in legend], np.uint8)
     return voxel_drawing(grid.spec, colors[numbers], grid.labels > 0, legend, "no voxel is occupied", ego)
 
 
@@ -323,7 +318,8 @@ def evidence_legend(color: GridColor) -> list[Entry]:
     if color == "inferred":
         return list(_ORIGINS)
     if color == "actor":
-        return [Entry("no actor", palette.STATIC), Entry("an actor, each in a colour of its own", _ACTORS[0], 1)]
+        first = palette.ACTORS.colors[2]
+        return [Entry("no actor", palette.STATIC), Entry("an actor, each in a colour of its own", first, 1)]
     if color == "confidence":
         names = [f"up to {_SHARES[0]:.0%}"]
         names += [f"{low * 100:.0f} to {high:.0%}" for low, high in pairwise(_SHARES)]
@@ -345,7 +341,7 @@ def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64]
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
         return np.where(values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)), legend
     if color == "actor":
-        return np.where(values > 0, 1 + values.astype(np.int64) % len(_ACTORS), 0), legend
+        return palette.actor_ids(values).astype(np.int64), legend
     if color == "confidence":
         return np.digitize(values.astype(np.float64), _SHARES), legend
     powers = np.floor(np.log2(np.maximum(values.astype(np.float64), 1)))

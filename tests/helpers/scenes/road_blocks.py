@@ -11,6 +11,7 @@ from helpers.readers.pixels import BLUE, RED, grid_with
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec, VoxelFlag
 from carlasc.storage import layout
+from carlasc.storage.field_files import VELOCITY_DTYPE
 from carlasc.storage.files import to_json
 from carlasc.storage.folder import FolderSink
 
@@ -64,6 +65,18 @@ def add_evidence(folder: Path, frames: int = 3) -> None:
         writer.write("evaluation/flags", frame, flags.astype(np.uint8))
         writer.write("evaluation/occupied", frame, np.select(kinds, [0.6, 0.8, 1.0], 0.0).astype(np.float16))
         writer.write("evaluation/views", frame, np.select(kinds, [0, 3, 40], 0).astype(np.uint16))
+
+
+def add_actors(folder: Path, frames: int = 3, number: int = 70_003, speed_m_s: float = 3.0) -> None:
+    """Write who is in each voxel of `write_blocks`: the red block is an actor that moves ahead, the blue one is actor 5 and stands."""
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    for frame in range(frames):
+        labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32)
+        instance = np.select([labels == RED, labels == BLUE], [number, 5], 0).astype(np.uint32)
+        velocity = np.zeros(np.count_nonzero(labels == RED), VELOCITY_DTYPE)
+        velocity["voxel"], velocity["velocity"] = np.flatnonzero(labels == RED), (speed_m_s, 0, 0)
+        writer.write("evaluation/instance", frame, instance.reshape(64, 64, 4))
+        writer.write("evaluation/velocity", frame, velocity)
 
 
 def add_poses(folder: Path, yaws_rad: list[float], step_m: float = 5.0) -> None:

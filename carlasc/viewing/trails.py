@@ -1,0 +1,85 @@
+"""The ways of actors up to a frame, which pages, recordings and windows draw."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.geometry import transform_points
+from carlasc.core.scans import Scan
+from carlasc.viewing.scene import FrameContent
+
+LONGEST = 50
+"""Frames that a trail reaches back: five seconds at the rate of the data."""
+
+_LEAST_WAY_M = 1.0  # what moved less stands: boxes of parked cars move by decimetres
+_MOVING_M_S = 0.2
+
+
+class Trail(NamedTuple):
+    """The way of one actor up to a frame.
+
+    Attributes:
+        actor: number of the track, or of the instance where there are no boxes.
+        label: class id.
+        points: (K, 3) float64 metres in the world, the frame of the first scan; the last is in the present frame.
+    """
+
+    actor: int
+    label: int
+    points: NDArray[np.float64]
+
+
+@dataclass
+class Trails:
+    """Follows the actors of a sequence through its frames, forwards or backwards. It remembers the `LONGEST` frames around the last one."""
+
+    _seen: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)  # places of actors, by frame
+
+    def follow(self, position: int, content: FrameContent, moving: Scan | None) -> tuple[Trail, ...]:
+        """Return the trails of the actors that a frame shows and that have moved; none without poses.
+
+        An actor is where its box is. In sequences without boxes, it is in the middle of the points of its instance, or of its voxels, if
+        these move.
+
+        Args:
+            position: place of the frame in the order of frames.
+            content: the frame.
+            moving: what moves in it, with flow, as `SceneReader.read_motion` returns it.
+        """
+        if content.pose is None:
+            return ()
+        actors = list(_actors(content, moving))
+        self._seen = {at: places for at, places in self._seen.items() if abs(at - position) < LONGEST}
+        self._seen[position] = {actor: transform_points(content.pose, center) for actor, _, center in actors}
+        ways = defaultdict(list)
+        for at in sorted(at for at in self._seen if at <= position):
+            for actor, place in self._seen[at].items():
+                ways[actor].append(place)
+        trails = (Trail(actor, label, np.array(ways[actor])) for actor, label, _ in actors)
+        return tuple(trail for trail in trails if np.linalg.norm(np.ptp(trail.points, axis=0)) >= _LEAST_WAY_M)
+
+
+def _actors(content: FrameContent, moving: Scan | None) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+    """Yield the number, the class and the (3,) position of each actor, in the frame of the sensor."""
+    boxes = content.boxes
+    if boxes is not None:
+        yield from zip(boxes.tracks.tolist(), boxes.labels.tolist(), boxes.centers, strict=True)
+        return
+    scan = content.scan if moving is None else moving
+    if scan is None or scan.instances is None:
+        return
+    chosen = scan.instances > 0
+    if scan.flow is not None:
+        chosen &= np.linalg.norm(scan.flow, axis=1) > _MOVING_M_S
+    actors, first, group = np.unique(scan.instances[chosen], return_index=True, return_inverse=True)
+    points = scan.points[chosen].astype(np.float64)
+    count = np.bincount(group.reshape(-1), minlength=len(actors))
+    middles = np.stack([np.bincount(group.reshape(-1), points[:, a], len(actors)) for a in range(3)], axis=1)
+    labels = np.zeros(len(points), np.int64) if scan.labels is None else scan.labels[chosen]
+    yield from zip(actors.tolist(), labels[first].tolist(), middles / count[:, None], strict=True)
