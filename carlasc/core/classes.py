@@ -125,6 +125,13 @@ class ClassTable:
         values |= {name: getattr(self, name) for name in _WITHOUT_LABELS if getattr(self, name) is not None}
         return values | {"num_channels": self.num_channels}
 
+    @cached_property
+    def standing(self) -> dict[int, int]:
+        """Class of what moves -> class of the same kind of actor, for classes with names such as "moving-car" and "car"."""
+        ids = {name: label for label, name in self.names.items()}
+        kinds = {label: self.names[label].removeprefix("moving-") for label in self.moving}
+        return {label: ids[kind] for label, kind in kinds.items() if ids.get(kind, label) != label}
+
     @property
     def geometry_id(self) -> int:
         """The id that the points of a scan without labels get."""

@@ -32,6 +32,7 @@ from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
 _WRITTEN = ("flow", "instances")
+_KEPT = 64  # frames of which some field is still to be read
 _FOUND = "found by carlasc from "  # what carlasc.json says of motion, before what showed it
 
 
@@ -60,7 +61,7 @@ def label_motion(
 
     The fields `instances` and `flow` are made from the bodies of what moves, which `observe` says how to find: with its defaults from the best
     field that exists, and from free space. An actor has one number in the whole sequence, that of the data where it has one. Points of what stands keep
-    the numbers of the data. Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one
+    the numbers of the data. Where the class table has classes of what moves, such as SemanticKITTI's, labels become these. Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one
     file system: no file of either may be edited in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
 
     Args:
@@ -112,6 +113,10 @@ def label_motion(
             _find(one, copy.writer(path), pool, step)
             moving[path] = _MovingSequence(given[path], one.feed, one.actors)
             notes += [note for note in one.notes() if "grids" not in note]
+        tables = {one.metadata.classes.name for one in given.values() if not one.metadata.classes.standing}
+        if tables and any("labels" in one.fields() for one in given.values()):
+            found = f"the classes {', '.join(sorted(tables))} do not tell what moves from what stands"
+            notes.append(f"{found}: labels are as they were; instances and flow say what moves")
         after = replace(pool, progress=lambda done, total: progress(scans + done, scans + total))
         copied = copy.write(moving, after)
     return MotionResult(
@@ -135,27 +140,45 @@ class _MovingSequence(DerivedSequence):
 
     def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
         extra = {**whole.metadata.extra, "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
-        super().__init__(whole, {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}, changed=_WRITTEN)
+        self._changed = {*_WRITTEN} | ({"labels"} & whole.fields() if whole.metadata.classes.standing else set[str]())
+        texts = {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}
+        super().__init__(whole, texts, changed=self._changed)
         self._feed, self.actors = feed, actors
-        self._made: dict[int, NDArray[np.float32]] = {}  # flow of the frames whose instances have been read
+        self._made: dict[int, dict[str, NDArray[Any]]] = {}  # by frame and field, until the last one is read
 
     def fields(self) -> frozenset[str]:
         """Return the fields that do not change, and those that were found."""
-        return self.kept | set(_WRITTEN)
+        return self.kept | self._changed
 
     def frames(self, field: str) -> NDArray[np.int64]:
         """Return the frames of a field."""
-        return self.whole.frames("points") if field in _WRITTEN else super().frames(field)
+        if field in _WRITTEN:
+            return self.whole.frames("points")
+        return self.whole.frames(field) if field in self._changed else super().frames(field)
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame."""
-        if field not in _WRITTEN:
+        if field not in self._changed:
             return self.whole.read(field, frame)
-        if field == "flow" and frame in self._made:
-            return self._made.pop(frame)
+        if frame not in self._made:
+            if len(self._made) == _KEPT:
+                self._made.clear()
+            self._made[frame] = self._make(frame)
+        made = self._made[frame][field]
+        if field == max(self._changed):  # what copies reads them in this order
+            del self._made[frame]
+        return made
+
+    def _make(self, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the fields of a frame that are found, and its labels if they change."""
         instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
-        self._made = {frame: flow} if field == "instances" else {}
-        return instances if field == "instances" else flow
+        found: dict[str, NDArray[Any]] = {"instances": instances, "flow": flow}
+        if "labels" in self._changed and frame in self.whole.frames("labels"):
+            labels = self.whole.read("labels", frame).astype(np.uint32)
+            for moving, standing in self.whole.metadata.classes.standing.items():
+                labels[(labels == standing) & flow.any(axis=1)] = moving
+            found["labels"] = labels
+        return found
 
 
 def points_of_actors(

@@ -37,9 +37,6 @@ from carlasc_converters.kitti_files import (
 )
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
-STANDING = {  # class of moving actors -> class of the same actors when they stand
-    moving: SEMANTICKITTI.id_of(SEMANTICKITTI.names[moving].removeprefix("moving-")) for moving in SEMANTICKITTI.moving
-}
 _TEST_FIRST, _VALIDATION = 11, 8
 
 
@@ -225,6 +222,6 @@ def _split_of(name: str) -> Split:
 
 
 _CLASS_PART = np.arange(1 << 16, dtype=np.uint32) << 16
-_CLASS_PART[list(STANDING)] = _CLASS_PART[list(STANDING.values())]
+_CLASS_PART[list(SEMANTICKITTI.standing)] = _CLASS_PART[list(SEMANTICKITTI.standing.values())]
 CLASS_PARTS = np.unique(_CLASS_PART[[label for label in SEMANTICKITTI.names if label]])
 """What the classes of actors add to the numbers of SemanticKITTI."""

@@ -15,7 +15,8 @@ from carlasc.cli import app
 from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import ArgumentError, ConflictError
 from carlasc.motion import MotionOptions
-from carlasc.storage import FolderSource
+from carlasc.storage import FolderSink, FolderSource
+from carlasc.storage.files import to_json
 
 ONE = Run(workers=1)
 REAL = Path(__file__).parents[3] / "shared/real"
@@ -68,6 +69,33 @@ def test_the_exporter_of_kitti_makes_the_classes_that_move_of_it(numbered):
     labels = np.fromfile(file, "<u4")
     assert ((labels & 0xFFFF) == 251).sum() == pytest.approx(moving.sum(), rel=0.03)
     assert set(np.unique(labels >> 16).tolist()) == {0, 4, 9}
+
+
+def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_files_of_kitti(numbered, tmp_path):
+    """SemanticKITTI's: the passing car becomes 252, the parked one stays 10; the number that it gets is nobody else's in a file either."""
+    folder, result = numbered
+    assert any("the classes carla do not tell what moves" in note for note in result.notes)
+    given = the_sequence(folder / "in")
+    writer = FolderSink(tmp_path / "in").sequence("Val/Street/cartesian")
+    writer.write_document("carlasc.json", to_json({"classes": "semantickitti", "axes": "right"}))
+    for name in ("poses.txt", "times.txt"):
+        writer.write_document(name, given.read_document(name))
+    for frame in range(8):
+        labels, instances = given.read("labels", frame), given.read("instances", frame)
+        writer.write("points", frame, given.read("points", frame))
+        writer.write("labels", frame, np.select([labels == 10, labels == 7], [10, 40], 50).astype(np.uint32))
+        writer.write("instances", frame, np.where(instances == 4, 10 << 16 | 4, 0).astype(np.uint32))
+        _, _, moving = scan(frame, sensor_pose(frame))
+        writer.write("flow", frame, (moving[:, None] * np.array([SPEED_M_S, 0, 0])).astype(np.float32))
+    observe = FromScans(motion=MotionOptions("flow"))
+    result = carlasc.label_motion(tmp_path / "in", tmp_path / "out", observe=observe, run=ONE)
+    assert result.actors == 1 and not any("do not tell" in note for note in result.notes)
+    carlasc.export("kitti", tmp_path / "out", tmp_path / "kitti", run=ONE)
+    (file,) = (tmp_path / "kitti").rglob("labels/000004.label")
+    both, (_, _, moving) = np.fromfile(file, "<u4"), scan(4, sensor_pose(4))
+    labels, numbers = both & 0xFFFF, both >> 16
+    assert (labels == 252).sum() == pytest.approx(moving.sum(), rel=0.03) and (labels[~moving] != 252).mean() > 0.999
+    assert np.unique(numbers[labels == 252]).tolist() == [5] and np.unique(numbers[labels == 10]).tolist() == [4]
 
 
 def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):

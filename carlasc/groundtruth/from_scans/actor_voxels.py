@@ -17,6 +17,7 @@ from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.motion.numbering import number_actors
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
 
+_CLASS_PARTS = 1 << 10  # numbers whose upper 16 bits are below this may have a class there
 _TURN_FRAMES = 3  # frames before and after, between which the turning of an actor is measured
 Numbered = tuple[NDArray[np.float32], NDArray[np.int64]]
 _NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = (
@@ -29,8 +30,15 @@ def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
     highest = max((int(actor["instance"]) for actor in actors.summary), default=0)
     numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_MOVER]
     if "instances" in feed.sequence.fields() and len(numbered) < len(actors.tracks):
-        frames = feed.sequence.frames("instances").tolist()
-        highest = max([highest, *(int(feed.sequence.read("instances", frame).max(initial=0)) for frame in frames)])
+        upper = lower = 0
+        for frame in feed.sequence.frames("instances").tolist():
+            numbers = feed.sequence.read("instances", frame).astype(np.int64)
+            highest, upper = max(highest, int(numbers.max(initial=0))), max(upper, int(numbers.max(initial=0)) >> 16)
+            lower = max(lower, int((numbers & 0xFFFF).max(initial=0)))
+        if (
+            upper < _CLASS_PARTS
+        ):  # new numbers differ in the lower half too, which is all that SemanticKITTI's files keep
+            highest = max(highest, upper << 16 | lower)
     return replace(actors, numbers=number_actors(actors.tracks, highest))
 
 

@@ -20,7 +20,7 @@ from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_
 from carlasc_converters.exporters.grid_exporter import choose_grid, number_folders, read_points, scan_occupancy
 from carlasc_converters.exporters.occlusion import occluded_voxels
 from carlasc_converters.exporters.submission import Task, check_archive, check_submission, pack_submission
-from carlasc_converters.kitti import CLASS_PARTS, STANDING
+from carlasc_converters.kitti import CLASS_PARTS
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 
 _NAMES_OF_11 = "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
@@ -48,7 +48,7 @@ TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
 _STANDS, _MOVES = 9, 251  # the ids of moving-object segmentation; unlabelled points and outliers stay 0
 _MOVING_M_S = 0.5  # points that are faster than this move
 _TO_MOVING = np.arange(max(SEMANTICKITTI.names) + 1)
-_TO_MOVING[list(STANDING.values())] = list(STANDING)
+_TO_MOVING[list(SEMANTICKITTI.standing.values())] = list(SEMANTICKITTI.standing)
 _CALIBRATION = "".join(
     f"{name}: {' '.join(f'{value:.12e}' for value in np.eye(4)[:3].ravel())}\n"
     for name in ("P0", "P1", "P2", "P3", "Tr")
