@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, get_args
 
@@ -33,6 +33,7 @@ GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags", "actor": "instance"}
 _SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
+VELOCITY = Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES)
 _ORIGINS = (
     Entry("seen in this frame", (0, 114, 178), 0),
     Entry("seen in other frames", (190, 196, 204), 1),
@@ -192,13 +193,18 @@ def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
         colors.table.check(points.labels, "scan labels")
         point_colors[moving] = colors.by_id[points.labels[moving]]
         legend += colors.entries(np.unique(points.labels[moving]).tolist())
-    tails, vectors = motion_arrows(points.select(moving))
-    meshes = [ego_vehicle()] if ego else []
-    if len(tails):
-        meshes.append(arrows(tails, vectors, palette.ARROW, 0.24))
-        legend.append(Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES))
-    note = None if len(tails) else "nothing moves"
-    return Drawing(extent, join(meshes) if meshes else None, points.points, point_colors, legend, note)
+    note = None if moving.any() else "nothing moves"
+    drawing = Drawing(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
+    return with_arrows(drawing, points.select(moving))
+
+
+def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
+    """Return a drawing with the arrows of what moves, points or middles of voxels with flow; None for nothing."""
+    if moving is None or not len((ends := motion_arrows(moving))[0]):
+        return drawing
+    mesh = arrows(*ends, palette.ARROW, 0.24)
+    mesh = mesh if drawing.mesh is None else join([drawing.mesh, mesh])
+    return replace(drawing, mesh=mesh, legend=[*drawing.legend, VELOCITY])
 
 
 def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

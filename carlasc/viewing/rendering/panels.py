@@ -18,6 +18,7 @@ from carlasc.viewing.finding import RemappedSequence
 from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
 from carlasc.viewing.rendering.drawings import (
+    VELOCITY,
     Drawing,
     Extent,
     GridColor,
@@ -29,6 +30,7 @@ from carlasc.viewing.rendering.drawings import (
     grid_extent,
     scan_drawing,
     scan_extent,
+    with_arrows,
 )
 from carlasc.viewing.rendering.pictures import Panel, draw_panels
 from carlasc.viewing.rendering.styles import Sheet
@@ -109,7 +111,8 @@ class FrameRenderer:
         if content == "errors":
             return error_drawing(reader.data.read_grid(frame), self._grid_of("truth").read_grid(frame), ego=self.ego)
         if content == "grid" and self.color != "class":
-            return evidence_drawing(reader.data, frame, self.color, ego=self.ego)
+            drawing = evidence_drawing(reader.data, frame, self.color, ego=self.ego)
+            return with_arrows(drawing, reader.read_motion(frame, None)) if self.color == "actor" else drawing
         return grid_drawing(self._grid_of(content).read_grid(frame), colors, ego=self.ego)
 
     def legend_of(self, frame: int) -> list[Entry]:
@@ -118,6 +121,8 @@ class FrameRenderer:
         for content in self.reader.contents:
             if content == "grid" and self.color != "class":
                 legends.append(evidence_legend(self.color))
+                if self.color == "actor" and self.reader.has(f"{self.reader.data.grid}/velocity"):
+                    legends.append([VELOCITY])
             elif content in ("grid", "truth") and colors.palette != "height":  # without building the mesh
                 labels = self._grid_of(content).read_grid(frame).labels
                 legends.append(colors.entries(np.flatnonzero(np.bincount(labels.reshape(-1))).tolist()))
