@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, check_rigid
+from carlasc.core.geometry import Transform, check_rigid, rotate_vectors
 from carlasc.core.scans import Scan, check_finite
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
@@ -211,6 +211,25 @@ class Capture:
                 )
         scan = Scan(arrays["points"], labels=arrays["labels"], instances=arrays["instances"])
         return SensorRecording(scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"])
+
+    def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
+        """Return the (3,) velocity over ground, m/s, world frame, of each actor that a sensor hit in a frame.
+
+        Raises:
+            MissingDataError: a file does not exist.
+            FormatError: a file does not have the format.
+        """
+        paths = [
+            self._folder + array_path(kind, sensor, frame) for kind in ("velocities", "pose") for sensor in self.sensors
+        ]
+        files, found = self.tree.read_many(paths), dict[int, NDArray[np.float64]]()
+        half = len(self.sensors)
+        for row, (path, data) in enumerate(zip(paths[:half], files[:half], strict=True)):
+            rows = parse_npy(data, FORMATS["velocities"], where := self.tree.where(path))
+            check_finite(rows, where)
+            velocities = rotate_vectors(self._pose_of(paths[half + row], files[half + row]), rows[:, 1:])
+            found |= dict(zip(rows[:, 0].astype(np.int64).tolist(), velocities, strict=True))
+        return found
 
     def read_pose(self, sensor: int, frame: int) -> Transform:
         """Return the (4, 4) float64 world_T_sensor of a frame.

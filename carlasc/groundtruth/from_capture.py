@@ -24,6 +24,9 @@ from carlasc.storage.protocol import Source
 if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views
 
+_TURN_FRAMES = 3  # frames before and after
+_TURNING_M_S = 1.0  # of slower actors, the direction of the velocity is not that of the actor
+
 
 @dataclass(frozen=True)
 class CaptureFrame(FrameInput):
@@ -33,6 +36,7 @@ class CaptureFrame(FrameInput):
     sensors: tuple[int, ...]
     number: int
     source_frame: int
+    around: tuple[int, int]  # a frame before and one after: between them, the turning of actors is measured
 
     def fields(self) -> tuple[str, ...]:
         """Return points, labels, flow and instances, and the pictures that the frame has."""
@@ -61,10 +65,10 @@ class CaptureFrame(FrameInput):
             fields["bev"] = np.frombuffer(picture, np.uint8)
         if self.capture.cameras:
             fields |= self.capture.read_images(self.source_frame)
-        step = plan.voting.free_step_m
-        who = ActorPoints(plan.spec) if plan.voting.keep_actors else None
+        step, classes = plan.voting.free_step_m, self.capture.classes
+        who = ActorPoints(plan.spec, self._turns(), classes.deformable) if plan.voting.keep_actors else None
         seen = self._observations(ego, who)
-        votes = count_votes(seen, plan.spec, self.capture.classes, rule=plan.rule, free_step_m=step)
+        votes = count_votes(seen, plan.spec, classes, rule=plan.rule, free_step_m=step)
         grid = votes.to_grid()
         return FrameData(fields, grid, votes, actors=None if who is None else who.of(grid.labels))
 
@@ -75,6 +79,17 @@ class CaptureFrame(FrameInput):
             if who is not None:
                 who.add(recording, ego_T_sensor)
             yield Observation(recording.scan.points, _present(recording.scan.labels), ego_T_sensor)
+
+    def _turns(self) -> dict[int, float]:
+        """Return how fast actors turn about the vertical, rad/s: how the direction of their velocity changes."""
+        before, after = (self.capture.read_velocities(frame) for frame in self.around)
+        seconds, turns = (self.around[1] - self.around[0]) * layout.FRAME_PERIOD_S, dict[int, float]()
+        for actor in before.keys() & after.keys() if seconds else ():
+            first, last = before[actor], after[actor]
+            if min(np.hypot(*first[:2]), np.hypot(*last[:2])) > _TURNING_M_S:
+                angle = np.arctan2(first[0] * last[1] - first[1] * last[0], first[0] * last[0] + first[1] * last[1])
+                turns[actor] = float(angle) / seconds
+        return turns
 
 
 class CaptureSequence(SequenceInput):
@@ -88,8 +103,11 @@ class CaptureSequence(SequenceInput):
         capture = self.capture
         numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
         # Frames hold another Capture: this one caches its listing, which would be pickled with every frame.
-        light = capture.light()
-        return tuple(CaptureFrame(light, capture.sensors, i, number) for i, number in enumerate(numbers))
+        light, known = capture.light(), capture.frames
+        place = np.searchsorted(known, numbers)
+        around = [known[np.clip(place + step, 0, len(known) - 1)].tolist() for step in (-_TURN_FRAMES, _TURN_FRAMES)]
+        frames = enumerate(zip(numbers, *around, strict=True))
+        return tuple(CaptureFrame(light, capture.sensors, i, n, (before, after)) for i, (n, before, after) in frames)
 
     def _count_points(self, source_frame: int) -> int:
         return len(self.capture.read(0, source_frame).scan)

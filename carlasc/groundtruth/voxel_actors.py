@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -54,27 +55,41 @@ class VoxelActors:
 
 
 class ActorPoints:
-    """Counts the points of each actor in each voxel; memory does not grow with the number of sensors."""
+    """Counts the points of each actor in each voxel; memory does not grow with the number of sensors.
 
-    def __init__(self, spec: GridSpec) -> None:
-        self.spec = spec
+    Attributes:
+        spec: the grid.
+        turns: how fast actors turn about the vertical, rad/s, by their numbers.
+        deformable: classes of what does not turn as a whole.
+    """
+
+    def __init__(self, spec: GridSpec, turns: Mapping[int, float], deformable: Collection[int]) -> None:
+        self.spec, self.turns, self.deformable = spec, turns, deformable
         self._counts = np.empty(0, _POINTS_DTYPE)
         self._velocity: dict[int, NDArray[np.float64]] = {}
+        self._extent: dict[
+            int, tuple[NDArray[np.float64], NDArray[np.float64]]
+        ] = {}  # lowest and highest x and y of the points of what turns
 
     def add(self, recording: SensorRecording, grid_T_sensor: Transform) -> None:
         """Add the points of a recording; numbers of actors are those of the whole recording."""
         scan = recording.scan
         if scan.labels is None or scan.instances is None:
             return
-        voxels = self.spec.flat_index(transform_points(grid_T_sensor, scan.points))
+        points = transform_points(grid_T_sensor, scan.points)
+        voxels = self.spec.flat_index(points)
         used = (voxels >= 0) & (scan.labels > 0)
-        points = np.empty(np.count_nonzero(used), _POINTS_DTYPE)
-        points["voxel"], points["label"], points["actor"] = voxels[used], scan.labels[used], scan.instances[used]
-        points["points"] = 1
-        self._counts = _sum(np.concatenate([self._counts, _sum(points)]))
+        rows = np.empty(np.count_nonzero(used), _POINTS_DTYPE)
+        rows["voxel"], rows["label"], rows["actor"] = voxels[used], scan.labels[used], scan.instances[used]
+        rows["points"] = 1
+        self._counts = _sum(np.concatenate([self._counts, _sum(rows)]))
         velocity = rotate_vectors(grid_T_sensor, recording.velocities[:, 1:])
         for actor, own in zip(recording.velocities[:, 0].astype(np.int64).tolist(), velocity, strict=True):
             self._velocity.setdefault(actor, own)
+            places = points[scan.instances == actor, :2]
+            if self.turns.get(actor) and len(places):
+                lower, upper = self._extent.get(actor, (places[0], places[0]))
+                self._extent[actor] = np.minimum(lower, places.min(axis=0)), np.maximum(upper, places.max(axis=0))
 
     def of(self, labels: NDArray[np.unsignedinteger]) -> VoxelActors:
         """Return the actors of a grid with these labels, (X, Y, Z): of the points of a voxel's class, the number that most have; ties go to the lowest."""
@@ -86,7 +101,21 @@ class ActorPoints:
         instance[best["voxel"]] = best["actor"]
         known = best[np.isin(best["actor"], list(self._velocity)) & (best["actor"] > 0)]
         velocity = np.array([self._velocity[actor] for actor in known["actor"].tolist()]).reshape(-1, 3)
+        self._turn(known, velocity)
         return VoxelActors.of(self.spec, instance, known["voxel"].astype(np.int64), velocity)
+
+    def _turn(self, rows: NDArray[np.void], velocity: NDArray[np.float64]) -> None:
+        """Add to the velocity of each voxel what the turning of its actor, about the middle of its points, adds."""
+        for actor, (lower, upper) in self._extent.items():
+            own = np.flatnonzero((rows["actor"] == actor) & ~np.isin(rows["label"], list(self.deformable)))
+            arm = centers_of(self.spec, rows["voxel"][own])[:, :2] - (lower + upper) / 2
+            velocity[own, :2] += self.turns[actor] * np.column_stack([-arm[:, 1], arm[:, 0]])
+
+
+def centers_of(spec: GridSpec, voxels: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return (N, 3) the centres of voxels, by their flat indices, metres, grid frame."""
+    index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
+    return spec.from_axes(np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)).astype(np.float64)
 
 
 def _sum(rows: NDArray[np.void]) -> NDArray[np.void]:

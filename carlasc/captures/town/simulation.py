@@ -144,6 +144,11 @@ class SimulatedCapture(Capture):
         self._check(frame)
         return self._drive.record(frame, sensor)
 
+    def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
+        """Return the (3,) velocity over ground, m/s, world frame, of each actor of the town in a frame."""
+        self._check(frame)
+        return {actor.id: actor.velocity for actor in self._drive.actors(frame)}
+
     def read_pose(self, sensor: int, frame: int) -> Transform:
         """Return the (4, 4) float64 world_T_sensor of a frame."""
         self._check(frame)

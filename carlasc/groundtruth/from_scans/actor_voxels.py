@@ -13,7 +13,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.from_scans.body_regions import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant
-from carlasc.groundtruth.voxel_actors import VoxelActors
+from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of
 from carlasc.motion.numbering import number_actors
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
 
@@ -67,7 +67,7 @@ def find_voxels(
     movable = solid & np.isin(labels, sorted(classes.movable)) if feed.has_labels else solid
     voxels, velocities = [np.empty(0, np.int64)], [np.empty((0, 3))]
     bodies = np.flatnonzero((regions.of_voxel != STATIC) & solid)
-    centers = transform_points(now.world_T_grid, _centers(spec, bodies))
+    centers = transform_points(now.world_T_grid, centers_of(spec, bodies))
     for region, number in regions.actors.items():
         track = actors.tracks[number]
         own = (regions.of_voxel[bodies] == region) & (movable[bodies] | (labels[bodies] == track.label))
@@ -78,12 +78,6 @@ def find_voxels(
     _number_points(spec, feed, actors, now, window, free, instance)
     _number_boxes(spec, feed, actors, now, free & (instance == 0), instance)
     return VoxelActors.of(spec, instance, np.concatenate(voxels), np.concatenate(velocities))
-
-
-def _centers(spec: GridSpec, voxels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return (N, 3) the centres of voxels, metres, grid frame."""
-    index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
-    return spec.from_axes(np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)).astype(np.float64)
 
 
 def velocity_at(track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed) -> NDArray[np.float64]:
@@ -154,7 +148,7 @@ def _number_boxes(
     moving = {track.instance for track in actors.tracks.values()}
     voxels = np.flatnonzero(free)
     centers, half = (
-        _centers(spec, voxels),
+        centers_of(spec, voxels),
         np.asarray(spec.voxel_size if spec.coordinates == "cartesian" else (0, 0, 0)) / 2,
     )
     for row in np.argsort(-boxes.sizes.prod(axis=1), kind="stable").tolist():
