@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from carlasc.core.tables import benchmark_remap, remap_named
 from carlasc.dataset.fields import Values
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import Sequence, layout
+from carlasc.storage.field_files import dense_velocity
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
 """What a `remap` argument takes: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids, "auto"; None keeps the ids."""
@@ -169,28 +169,6 @@ class GridFields:
     @property
     def _needs_known(self) -> bool:
         return not self.fields.isdisjoint(("known", "posterior"))
-
-
-def dense_velocity(velocity: NDArray[Any], size: tuple[int, ...], where: str) -> NDArray[np.float32]:
-    """Return (X, Y, Z, 3) the velocity of each voxel, m/s, zero where nothing moves.
-
-    Args:
-        velocity: (M,), the field `<grid>/velocity`.
-        size: shape of the grid.
-        where: the field, for errors.
-
-    Raises:
-        FormatError: a voxel is not in the grid, or a velocity is not finite.
-    """
-    voxel, count = velocity["voxel"], math.prod(size)
-    if len(voxel) and not 0 <= int(voxel.min()) <= int(voxel.max()) < count:
-        outside = voxel[(voxel < 0) | (voxel >= count)]
-        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
-    if not np.isfinite(velocity["velocity"]).all():
-        raise FormatError(where, expected="finite velocities", found="NaN or infinity")
-    dense = np.zeros((count, 3), np.float32)
-    dense[voxel] = velocity["velocity"]
-    return dense.reshape(*size, 3)
 
 
 def soft_labels(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError
 from carlasc.metrics.confusion import ratio
 from carlasc.metrics.conventions import Convention
 from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore
 from carlasc.metrics.tracking import TrackingQuality, TrackingScore
+from carlasc.storage.field_files import dense_velocity
 
 SPEEDS_M_S = (0.0, 2.0, 5.0, 10.0)
 """Lower ends of the bands of speed that velocities are scored in."""
@@ -99,7 +101,7 @@ class ActorScores:
         for name, side in (("prediction", pair.prediction), ("truth", pair.truth)):
             if isinstance(side, SequenceGrid):
                 known[name] = side.sequence.read(f"{side.grid}/instance", frame)
-                moving[name] = _dense(side, frame, truth.size)
+                moving[name] = _dense(side, frame, truth.shape)
         numberless = np.isin(truth, sorted(self.panoptic.things)) & (known["truth"] == 0)
         counted = counted & ~numberless  # nobody knows whose they are
         sides = (prediction, known["prediction"]), (truth, known["truth"])
@@ -139,13 +141,10 @@ def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
     return frozenset(label for label in found if label in convention.averaged and label != convention.free)
 
 
-def _dense(side: SequenceGrid, frame: int, count: int) -> NDArray[np.float32]:
+def _dense(side: SequenceGrid, frame: int, size: tuple[int, ...]) -> NDArray[np.float32]:
     """Return (V, 3) the velocity of each voxel; zero where nothing moves, or nobody says it."""
-    dense, name = np.zeros((count, 3), np.float32), f"{side.grid}/velocity"
-    if name in side.sequence.fields() and frame in side.sequence.frames(name):
-        table = side.sequence.read(name, frame)
-        if not np.isfinite(table["velocity"]).all() or not ((table["voxel"] >= 0) & (table["voxel"] < count)).all():
-            where = f"{side.sequence.location}: {name} of frame {frame}"
-            raise FormatError(where, expected=f"finite velocities of voxels 0 to {count - 1}", found="others")
-        dense[table["voxel"]] = table["velocity"]
-    return dense
+    name = f"{side.grid}/velocity"
+    if name not in side.sequence.fields() or frame not in side.sequence.frames(name):
+        return np.zeros((math.prod(size), 3), np.float32)
+    where = f"{side.sequence.location}: {name} of frame {frame}"
+    return dense_velocity(side.sequence.read(name, frame), size, where).reshape(-1, 3)

@@ -183,6 +183,27 @@ def _decode_velocities(data: bytes | memoryview, where: str, shape: tuple[int, .
     return table
 
 
+def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
+    """Check a field `<grid>/velocity` of a grid of `count` voxels.
+
+    Raises:
+        FormatError: a voxel is not in the grid, or a velocity is not finite; the message names `where`.
+    """
+    voxel = velocity["voxel"]
+    if len(outside := voxel[(voxel < 0) | (voxel >= count)]):
+        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
+    if not np.isfinite(velocity["velocity"]).all():
+        raise FormatError(where, expected="finite velocities", found="NaN or infinity")
+
+
+def dense_velocity(velocity: NDArray[Any], size: tuple[int, ...], where: str) -> NDArray[np.float32]:
+    """Return (X, Y, Z, 3) the velocity of each voxel of a grid of shape `size`, m/s, zero where nothing moves; see `check_velocity`."""
+    check_velocity(velocity, math.prod(size), where)
+    dense = np.zeros((*size, 3), np.float32)
+    dense.reshape(-1, 3)[velocity["voxel"]] = velocity["velocity"]
+    return dense
+
+
 def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
     if len(data) % BOXES_DTYPE.itemsize:
         raise FormatError(

@@ -22,6 +22,7 @@ from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.metrics.grids import check_same_geometry, compare_grids
+from carlasc.storage.field_files import check_velocity
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ACTORS, ERRORS, PALETTES, ClassColors, PaletteName, actor_ids
 from carlasc.viewing.finding import (
@@ -312,6 +313,7 @@ class SceneReader:
         if not data.grid or frame not in data.frames_with(name):
             return None
         moving = data.sequence.read(name, frame)
+        check_velocity(moving, data.spec.num_voxels, f"{data.sequence.location}: {name} of frame {frame}")
         points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(np.float32)
         labels, actors = (
             a.reshape(-1)[moving["voxel"]] for a in (data.read_grid(frame).labels, self._instances(frame))

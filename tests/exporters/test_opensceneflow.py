@@ -139,6 +139,14 @@ def test_a_scan_has_the_types_of_the_format(tmp_path):
     assert np.array_equal(group["lidar_dt"], scan.seconds.astype(np.float32))
 
 
+def test_more_objects_than_16_bits_hold_are_named(tmp_path):
+    with opensceneflow._LogFile(tmp_path / "log.h5", {0: "1"}) as log:
+        found = log._number(np.arange(32_768, dtype=np.uint32)[::-1] << 5)
+        assert (found.dtype, found.min(), found.max(), len(np.unique(found))) == (np.int16, 0, 32_767, 32_768)
+        with pytest.raises(FormatError, match=r"log.h5: expected at most 32767 objects, found 32768"):
+            log.add(0, {"flow_instance_id": np.array([3], np.uint32)})
+
+
 def test_objects_keep_their_numbers_although_the_source_has_larger_ones(tmp_path):
     write_drive(tmp_path / "in")
     export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))

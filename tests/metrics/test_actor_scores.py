@@ -105,6 +105,14 @@ def test_grids_without_instances_and_velocities_that_are_not_finite_are_named(tr
     assert len(result.failures) == 3 and "finite velocities" in result.failures[0][1]
 
 
+def test_instance_grids_of_another_geometry_are_named(truth, tmp_path):
+    folder = write(tmp_path / "small")
+    for file in folder.rglob("*.instance"):
+        file.write_bytes(file.read_bytes()[:-64])
+    result = carlasc.evaluate(folder, truth, convention="own", scoring=Scoring(actors=True))
+    assert len(result.failures) == 3 and "000000.instance: expected 1024 bytes (8 x 8 x 4" in result.failures[0][1]
+
+
 def test_the_command_prints_the_table(truth):
     given = ["evaluate", str(truth), str(truth), "--convention", "own", "--actors"]
     result = CliRunner().invoke(app, given)

@@ -10,6 +10,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
+from carlasc.errors import FormatError
 from carlasc.viewing import Scene
 from carlasc.viewing.page.contents import (
     OFFSET_STEPS,
@@ -19,9 +20,9 @@ from carlasc.viewing.page.contents import (
     open_content,
     pack_arrays,
 )
-from carlasc.viewing.recordings.content import Trail
 from carlasc.viewing.rendering.drawings import evidence_drawing
 from carlasc.viewing.scene import FrameContent
+from carlasc.viewing.trails import Trail
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),
@@ -138,6 +139,15 @@ def test_voxels_have_actors_and_arrows_where_no_point_has_flow(moving_grid):
     right = Scene(moving_grid).open().right_handed()
     moving = right.read_motion(0, None)
     assert np.allclose(moving.points.mean(axis=0)[:2], (10, -5), atol=0.5) and np.allclose(moving.flow, (3, 0, 0))
+
+
+def test_velocities_that_are_not_finite_are_named(moving_grid):
+    file = moving_grid / "evaluation/000000.velocity.npz"
+    with np.load(file) as arrays:
+        broken = {"voxel": arrays["voxel"], "velocity": np.full_like(arrays["velocity"], np.nan)}
+    np.savez(file, **broken)
+    with pytest.raises(FormatError, match="evaluation/velocity of frame 0: expected finite velocities, found NaN"):
+        open_content(Scene(moving_grid), 0.2).read(0)
 
 
 def test_pictures_colour_voxels_by_actor(moving_grid):
