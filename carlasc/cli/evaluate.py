@@ -205,8 +205,6 @@ class _Region:
     fov: float
 
     def __call__(self, spec: Any) -> Any:
-        import math
-
         from carlasc.metrics import distance_band, field_of_view
 
         band = distance_band(spec, self.near_m, math.inf if self.far_m is None else self.far_m)
@@ -272,8 +270,6 @@ def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: Out
 
 def _print_conventions(found: Any, as_json: bool) -> None:
     """Print a row per convention: its mean IoU and completeness, or why there is none."""
-    import math
-
     from carlasc.cli.tables import print_table
     from carlasc.errors import CarlascError
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from carlasc.core.compiling import cached
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import check_ids, ratio, to_numpy
+from carlasc.metrics.summing import Summed
 
 Variant = Literal["standard", "pasco"]
 _SLOTS = 256  # of the tables of latest segments and pairs; a power of two
@@ -70,7 +71,7 @@ class Segments:
     overlaps: NDArray[np.int64]
 
 
-class PanopticQuality:
+class PanopticQuality(Summed):
     """Adds up matched segments of predictions and truths.
 
     A predicted and a true segment match where they have the same class and an IoU over 0.5. Free elements belong to no segment.
@@ -82,6 +83,8 @@ class PanopticQuality:
         variant: "standard", or "pasco": a stuff segment matches the true segment of its class if they overlap at all, as in PaSCo's
             evaluation script. Stuff is then never a false positive if its class occurs in the truth.
     """
+
+    _SETTINGS, _SUMS = ("num_classes", "things", "free", "variant"), ("counts", "iou_sum", "elements")
 
     def __init__(
         self, num_classes: int, things: frozenset[int], *, free: int = 0, variant: Variant = "standard"
@@ -169,22 +172,6 @@ class PanopticQuality:
         return PanopticScore(
             pq, np.where(occurs, np.nan_to_num(sq), np.nan), rq, ratio(common, predicted + true - common), self.things
         )
-
-    def merge(self, other: PanopticQuality) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
-
-        Raises:
-            ArgumentError: its settings differ.
-        """
-        mine = (self.num_classes, self.things, self.free, self.variant)
-        if (other.num_classes, other.things, other.free, other.variant) != mine:
-            raise ArgumentError(
-                "panoptic quality", expected="metrics of the same classes, things and variant", found="others"
-            )
-        self.counts += other.counts
-        self.iou_sum += other.iou_sum
-        self.elements += other.elements
-        return self
 
 
 def match_segments(

@@ -19,6 +19,7 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.casting import cast_rays, cast_rays_on_device, rayiou_directions
 from carlasc.metrics.confusion import device_of, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
+from carlasc.metrics.summing import Summed
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
 _MOST_ORIGINS = 8
@@ -74,7 +75,7 @@ class RayScore:
         return _mean(np.delete(self.class_iou, self.free, axis=1))
 
 
-class RayIoU:
+class RayIoU(Summed):
     """Adds up the first surfaces on rays through predicted and true grids.
 
     A ray is correct if the first voxels of the prediction and of the truth have the same class and their distances differ by less than a
@@ -86,6 +87,8 @@ class RayIoU:
         skip_unknown: drop the rays that cross an unknown voxel before they meet something in the truth. The original has no unknown
             voxels: there they count as free.
     """
+
+    _SETTINGS, _SUMS = ("num_classes", "free", "thresholds_m", "skip_unknown"), ("true", "predicted", "hits")
 
     def __init__(
         self,
@@ -173,24 +176,6 @@ class RayIoU:
         """Return the score of everything that was added."""
         iou = ratio(self.hits, self.true + self.predicted - self.hits)
         return RayScore(iou, self.thresholds_m, self.free)
-
-    def merge(self, other: RayIoU) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
-
-        Raises:
-            ArgumentError: its settings differ.
-        """
-        if (other.num_classes, other.free, other.thresholds_m, other.skip_unknown) != (
-            self.num_classes,
-            self.free,
-            self.thresholds_m,
-            self.skip_unknown,
-        ):
-            raise ArgumentError("RayIoU", expected="metrics of the same classes and thresholds", found="others")
-        self.true += other.true
-        self.predicted += other.predicted
-        self.hits += other.hits
-        return self
 
     def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> NDArray[Any]:
         array = to_numpy(labels)

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError
 from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.summing import Summed
 
 
 def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
@@ -35,7 +36,7 @@ def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
     return Grid(spec, labels.reshape(spec.size), counts.reshape(spec.size))
 
 
-class Consistency:
+class Consistency(Summed):
     """Adds up the agreement of consecutive frames in the static parts of the scene.
 
     Voxels of frame t with a static class or free space are moved to frame t + 1 and compared with the voxels of that frame, over the
@@ -44,6 +45,8 @@ class Consistency:
     Attributes:
         matrix: confusion of the later frame (columns) against the earlier one (rows).
     """
+
+    _SETTINGS, _SUMS = ("moving",), ("matrix",)
 
     def __init__(self, num_classes: int, moving: Iterable[int], *, free: int = 0) -> None:
         """Start empty; `moving` are the ids of classes that may move and are left out."""
@@ -79,19 +82,6 @@ class Consistency:
     def reset(self) -> None:
         """Remove everything that was added."""
         self.matrix = ConfusionMatrix(self.matrix.num_classes, free=self.matrix.free)
-
-    def merge(self, other: Consistency) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
-
-        Raises:
-            ArgumentError: its settings differ.
-        """
-        if other.moving != self.moving:
-            raise ArgumentError(
-                "consistency", expected=f"moving classes {sorted(self.moving)}", found=str(sorted(other.moving))
-            )
-        self.matrix += other.matrix
-        return self
 
 
 def shape_consistency(earlier: NDArray[np.bool_], later: NDArray[np.bool_]) -> float:

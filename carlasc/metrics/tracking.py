@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Self
@@ -9,10 +10,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError
 from carlasc.metrics.confusion import check_ids, ratio, to_numpy
+from carlasc.metrics.summing import Summed
 
-_Sizes = dict[tuple[str | int, ...], int]
+_Sizes = Counter[tuple[str | int, ...]]
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class TrackingScore:
     actors: int
 
 
-class TrackingQuality:
+class TrackingQuality(Summed):
     """Adds up the frames of sequences, as SemanticKITTI's evaluation of 4D panoptic segmentation does.
 
     Attributes:
@@ -42,6 +44,11 @@ class TrackingQuality:
         unaveraged: classes that are not in the mean IoU, such as free space.
         fewest: a true actor counts in the frames in which it has more elements than this.
     """
+
+    _SETTINGS, _SUMS = (
+        ("num_classes", "things", "ignored", "unaveraged", "fewest"),
+        ("confusion", "predicted", "true", "common"),
+    )
 
     def __init__(
         self,
@@ -59,9 +66,9 @@ class TrackingQuality:
     def reset(self) -> None:
         """Remove everything that was added."""
         self.confusion = np.zeros((self.num_classes, self.num_classes), np.int64)  # predicted, true
-        self.predicted: _Sizes = {}  # elements by sequence and number
-        self.true: _Sizes = {}  # by sequence, class and number
-        self.common: _Sizes = {}  # by sequence, class, true number and predicted number
+        self.predicted: _Sizes = Counter()  # elements by sequence and number
+        self.true: _Sizes = Counter()  # by sequence, class and number
+        self.common: _Sizes = Counter()  # by sequence, class, true number and predicted number
 
     def update(
         self,
@@ -93,36 +100,21 @@ class TrackingQuality:
         k = self.num_classes
         self.confusion += np.bincount(pred_class * k + true_class, minlength=k * k).reshape(k, k)
         for number, size in _counts(pred[(pred > 0) & ~np.isin(pred_class, sorted(self.ignored))]):
-            _add(self.predicted, (sequence, number), size)
+            self.predicted[sequence, number] += size
         for label in self.things:
             own = (true_class == label) & (true > 0)
             for number, size in _counts(true[own]):
                 if size > self.fewest:
-                    _add(self.true, (sequence, label, number), size)
+                    self.true[sequence, label, number] += size
                     for other, common in _counts(pred[own & (true == number) & (pred > 0)]):
-                        _add(self.common, (sequence, label, number, other), common)
-        return self
-
-    def merge(self, other: TrackingQuality) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
-
-        Raises:
-            ArgumentError: its settings differ.
-        """
-        names = ("num_classes", "things", "ignored", "unaveraged", "fewest")
-        if any(getattr(self, name) != getattr(other, name) for name in names):
-            raise ArgumentError("tracking quality", expected="metrics of the same settings", found="others")
-        self.confusion += other.confusion
-        for mine, theirs in ((self.predicted, other.predicted), (self.true, other.true), (self.common, other.common)):
-            for key, size in theirs.items():
-                _add(mine, key, size)
+                        self.common[sequence, label, number, other] += common
         return self
 
     def compute(self) -> TrackingScore:
         """Return the scores of everything that was added; NaN where nothing occurs."""
         sums = dict.fromkeys(self.true, 0.0)
         for (sequence, label, number, other), common in self.common.items():
-            predicted, true = self.predicted.get((sequence, other), 0), self.true[sequence, label, number]
+            predicted, true = self.predicted[sequence, other], self.true[sequence, label, number]
             if predicted:
                 sums[sequence, label, number] += common * common / (true + predicted - common)
         quality = [total / self.true[key] for key, total in sums.items()]
@@ -137,7 +129,3 @@ class TrackingQuality:
 def _counts(numbers: NDArray[np.int64]) -> list[tuple[int, int]]:
     found, sizes = np.unique(numbers, return_counts=True)
     return list(zip(found.tolist(), sizes.tolist(), strict=True))
-
-
-def _add(sums: _Sizes, key: tuple[str | int, ...], size: int) -> None:
-    sums[key] = sums.get(key, 0) + size

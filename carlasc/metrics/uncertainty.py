@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import check_ids, to_numpy
+from carlasc.metrics.summing import Summed
 
 _BINS = 15
 _TOLERANCE = 1e-3  # largest deviation of the sum of the probabilities of a voxel from one: half precision gives 5e-4
@@ -60,7 +61,7 @@ class UncertaintyScore:
     occupied: Reliability
 
 
-class Uncertainty:
+class Uncertainty(Summed):
     """Adds up the confidence and the accuracy of predictions.
 
     As in PaSCo, calibration errors are computed per frame and averaged, likelihoods are pooled over voxels, and both are computed
@@ -71,6 +72,8 @@ class Uncertainty:
         free: id of free space.
         bins: number of bins of equal width.
     """
+
+    _SETTINGS, _SUMS = ("num_classes", "free", "bins"), ("sums", "nll", "ece")
 
     def __init__(self, num_classes: int, *, free: int = 0, bins: int = _BINS) -> None:
         if not 0 <= free < num_classes:
@@ -139,19 +142,6 @@ class Uncertainty:
             ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
         empty, occupied = map(_reliability, self.sums)
         return UncertaintyScore(float(ece[0]), float(ece[1]), float(nll[0]), float(nll[1]), empty, occupied)
-
-    def merge(self, other: Uncertainty) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
-
-        Raises:
-            ArgumentError: its settings differ.
-        """
-        if (other.num_classes, other.free, other.bins) != (self.num_classes, self.free, self.bins):
-            raise ArgumentError("uncertainty", expected="metrics of the same classes and bins", found="others")
-        self.sums += other.sums
-        self.nll += other.nll
-        self.ece += other.ece
-        return self
 
 
 def _reliability(sums: NDArray[np.float64]) -> Reliability:

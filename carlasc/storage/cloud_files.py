@@ -28,7 +28,6 @@ POINT_DTYPE = np.dtype(
 
 _ROW_DTYPE = np.dtype([*POINT_DTYPE.descr[:3], ("rgb", "<u4"), *POINT_DTYPE.descr[3:]])  # 0xAARRGGBB: bytes b, g, r, a
 _PLY_NAMES = {"f4": "float", "u2": "ushort", "u4": "uint"}
-_UNLABELLED = (150, 150, 150)
 _LAS_SCALE_M = 0.0001
 _LAS_CLASSES = 256  # a classification has 8 bits; `label` holds every class
 
@@ -55,17 +54,9 @@ class PointPieces:
             rows = np.zeros(len(piece), _ROW_DTYPE)
             for name in POINT_DTYPE.names or ():
                 rows[name] = piece[name]
-            red, green, blue = colors_of(piece["label"], self.classes).astype(np.uint32).T
+            red, green, blue = self.classes.palette[piece["label"]].astype(np.uint32).T
             rows["rgb"] = red << 16 | green << 8 | blue | np.uint32(255 << 24)
             yield rows
-
-
-def colors_of(labels: NDArray[np.integer], classes: ClassTable) -> NDArray[np.uint8]:
-    """Return (N, 3) the colours of classes; those that the table lacks are grey."""
-    table = np.full((max(classes.colors, default=0) + 2, 3), _UNLABELLED, np.uint8)
-    for label, color in classes.colors.items():
-        table[label] = color
-    return table[np.minimum(labels, len(table) - 1)]
 
 
 def write_points(path: str | os.PathLike[str], points: PointPieces) -> None:

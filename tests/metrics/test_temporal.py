@@ -48,7 +48,7 @@ def test_things_that_may_move_are_left_out_and_so_is_what_is_ignored():
     assert everything.compute() < 1.0
     merged = Consistency(4, moving={3}).merge(everything).merge(everything)
     assert merged.matrix.total == 2 * everything.matrix.total
-    with pytest.raises(ArgumentError, match="moving classes"):
+    with pytest.raises(ArgumentError, match="a Consistency with moving"):
         everything.merge(Consistency(4, moving={2}))
 
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid
 from carlasc.errors import import_extra
-from carlasc.storage.cloud_files import colors_of
 from carlasc.storage.files import write_output
 
 MESH_ENDINGS = (".ply", ".glb")
@@ -87,7 +86,7 @@ class SurfaceMesh:
         mesh = trimesh.Trimesh(
             self.vertices @ _UP.T if kind == ".glb" else self.vertices,
             self.faces,
-            vertex_colors=colors_of(self.labels, classes),
+            vertex_colors=classes.palette[self.labels],
             process=False,
         )
         write_output(Path(path), mesh.export(file_type=kind[1:]))
