@@ -261,7 +261,8 @@ def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: Out
     if output.as_json:
         print_json({"name": name, "forecasts": [{"horizon_s": t, **result.to_dict()} for t, result in by_time.items()]})
     else:
-        tables = carlasc.metrics.semantic_table(results), carlasc.metrics.geometric_table(results)
+        tables = [carlasc.metrics.semantic_table(results), carlasc.metrics.geometric_table(results)]
+        tables += [replace(table, title=f"{table.title}, {one.name}") for one in results for table in one.tables()[2:]]
         frames = ", ".join(str(result.frames) for result in results)
         _print_tables(tables, f"percent, {name}, frames: {frames}, voxels: {results[0].voxels}", output)
     failures = [failure for result in results for failure in result.failures]

@@ -129,6 +129,8 @@ def test_the_command_prints_a_row_for_each_time_ahead(tmp_path, truth, world):
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
     assert "frames: 5, 4" in result.output and result.output.count("0.5 s") == 2
+    result = CliRunner().invoke(app, [*given, "--by", "distance"])
+    assert "By region, 0.5 s" in result.output and "By region, 1 s" in result.output
     values = json.loads(CliRunner().invoke(app, [*given, "--json"]).stdout)["forecasts"]
     assert [(row["horizon_s"], row["accuracy"]) for row in values] == [(0.5, 1), (1, 1)]
     result = CliRunner().invoke(app, [*given, "--all-conventions"])
