@@ -122,7 +122,7 @@ def test_boxes_and_tracks_are_lines_in_the_frame_of_the_sensor():
 
 @pytest.fixture
 def moving_grid(tmp_path):
-    """A grid whose red block is actor 70,003 and moves at 3 m/s; the blue one is actor 5 and stands. There are no points."""
+    """A grid whose red block is actor 70,003 and moves at 3 m/s; the blue one is actor 6 and stands. There are no points."""
     folder = write_blocks(tmp_path / "cartesian", frames=1, points=False)
     add_actors(folder, frames=1)
     return folder
@@ -131,8 +131,8 @@ def moving_grid(tmp_path):
 def test_voxels_have_actors_and_arrows_where_no_point_has_flow(moving_grid):
     content = open_content(Scene(moving_grid), 0.2)
     arrays, _ = content.read(0)
-    assert set(np.unique(arrays["panel0/instance"]).tolist()) == {0, 5, 70_003}
-    assert np.array_equal(arrays["panel0/instance"] == 5, arrays["panel0/label"] == BLUE)
+    assert set(np.unique(arrays["panel0/instance"]).tolist()) == {0, 6, 70_003}
+    assert np.array_equal(arrays["panel0/instance"] == 6, arrays["panel0/label"] == BLUE)
     (arrow,) = arrays["actors/arrows"].reshape(-1, 6)
     assert np.allclose(arrow[:2], (10, 5), atol=0.5) and np.allclose(arrow[3:], (3, 0, 0))
     assert content.describe()["hasFlow"] and content.panels[0].evidence == ("instance",)

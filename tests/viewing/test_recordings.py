@@ -441,7 +441,7 @@ def test_actors_without_boxes_are_followed_by_their_instances(tmp_path):
 
 @pytest.fixture(scope="module")
 def actors(tmp_path_factory):
-    """A grid whose red block is actor 70,003, drives ahead at 3 m/s, and has no points; the blue one is actor 5 and stands."""
+    """A grid whose red block is actor 70,003, drives ahead at 3 m/s, and has no points; the blue one is actor 6 and stands."""
     folder = write_blocks(tmp_path_factory.mktemp("actors") / "cartesian", points=False)
     add_actors(folder)
     add_poses(folder, [0.0] * 3, step_m=0.0)
@@ -471,7 +471,7 @@ def test_voxels_are_shown_by_actor_too(actors, tmp_path):
     cells, _, _ = voxels_of(read_mcap(view(actors, tmp_path / "a.mcap").out)["/actors"][1].message)
     names = {path.rsplit("/", 1)[1] for path in entities if path.startswith("/world/ego/actors/")}
     assert len(names) == 3
-    for label, actor in ((RED, 70_003), (BLUE, 5), (ROAD, 0)):
+    for label, actor in ((RED, 70_003), (BLUE, 6), (ROAD, 0)):
         color = ACTORS.palette[actor_ids(np.array(actor))]
         assert (cells["rgba"][labels == label][:, :3] == color).all()
         parts = [entities[path][1] for path in entities if path.startswith("/world/ego/actors/")]

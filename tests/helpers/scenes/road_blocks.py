@@ -68,11 +68,11 @@ def add_evidence(folder: Path, frames: int = 3) -> None:
 
 
 def add_actors(folder: Path, frames: int = 3, number: int = 70_003, speed_m_s: float = 3.0) -> None:
-    """Write who is in each voxel of `write_blocks`: the red block is an actor that moves ahead, the blue one is actor 5 and stands."""
+    """Write who is in each voxel of `write_blocks`: the red block is an actor that moves ahead, the blue one is actor 6 and stands."""
     writer = FolderSink(folder.parent).sequence(folder.name)
     for frame in range(frames):
         labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32)
-        instance = np.select([labels == RED, labels == BLUE], [number, 5], 0).astype(np.uint32)
+        instance = np.select([labels == RED, labels == BLUE], [number, 6], 0).astype(np.uint32)
         velocity = np.zeros(np.count_nonzero(labels == RED), VELOCITY_DTYPE)
         velocity["voxel"], velocity["velocity"] = np.flatnonzero(labels == RED), (speed_m_s, 0, 0)
         writer.write("evaluation/instance", frame, instance.reshape(64, 64, 4))
