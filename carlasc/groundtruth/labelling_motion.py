@@ -32,7 +32,6 @@ from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
 _WRITTEN = ("flow", "instances")
-_KEPT = 64  # frames of which some field is still to be read
 _FOUND = "found by carlasc from "  # what carlasc.json says of motion, before what showed it
 
 
@@ -140,40 +139,18 @@ class _MovingSequence(DerivedSequence):
 
     def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
         extra = {**whole.metadata.extra, "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
-        self._changed = {*_WRITTEN} | ({"labels"} & whole.fields() if whole.metadata.classes.standing else set[str]())
+        made = dict.fromkeys(_WRITTEN, whole.frames("points"))
+        if whole.metadata.classes.standing and "labels" in whole.fields():
+            made["labels"] = whole.frames("labels")
         texts = {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}
-        super().__init__(whole, texts, changed=self._changed)
+        super().__init__(whole, texts, made=made)
         self._feed, self.actors = feed, actors
-        self._made: dict[int, dict[str, NDArray[Any]]] = {}  # by frame and field, until the last one is read
 
-    def fields(self) -> frozenset[str]:
-        """Return the fields that do not change, and those that were found."""
-        return self.kept | self._changed
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field."""
-        if field in _WRITTEN:
-            return self.whole.frames("points")
-        return self.whole.frames(field) if field in self._changed else super().frames(field)
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame."""
-        if field not in self._changed:
-            return self.whole.read(field, frame)
-        if frame not in self._made:
-            if len(self._made) == _KEPT:
-                self._made.clear()
-            self._made[frame] = self._make(frame)
-        made = self._made[frame][field]
-        if field == max(self._changed):  # what copies reads them in this order
-            del self._made[frame]
-        return made
-
-    def _make(self, frame: int) -> dict[str, NDArray[Any]]:
+    def make(self, frame: int) -> dict[str, NDArray[Any]]:
         """Return the fields of a frame that are found, and its labels if they change."""
         instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
         found: dict[str, NDArray[Any]] = {"instances": instances, "flow": flow}
-        if "labels" in self._changed and frame in self.whole.frames("labels"):
+        if frame in self.made.get("labels", ()):
             labels = self.whole.read("labels", frame).astype(np.uint32)
             for moving, standing in self.whole.metadata.classes.standing.items():
                 labels[(labels == standing) & flow.any(axis=1)] = moving

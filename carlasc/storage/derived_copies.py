@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -32,6 +33,8 @@ from carlasc.storage.transport.trees import is_url
 from carlasc.storage.unpacking import UnpackResult, unpack
 from carlasc.storage.views import ChosenSequences, SequenceView
 
+_MOST_UNREAD = 64  # frames
+
 
 @dataclass
 class CopyResult(UnpackResult):
@@ -51,6 +54,7 @@ class DerivedSequence(SequenceView):
 
     Attributes:
         texts: the text files that are others, or new, by name.
+        made: the fields that are others, or new, each with its frames; a subclass makes them.
         kept: fields of the sequence that do not change.
         left_out: what the sequence has and this one does not.
     """
@@ -60,7 +64,7 @@ class DerivedSequence(SequenceView):
         whole: Sequence,
         texts: Mapping[str, bytes],
         *,
-        changed: Collection[str] = (),
+        made: Mapping[str, NDArray[np.int64]] = MappingProxyType({}),
         stale: Collection[str] = (),
     ) -> None:
         """Show a sequence.
@@ -68,21 +72,39 @@ class DerivedSequence(SequenceView):
         Args:
             whole: the sequence.
             texts: the text files that are others, or new, by name.
-            changed: fields that are not taken from the sequence: a subclass shows them.
+            made: fields that are not taken from the sequence, each with its frames.
             stale: fields that are left out.
         """
         super().__init__(whole)
-        self.texts = dict(texts)
-        self.kept = frozenset(name for name in whole.fields() - {*changed, *stale} if "/" not in name)
+        self.texts, self.made = dict(texts), dict(made)
+        self.kept = frozenset(name for name in whole.fields() - {*made, *stale} if "/" not in name)
+        self._unread: dict[int, dict[str, NDArray[Any]]] = {}
         self.left_out = {*stale} & whole.fields() | {f"{grid}/" for grid in whole.grids}
 
     def fields(self) -> frozenset[str]:
-        """Return the fields that do not change."""
-        return self.kept
+        """Return the fields that do not change, and those that are made."""
+        return self.kept | self.made.keys()
 
     def frames(self, field: str) -> NDArray[np.int64]:
         """Return the frames of a field."""
-        return self.whole.frames(field) if field in self.kept else np.empty(0, np.int64)
+        return self.whole.frames(field) if field in self.kept else self.made.get(field, np.empty(0, np.int64))
+
+    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the fields of a frame that are made."""
+        return {}
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame. Those that are made are kept until the last one, in the order of their names, is read."""
+        if field not in self.made:
+            return self.whole.read(field, frame)
+        if frame not in self._unread:
+            if len(self._unread) == _MOST_UNREAD:
+                self._unread.clear()
+            self._unread[frame] = self.make(frame)
+        array = self._unread[frame][field]
+        if field == max(self.made):
+            del self._unread[frame]
+        return array
 
     def documents(self) -> tuple[str, ...]:
         """Return the text files of the whole sequence without those of grids, and the new ones."""

@@ -135,34 +135,22 @@ class _LabelledSequence(DerivedSequence):
         extra = {**whole.metadata.extra, "labels": f"{PREDICTED}{by}"}
         metadata = replace(whole.metadata, classes=reader.target, extra=extra).to_json()
         stale = {"boxes"} if reader.target != whole.metadata.classes else set()  # their classes are of the other table
-        super().__init__(whole, {layout.METADATA: metadata}, changed=_PREDICTED, stale=stale)
-        self.files, self.reader = files, reader
         first = files.path(files.frames[0]) if files.frames else None  # the others are like the first
-        self._own = frozenset(_PREDICTED[: 1 + (load(first)[1] is not None)] if first else ())
-        self._pairs: dict[int, NDArray[np.uint16]] = {}  # of frames whose labels have been read
+        own = _PREDICTED[: 1 + (load(first)[1] is not None)] if first else ()
+        made = dict.fromkeys(own, np.array(files.frames, np.int64))
+        super().__init__(whole, {layout.METADATA: metadata}, made=made, stale={*stale, *_PREDICTED} - {*own})
+        self.files, self.reader = files, reader
 
-    def fields(self) -> frozenset[str]:
-        """Return the fields of the whole sequence without grids, and those that were predicted."""
-        return self.kept | self._own
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field."""
-        return np.array(self.files.frames, np.int64) if field in self._own else super().frames(field)
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame: probabilities of a frame whose labels were read before are not computed again."""
-        if field not in self._own:
-            return self.whole.read(field, frame)
-        if field == "probabilities" and frame in self._pairs:
-            return self._pairs.pop(frame)
-        labels, pairs = self.reader.read(self.files.path(frame), len(self.whole.read("points", frame)))
-        if (pairs is not None) != ("probabilities" in self._own):
-            like, has = ("labels", "probabilities") if pairs is not None else ("probabilities", "labels only")
-            raise FormatError(self.files.path(frame), expected=f"{like}, as in the first file", found=has)
-        if pairs is None or field == "labels":
-            self._pairs |= {} if pairs is None else {frame: pairs}
-            return labels
-        return pairs
+    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the labels of a frame, and the probabilities if there are some."""
+        path = self.files.path(frame)
+        found = dict(zip(_PREDICTED, self.reader.read(path, len(self.whole.read("points", frame))), strict=True))
+        if (found["probabilities"] is not None) != ("probabilities" in self.made):
+            words = (
+                ("labels", "probabilities") if "probabilities" not in self.made else ("probabilities", "labels only")
+            )
+            raise FormatError(path, expected=f"{words[0]}, as in the first file", found=words[1])
+        return {name: array for name, array in found.items() if array is not None}
 
 
 def _reader(given: ClassTable | None, sequence: Sequence, logits: bool) -> PredictionReader:
