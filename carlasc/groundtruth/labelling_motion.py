@@ -176,13 +176,19 @@ def points_of_actors(
     moving = {track.instance for track in actors.tracks.values()}
     numbers = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances.astype(np.uint32)
     numbers[np.isin(numbers, list(moving))] = 0  # these have tracks, which know better
-    _number_boxes(feed, frame, scan.points, numbers, moving)
     flow, world = np.zeros((len(scan), 3)), transform_points(pose, scan.points)
     classes = feed.classes
     if scan.labels is not None and feed.names_ground and classes.ground:
         ground = np.isin(scan.labels, sorted(classes.ground))
     else:
         ground = ground_points(scan.points)
+        if scan.labels is not None:  # wheels are near the ground, and are none
+            ground &= ~np.isin(scan.labels, sorted(classes.movable))
+    if "boxes" in feed.sequence.fields() and (boxes := feed.sequence.boxes(frame)) is not None:
+        standing = boxes.select(~np.isin(boxes.tracks, list(moving)))
+        row = standing.owners(scan.points)
+        boxed = (row >= 0) & (numbers == 0) & ~ground
+        numbers[boxed] = standing.tracks[row[boxed]]
     rows = _Rows(scan.points)
     tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
     for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):
@@ -223,16 +229,3 @@ def _inside(track: Track, frame: int, world: NDArray[np.float64]) -> NDArray[np.
     local = transform_points(invert(pose), world[near])
     near[near] = ((local >= track.lower) & (local <= track.upper)).all(axis=1)
     return near
-
-
-def _number_boxes(
-    feed: ScanFeed, frame: int, points: NDArray[np.float32], numbers: NDArray[np.uint32], moving: set[int]
-) -> None:
-    """Give points without a number that of the box that they are in, of those that do not move; the ground has none."""
-    boxes = feed.sequence.boxes(frame) if "boxes" in feed.sequence.fields() else None
-    for row in range(0 if boxes is None else len(boxes)):
-        if boxes is not None and int(boxes.tracks[row]) not in moving:
-            local = transform_points(invert(boxes.sensor_T_box[row]), points)
-            half = boxes.sizes[row] / 2
-            inside = (np.abs(local) <= half).all(axis=1) & (local[:, 2] > 0.2 - half[2]) & (numbers == 0)
-            numbers[inside] = boxes.tracks[row]

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.scenes.passing_car import SPEED_M_S, scan, sensor_pose, write_sequence
+from helpers.scenes.passing_car import SPEED_M_S, scan, sensor_pose, street, write_sequence
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc import FromScans, Run
+from carlasc import Boxes, FromScans, Run
 from carlasc.cli import app
-from carlasc.core.geometry import invert, transform_points
+from carlasc.core.geometry import invert, transform_points, translation
 from carlasc.errors import ArgumentError, ConflictError
 from carlasc.motion import MotionOptions
 from carlasc.storage import FolderSink, FolderSource
@@ -84,7 +84,11 @@ def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_f
         labels, instances = given.read("labels", frame), given.read("instances", frame)
         writer.write("points", frame, given.read("points", frame))
         writer.write("labels", frame, np.select([labels == 10, labels == 7], [10, 40], 50).astype(np.uint32))
-        writer.write("instances", frame, np.where(instances == 4, 10 << 16 | 4, 0).astype(np.uint32))
+        writer.write("instances", frame, np.where(instances == 4, 10 << 16 | 4, 0).astype(np.uint32) * (frame < 4))
+        here = street(frame)  # from the fourth scan on, the parked car has a box only
+        pose = invert(sensor_pose(frame)) @ translation((here.lower[-2] + here.upper[-2]) / 2)
+        size, track = (here.upper - here.lower)[-2:-1] + 0.1, np.array([10 << 16 | 4], np.uint32)
+        writer.write("boxes", frame, Boxes.from_poses(track, np.array([10]), pose[None], size).to_table())
         _, _, moving = scan(frame, sensor_pose(frame))
         writer.write("flow", frame, (moving[:, None] * np.array([SPEED_M_S, 0, 0])).astype(np.float32))
     observe = FromScans(motion=MotionOptions("flow"))
@@ -95,7 +99,9 @@ def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_f
     both, (_, _, moving) = np.fromfile(file, "<u4"), scan(4, sensor_pose(4))
     labels, numbers = both & 0xFFFF, both >> 16
     assert (labels == 252).sum() == pytest.approx(moving.sum(), rel=0.03) and (labels[~moving] != 252).mean() > 0.999
-    assert np.unique(numbers[labels == 252]).tolist() == [5] and np.unique(numbers[labels == 10]).tolist() == [4]
+    assert np.unique(numbers[labels == 252]).tolist() == [5]
+    parked = labels == 10
+    assert (numbers[parked] == 4).mean() > 0.97 and not numbers[~parked & (labels != 252)].any()  # by its box
 
 
 def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -16,6 +17,7 @@ from carlasc.groundtruth.from_scans.merging import STATIC, Instant
 from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of
 from carlasc.motion.numbering import number_actors
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
+from carlasc.storage.protocol import Sequence
 
 _CLASS_PARTS = 1 << 10  # numbers whose upper 16 bits are below this may have a class there
 _TURN_FRAMES = 3  # frames before and after, between which the turning of an actor is measured
@@ -29,17 +31,25 @@ def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
     """Return the actors with their numbers over the whole sequence."""
     highest = max((int(actor["instance"]) for actor in actors.summary), default=0)
     numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_MOVER]
-    if "instances" in feed.sequence.fields() and len(numbered) < len(actors.tracks):
+    if len(numbered) < len(actors.tracks):
         upper = lower = 0
-        for frame in feed.sequence.frames("instances").tolist():
-            numbers = feed.sequence.read("instances", frame).astype(np.int64)
-            highest, upper = max(highest, int(numbers.max(initial=0))), max(upper, int(numbers.max(initial=0)) >> 16)
-            lower = max(lower, int((numbers & 0xFFFF).max(initial=0)))
+        for given in _numbers_of(feed.sequence):
+            highest, upper = max(highest, int(given.max(initial=0))), max(upper, int(given.max(initial=0)) >> 16)
+            lower = max(lower, int((given & 0xFFFF).max(initial=0)))
         if (
             upper < _CLASS_PARTS
         ):  # new numbers differ in the lower half too, which is all that SemanticKITTI's files keep
             highest = max(highest, upper << 16 | lower)
     return replace(actors, numbers=number_actors(actors.tracks, highest))
+
+
+def _numbers_of(sequence: Sequence) -> Iterator[NDArray[np.int64]]:
+    """Yield the numbers that the data give to actors: those of the points of each scan, and the tracks of its boxes."""
+    fields = sequence.fields()
+    for frame in sequence.frames("instances").tolist() if "instances" in fields else ():
+        yield sequence.read("instances", frame).astype(np.int64)
+    for frame in sequence.frames("boxes").tolist() if "boxes" in fields else ():
+        yield sequence.read("boxes", frame)["track"].astype(np.int64)
 
 
 def find_voxels(
