@@ -47,9 +47,11 @@ class FutureGrid(GridFrames):
         numbers, sequence = grid.frames(), grid.sequence
         timed = layout.TIMES in sequence.documents()
         times = np.array([sequence.read_time(n) if timed else n * layout.FRAME_PERIOD_S for n in numbers.tolist()])
-        apart = np.abs(times[None] - times[:, None] - horizon_s)
-        later = apart.argmin(axis=1) if len(times) else np.zeros(0, np.int64)
-        near = apart.min(axis=1, initial=np.inf) <= _TOLERANCE_S
+        wanted = times + horizon_s
+        after = np.searchsorted(times, wanted).clip(max=len(times) - 1)
+        before = np.maximum(after - 1, 0)
+        later = np.where(wanted - times[before] < times[after] - wanted, before, after)
+        near = np.abs(times[later] - wanted) <= _TOLERANCE_S
         self.later = dict(zip(numbers[near].tolist(), numbers[later[near]].tolist(), strict=True))
         if not self.later:
             found = f"frames of {np.ptp(times):g} s" if len(times) else "none"
