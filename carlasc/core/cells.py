@@ -121,26 +121,41 @@ def fast_azimuth(x: float, y: float) -> float:
     return -angle if y < 0.0 else angle
 
 
-@cached(error_model="python")
 def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return (N,) which of (N, 3) cells are different from those before them."""
+    first = np.zeros(len(cells), np.bool_)
+    first[numbered(cells)[0]] = True
+    return first
+
+
+@cached(error_model="python")
+def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number (N, 3) cells in the order in which they occur, without sorting them.
+
+    Returns:
+        (C,) the first row of each different cell, and (N,) the number of the cell of each row.
+    """
     size = 2
     while size < 2 * len(cells):
         size *= 2
-    table = np.zeros(size, np.int64)  # 1 + the index of the first row of each cell, at the hash of the cell or after it
-    first = np.zeros(len(cells), np.bool_)
+    table = np.zeros(size, np.int64)  # 1 + the number of each cell, at the hash of the cell or after it
+    first, number, count = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64), 0
     for i in range(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         slot = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
         while True:
             k = table[slot] - 1
             if k < 0:
-                table[slot], first[i] = i + 1, True
+                first[count], number[i] = i, count
+                count += 1
+                table[slot] = count
                 break
-            if cells[k, 0] == x and cells[k, 1] == y and cells[k, 2] == z:
+            j = first[k]
+            if cells[j, 0] == x and cells[j, 1] == y and cells[j, 2] == z:
+                number[i] = k
                 break
             slot = (slot + 1) & (size - 1)
-    return first
+    return first[:count], number
 
 
 def count_points(

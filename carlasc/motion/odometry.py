@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, slerp
+from carlasc.core.scans import finite
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_points
 
@@ -122,7 +123,7 @@ def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (N,) which points of a scan odometry uses: those that are finite, and not far away on the ground."""
     with np.errstate(invalid="ignore"):
         used = ~ground_points(points) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
-        return used & np.isfinite(points[:, :3]).all(axis=1)
+        return used & finite(points[:, :3])
 
 
 def _usable(
