@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import as_pose, numbered
+from carlasc.core.cells import as_pose, distinct, numbered
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.core.scans import finite, runs_of_origins
@@ -269,9 +269,7 @@ def _clusters(
     width = high[1] - low[1] + 1
     cells = int((high[0] - low[0] + 1) * width)
     place = kind[inside] * cells + (cell[inside, 0] - low[0]) * width + (cell[inside, 1] - low[1])
-    first, number = numbered(np.column_stack([kind[inside], cell[inside]]))
-    order = np.argsort(place[first])
-    keys, flat = place[first][order], np.argsort(order)[number]
+    keys, flat = distinct(place)
     share = np.bincount(flat, either[inside], minlength=len(keys)) / np.bincount(flat, minlength=len(keys))
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
     component = _join(keys, seeds, int(width))[flat]
