@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle, Sensor, Trajectory
 from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.sweeps import move_each, ticks_of
 from carlasc.errors import CarlascError, FormatError, describe
 from carlasc.storage import layout
 
-_TICK_S = 1e-4  # points of so short a time have the same pose: at 30 m/s this is 3 mm
 _APART_M = 0.25  # places of one sensor within a sweep that are nearer to each other count as one
 
 
@@ -155,11 +155,15 @@ def _place(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> tuple[NDArra
         if cloud.origins is not None:
             return points, transform_points(scan_T_points, cloud.origins).astype(np.float32)
         return points, np.broadcast_to(_origin(sensor, scan_T_points), (len(points), 3))
-    ticks, tick_of = np.unique(np.round(np.asarray(cloud.seconds, np.float64) / _TICK_S), return_inverse=True)
+    ticks, tick_of = ticks_of(cloud.seconds)
     now = motion.trajectory.at(np.array([motion.seconds]))[0]
-    vehicle_T_then = invert(now) @ motion.trajectory.at(motion.seconds + ticks * _TICK_S)
+    vehicle_T_then = invert(now) @ motion.trajectory.at(motion.seconds + ticks)
     scan_T_then = scan_T_vehicle @ vehicle_T_then @ sensor.vehicle_T_points
-    points = _moved(scan_T_points, cloud.points) if sensor.deskewed else _moved_each(scan_T_then[tick_of], cloud.points)
+    if sensor.deskewed:
+        points = _moved(scan_T_points, cloud.points)
+    else:
+        points = cloud.points.copy()
+        points[:, :3] = move_each(cloud.points, scan_T_then, tick_of)
     if cloud.origins is not None:
         origins = transform_points(scan_T_points, cloud.origins).astype(np.float32)
     else:
@@ -194,15 +198,6 @@ def _moved(scan_T_points: Transform, points: NDArray[np.float32]) -> NDArray[np.
         return points
     moved = points.copy()
     moved[:, :3] = transform_points(scan_T_points, points[:, :3])
-    return moved
-
-
-def _moved_each(scan_T_point: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (N, 4) points, each moved by its own transform."""
-    moved = points.copy()
-    moved[:, :3] = (
-        np.einsum("nij,nj->ni", scan_T_point[:, :3, :3], points[:, :3], dtype=np.float64) + scan_T_point[:, :3, 3]
-    )
     return moved
 
 

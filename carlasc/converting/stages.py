@@ -65,7 +65,7 @@ class Conversion:
         begin(plan, self.target, metadata)
         if plan.poses is None and plan.rig.needs_motion:  # scans are corrected by the poses: each is then read twice
             self.steps.expect(len(plan.recording.frames))
-            plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps))
+            plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps, self.run_options))
             write_poses(plan, self.target)
         velocities = self._read_scans()
         if plan.poses is not None:

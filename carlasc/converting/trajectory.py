@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, read_scan
-from carlasc.converting.protocol import Converter, Recording, Trajectory
+from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
 from carlasc.errors import CarlascError, FormatError, MissingDataError
@@ -16,7 +19,12 @@ from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.pose_quality import describe_mounting
 from carlasc.inspection.structure import structure_of
 from carlasc.motion.options import PoseOptions
+from carlasc.running.processes import run_all
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
+
+if TYPE_CHECKING:
+    from carlasc.motion import odometry
 
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
@@ -122,8 +130,25 @@ def jitter_note(poses: NDArray[np.float64]) -> str | None:
     return f"poses jump by about {100 * found:.0f} cm from one to the next, which blurs grids: {_ESTIMATE}"
 
 
+@dataclass(frozen=True)
+class _ReadUsable:
+    """Reads what odometry uses of a scan, in a worker, while poses of the scans before it are estimated."""
+
+    rig: Rig
+
+    def __call__(self, handle: FrameHandle) -> odometry.UsableScan | CarlascError | OSError:
+        from carlasc.motion.odometry import usable_points
+
+        try:
+            scan = read_scan(handle, self.rig, None)
+        except (CarlascError, OSError) as error:
+            return error
+        used, seconds = usable_points(scan.points), scan.fields.get("seconds")
+        return scan.points[used, :3], None if seconds is None else seconds[used]
+
+
 def estimate_poses(
-    recording: Recording, converter: Converter, times: NDArray[np.float64], step: Callable[[], object]
+    recording: Recording, converter: Converter, times: NDArray[np.float64], step: Callable[[], object], run: Run
 ) -> NDArray[np.float64]:
     """Estimate the pose of each scan with KISS-ICP. A frame without a scan gets the pose of the scan before it.
 
@@ -135,6 +160,7 @@ def estimate_poses(
         converter: says which points belong to the vehicle, and which are too far away.
         times: (F,) seconds by frame number.
         step: is called for each frame.
+        run: how the reading of scans is spread.
 
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
@@ -152,20 +178,15 @@ def estimate_poses(
     errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[odometry.UsableScan]:
-        for handle in recording.frames:
-            step()
-            try:
-                scan = read_scan(handle, rig, None)
-            except (CarlascError, OSError) as error:
-                errors.append(error)
-                continue
-            used = odometry.usable_points(scan.points)
-            if np.count_nonzero(used) < odometry.MIN_POINTS:
-                continue
-            found.append(handle.number)
-            read_at.append(float(times[handle.number]))
-            seconds = scan.fields.get("seconds")
-            yield scan.points[used, :3], None if seconds is None else seconds[used]
+        with closing(run_all(_ReadUsable(rig), recording.frames, run)) as read:
+            for handle, scan in zip(recording.frames, read, strict=True):
+                step()
+                if isinstance(scan, Exception):
+                    errors.append(scan)
+                elif len(scan[0]) >= odometry.MIN_POINTS:
+                    found.append(handle.number)
+                    read_at.append(float(times[handle.number]))
+                    yield scan
 
     nearest, farthest = odometry_range(converter)
     poses = list(odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest))

@@ -121,26 +121,54 @@ def fast_azimuth(x: float, y: float) -> float:
     return -angle if y < 0.0 else angle
 
 
-@cached(error_model="python")
 def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return (N,) which of (N, 3) cells are different from those before them."""
+    first = np.zeros(len(cells), np.bool_)
+    first[numbered(cells)[0]] = True
+    return first
+
+
+def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the (K,) different ones of (N,) keys, increasing, and the (N,) place of each key among them: `np.unique` without sorting all keys."""
+    first, number = numbered(keys[:, None])
+    order = np.argsort(keys[first])
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return keys[first[order]], place[number]
+
+
+@cached(error_model="python")
+def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number (N, K) cells in the order in which they occur, without sorting them.
+
+    Returns:
+        (C,) the first row of each different cell, and (N,) the number of the cell of each row.
+    """
     size = 2
     while size < 2 * len(cells):
         size *= 2
-    table = np.zeros(size, np.int64)  # 1 + the index of the first row of each cell, at the hash of the cell or after it
-    first = np.zeros(len(cells), np.bool_)
+    table = np.zeros(size, np.int64)  # 1 + the number of each cell, at the hash of the cell or after it
+    first, number, count = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64), 0
     for i in range(len(cells)):
-        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        slot = (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
+        code = 0
+        for axis in range(cells.shape[1]):
+            code = (code ^ cells[i, axis]) * 0x9E3779B97F4A7C1
+        slot = (code ^ (code >> 29)) & (size - 1)
         while True:
             k = table[slot] - 1
             if k < 0:
-                table[slot], first[i] = i + 1, True
+                first[count], number[i] = i, count
+                count += 1
+                table[slot] = count
                 break
-            if cells[k, 0] == x and cells[k, 1] == y and cells[k, 2] == z:
+            same = True
+            for axis in range(cells.shape[1]):
+                same = same and cells[first[k], axis] == cells[i, axis]
+            if same:
+                number[i] = k
                 break
             slot = (slot + 1) & (size - 1)
-    return first
+    return first[:count], number
 
 
 def count_points(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
-from carlasc.core.scans import Scan
+from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.smoothing import resample, smooth
@@ -24,6 +24,7 @@ _STEADY_M, _STEADY = 0.3, 5.0  # a shorter way counts if it is so many times as 
 _HOLD_S = 1.0  # an object that stands for this long stands in all frames
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last box
 _JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart are different objects with one number
+_ROUNDING_M = 0.01  # more than the rounding of a place
 
 
 @dataclass(frozen=True)
@@ -114,21 +115,22 @@ def segment_by_boxes(
         those of the track.
     """
     owners = np.full(len(scan), -1, np.int64)
-    usable = np.isfinite(scan.points).all(axis=1)
+    usable = finite(scan.points)
     if scan.labels is not None:
         usable &= ~np.isin(scan.labels, sorted(ground))
     candidates = np.flatnonzero(usable)
-    points = transform_points(world_T_sensor, scan.points[candidates])
+    x, y = scan.points[candidates, 0], scan.points[candidates, 1]
     labels = None if scan.labels is None else scan.labels[candidates]
-    order = np.argsort(points[:, 0], kind="stable")
-    along = points[order, 0]
+    sensor_T_world = invert(world_T_sensor)
     for index in np.argsort([-np.prod(track.size) for track in tracks], kind="stable").tolist():
         track = tracks[index]
         pose = track.pose(frame)
         if pose is not None:
-            reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
-            near = order[slice(*np.searchsorted(along, [pose[0, 3] - reach, pose[0, 3] + reach]))]
-            members = near[_inside(track, pose, points[near], None if labels is None else labels[near], floor_m)]
+            reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0) + _ROUNDING_M
+            there = transform_points(sensor_T_world, pose[:3, 3])
+            near = np.flatnonzero((np.abs(x - there[0]) <= reach) & (np.abs(y - there[1]) <= reach))
+            points = transform_points(world_T_sensor, scan.points[candidates[near]])
+            members = near[_inside(track, pose, points, None if labels is None else labels[near], floor_m)]
             owners[candidates[members]] = index
     segments = []
     for index, track in enumerate(tracks):

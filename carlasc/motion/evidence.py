@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import as_pose
+from carlasc.core.cells import as_pose, distinct, numbered
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points, translation
-from carlasc.core.scans import runs_of_origins
+from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
+from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
-from carlasc.motion.visibility import SortedReturns, look_up
+from carlasc.motion.visibility import SAME_PLACE_M, SortedReturns, look_up, undecided
 
 HORIZON_S = 5.0
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -33,7 +33,6 @@ _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and the others are as it is
 _BAND_M = 0.3  # what stands this much below or above a cluster, in its cells or beside them, is around it
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points is one object, which moved with all its points
-_SAME_PLACE_M = 0.2  # rays that began within this distance of each other are looked up together
 _PERIOD_S = 0.1  # between scans whose times do not rise
 
 
@@ -115,17 +114,14 @@ class _Kept:
 
     scan: Sighting
     seconds: float
-    views: tuple[tuple[Transform, SortedReturns], ...]
+    views: tuple[SortedReturns, ...]
 
     @classmethod
     def of(cls, scan: Sighting, seconds: float) -> _Kept:
-        """Sort the points of a scan by the places from which they were seen: (place_T_world, view) for each."""
-        views = []
-        for part, origin in _places(scan):
-            place_T_world = invert(multiply(scan.world_T_sensor, translation(origin)))
-            views.append(
-                (place_T_world, SortedReturns.of(scan.points[part] - origin if origin.any() else scan.points[part]))
-            )
+        """Sort the points of a scan by their directions, those of each sensor by themselves."""
+        if scan.origins is None:
+            return cls(scan, seconds, (SortedReturns.of(scan.points),))
+        views = (SortedReturns.of(scan.points[own], scan.origins[own]) for own in _sensors(scan.origins))
         return cls(scan, seconds, tuple(views))
 
 
@@ -162,7 +158,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     scan = own.scan
     ground = ground_points(scan.points) if scan.ground is None else scan.ground
     asked = ~ground if scan.explained is None else ~(ground | scan.explained)
-    candidates = np.flatnonzero(asked & np.isfinite(scan.points).all(axis=1))
+    candidates = np.flatnonzero(asked & finite(scan.points))
     before, after = _others(window, current)
     world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
     asked_first, same = _thin(world)
@@ -182,15 +178,17 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *found, scan.world_T_sensor)
 
 
-def _places(scan: Sighting) -> list[tuple[slice, NDArray[np.float32]]]:
-    """Return the places from which the points of a scan were seen. Neighbouring places of one sensor that moves count as their middle."""
-    joined: list[tuple[slice, list[NDArray[np.float32]]]] = []
-    for part, origin in runs_of_origins(scan.origins, len(scan.points)):
-        if joined and np.linalg.norm(origin - joined[-1][1][0], axis=0) < _SAME_PLACE_M:
-            joined[-1] = (slice(joined[-1][0].start, part.stop), [*joined[-1][1], origin])
-        else:
-            joined.append((part, [origin]))
-    return [(part, np.mean(origins, axis=0, dtype=np.float32)) for part, origins in joined]
+def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
+    """Return the points of each sensor, by where their (N, 3) rays began, metres: the places of a sensor that moves follow on each other."""
+    found: list[tuple[list[NDArray[np.float32]], list[NDArray[np.int64]]]] = []
+    for part, origin in runs_of_origins(origins, len(origins)):
+        near = (own for own in found if np.linalg.norm(np.array(own[0]) - origin, axis=1).min() < SAME_PLACE_M)
+        places, members = next(near, ([], []))
+        if not places:
+            found.append((places, members))
+        places.append(origin)
+        members.append(np.arange(part.start, part.stop))
+    return [np.concatenate(members) for _, members in found]
 
 
 def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
@@ -211,11 +209,18 @@ def _judge(
     """Return which candidates were seen through most of the time, which on one side in time only, and which are static."""
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
-    for side, others in enumerate((before, after)):
-        for bit, other in enumerate(others):
-            for place_T_world, view in other.views:
-                pose = as_pose(multiply(place_T_world, scan.world_T_sensor))
-                look_up(points, pose, view.start, view.slope, view.distance, bit, free[side], hit[side])
+    asked, left = np.arange(len(points), dtype=np.int32), [len(before), len(after)]
+    while any(
+        left
+    ):  # from the farthest inwards; most places are occupied in so many scans that the nearest change nothing
+        for side, others in enumerate((before, after)):
+            if left[side]:
+                left[side] -= 1
+                other = others[left[side]]
+                pose = as_pose(multiply(invert(other.scan.world_T_sensor), scan.world_T_sensor))
+                for view in other.views:
+                    look_up(points, asked, pose, view, left[side], free[side], hit[side])
+        asked = undecided(asked, free, hit, (left[0], left[1]), (_AGREEING, _IN_A_ROW))
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)
     # Bits above the highest hit are those of the scans farther away than all that saw the place occupied.
@@ -230,10 +235,7 @@ def _judge(
 
 def _thin(world: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first point of each small cell, and the position of each point's cell among them."""
-    cell = np.floor(world / _JUDGED_CELL_M).astype(np.int64) + (1 << 20)
-    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    _, first, same = np.unique(key, return_index=True, return_inverse=True)
-    return first, same
+    return numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
 
 
 def _clusters(
@@ -262,12 +264,12 @@ def _clusters(
         return []
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64)
     low, high = cell[flagged].min(axis=0) - 1, cell[flagged].max(axis=0) + 1
-    inside = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
+    x, y = ((axis >= a) & (axis <= b) for axis, a, b in zip(cell.T, low, high, strict=True))
+    inside = np.flatnonzero(x & y)
     width = high[1] - low[1] + 1
     cells = int((high[0] - low[0] + 1) * width)
-    layer = np.unique(kind[inside], return_inverse=True)[1]
-    place = layer * cells + (cell[inside, 0] - low[0]) * width + (cell[inside, 1] - low[1])
-    keys, flat = np.unique(place, return_inverse=True)
+    place = kind[inside] * cells + (cell[inside, 0] - low[0]) * width + (cell[inside, 1] - low[1])
+    keys, flat = distinct(place)
     share = np.bincount(flat, either[inside], minlength=len(keys)) / np.bincount(flat, minlength=len(keys))
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
     component = _join(keys, seeds, int(width))[flat]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import fast_azimuth
 from carlasc.core.compiling import cached
+from carlasc.core.scans import finite
 from carlasc.motion.solving import least_squares
 
 _SECTORS, _RINGS, _RING_M = 120, 160, 0.5
@@ -44,10 +45,10 @@ def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
         (N,) bool.
     """
     own = np.ascontiguousarray(points[:, :3], np.float32)
-    finite = np.isfinite(own).all(axis=1)
-    if not finite.all():
+    known = finite(own)
+    if not known.all():
         ground = np.zeros(len(own), np.bool_)
-        ground[finite] = ground_points(own[finite])
+        ground[known] = ground_points(own[known])
         return ground
     sector, ring, lowest = _lowest(own)
     plane = _plane(own, lowest)
@@ -69,7 +70,7 @@ def ground_height(points: NDArray[np.floating]) -> float:
     Returns:
         Metres; NaN if no plane is found.
     """
-    own = np.ascontiguousarray(points[np.isfinite(points[:, :3]).all(axis=1), :3], np.float32)
+    own = np.ascontiguousarray(points[finite(points[:, :3]), :3], np.float32)
     plane = _plane(own, _lowest(own)[2])
     return float("nan") if plane is None else float(plane[2])
 

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, invert, slerp
+from carlasc.core.scans import finite
+from carlasc.core.sweeps import move_each, ticks_of
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_points
 
@@ -122,7 +124,7 @@ def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return (N,) which points of a scan odometry uses: those that are finite, and not far away on the ground."""
     with np.errstate(invalid="ignore"):
         used = ~ground_points(points) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
-        return used & np.isfinite(points[:, :3]).all(axis=1)
+        return used & finite(points[:, :3])
 
 
 def _usable(
@@ -164,9 +166,9 @@ def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: flo
     """
     points, seconds = scan
     if seconds is not None:
-        at = np.asarray(-seconds if back else seconds, np.float64)
+        at, tick_of = ticks_of(-seconds if back else seconds)
         moved = slerp(np.stack([invert(motion), np.eye(4), motion]), np.array([-1.0, 0.0, 1.0]) * elapsed_s, at)
-        points = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
+        points = move_each(points, moved, tick_of)
     if not len(odometry.local_map.point_cloud()):
         odometry.last_pose = invert(motion)  # so that the first scan is at the origin
     odometry.last_delta = motion

@@ -15,11 +15,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, thin, transform_points
+from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes, nearest_points
+from carlasc.motion.registration import pose_of, register
 from carlasc.motion.smoothing import resample, smooth, smooth_at
-from carlasc.motion.solving import least_squares
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
 _MAX_ACCELERATION_M_S2 = 6.0  # hard braking, a sharp bend
@@ -36,17 +35,11 @@ _MIN_TURNS = 4  # the fewest directions that do
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of a sighting that are registered to the model
 _SIDE_M = 0.14  # standard deviation, across a side, of points of this side alone
-_ITERATIONS = 8
-_FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
-_DEVIATIONS = 2.0  # the first reach is at least so many standard deviations of the prediction
-_POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and the number of points with independent errors
-_VARIANCE_M2 = _POINT_M**2
 # Error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians.
 _PREDICTED = np.array([0.2, 0.2, 0.01, 0.02])
 _UNKNOWN = 5.0  # factor of this error while the motion is not known yet
-_ROBUST = 0.3  # fraction of the reach; pairs farther from their plane get less weight
 _SLOW_M_S, _END_POINTS = 1.0, 20  # the ends of slower actors, and of sightings with fewer points, are not compared
-_SAME_WIDTH_M, _ENDS_M = 0.12, 0.12  # greatest difference of the widths of the same ends, and the error of their shift
+_SAME_WIDTH_M = 0.12  # greatest difference of the widths of the same ends
 _GAIN = 0.3  # weight of the last correction in the motion
 
 
@@ -209,14 +202,14 @@ def follow(
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
             points = thin(sightings[index], _REGISTERED)
             shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
-            states[index] = _register(points, model, predicted, error, states[previous, :3], shifts)
+            states[index] = register(points, model, predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
                 motion = velocity  # the backward pass starts with this estimate
-            model.add(transform_points(invert(_pose(states[index])), points))
+            model.add(transform_points(invert(pose_of(states[index])), points))
             previous, seen = index, seen + 1
     middle = (np.quantile(model.points, 0.01, axis=0) + np.quantile(model.points, 0.99, axis=0)) / 2
-    return np.stack([transform_points(_pose(state), middle) for state in states]), states[:, 3]
+    return np.stack([transform_points(pose_of(state), middle) for state in states]), states[:, 3]
 
 
 def corrections(
@@ -242,110 +235,30 @@ def corrections(
     for index in [best, *range(best + 1, len(states)), *range(best - 1, -1, -1)]:
         points = thin(sightings[index], _REGISTERED)
         if index != best:
-            laid[index] = _register(points, model, states[index], error, states[index, :3], ())
-        model.add(transform_points(invert(_pose(laid[index])), points))
+            laid[index] = register(points, model, states[index], error, states[index, :3], np.empty((0, 4)))
+        model.add(transform_points(invert(pose_of(laid[index])), points))
     counts = np.array([min(len(points), _REGISTERED) for points in sightings], np.float64)
     return smooth(laid - states, seconds, counts, _DRIVE_S)
 
 
-def _register(
-    points: NDArray[np.float64],
-    model: Planes,
-    predicted: NDArray[np.float64],
-    error: NDArray[np.float64],
-    previous: NDArray[np.float64],
-    shifts: Sequence[tuple[NDArray[np.float64], float]],
-) -> NDArray[np.float64]:
-    """Return the state (x, y, z, yaw), near the predicted one, that registers points to the planes of the model.
-
-    Args:
-        points: (N, 3) points of the sighting, metres, world.
-        model: what was seen of the actor so far.
-        predicted: (4,) predicted state.
-        error: (4,) standard deviation of the prediction.
-        previous: (3,) position at the sighting before, metres, world.
-        shifts: directions in which the ends of what is seen moved since then, and how far: see `_shift_of_ends`.
-    """
-    state = predicted.copy()
-    prior = 1 / error**2
-    expected = np.diag(prior)
-    ways = [(np.append(direction, 0.0), direction, shift) for direction, shift in shifts]
-    for row, _, _ in ways:
-        expected = expected + np.outer(row, row) / _ENDS_M**2
-    first_reach = max(_FIRST_REACH_M, _DEVIATIONS * float(error[:2].max()))
-    for iteration in range(_ITERATIONS):
-        reach = first_reach * (_LAST_REACH_M / first_reach) ** (iteration / (_ITERATIONS - 1))
-        pose = _pose(state)
-        pairs, nearest = model.near(points, pose, reach**2)
-        information, pull = expected, prior * (predicted - state)
-        for row, direction, shift in ways:
-            pull = pull + row * ((direction * (previous - state[:3])).sum() + shift) / _ENDS_M**2
-        if len(pairs) >= 3:
-            arm, normal = rotate_vectors(pose, model.points[nearest]), rotate_vectors(pose, model.normals[nearest])
-            scale, share = max(2 * _POINT_M, _ROBUST * reach), min(1.0, _INDEPENDENT / len(pairs))
-            slope, weighted, off = lay(points[pairs], pose[:3, 3], arm, normal, scale, share)
-            information = information + np.einsum("pi,pj->ij", weighted, slope)
-            pull = pull + np.einsum("pi,p->i", weighted, off)
-        state = state + least_squares(information, pull[:, None])[:, 0]
-    return state
-
-
-@cached(error_model="python")
-def lay(
-    points: NDArray[np.float64],
-    place: NDArray[np.float64],
-    arm: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    scale: float,
-    share: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the equations that lay points on planes, for a step of the state of the actor.
-
-    Args:
-        points: (P, 3) metres, world.
-        place: (3,) position of the actor, metres, world.
-        arm: (P, 3) point of the plane of each point, metres, from the actor in the axes of the world.
-        normal: (P, 3) normals of the planes, in the axes of the world.
-        scale: distance from its plane, in metres, at which a point has half the weight.
-        share: of its weight that each point has, because the errors of so many points are not independent.
-
-    Returns:
-        (P, 4) slope of the distance to the plane over x, y, z and yaw; the same with the weight of each point; (P,) the distance, metres.
-    """
-    count = len(points)
-    slope, weighted, off = np.empty((count, 4)), np.empty((count, 4)), np.empty(count)
-    for i in range(count):
-        slope[i, 0], slope[i, 1], slope[i, 2] = normal[i, 0], normal[i, 1], normal[i, 2]
-        slope[i, 3] = arm[i, 0] * normal[i, 1] - arm[i, 1] * normal[i, 0]
-        x = (points[i, 0] - place[0] - arm[i, 0]) * normal[i, 0]
-        y = (points[i, 1] - place[1] - arm[i, 1]) * normal[i, 1]
-        z = (points[i, 2] - place[2] - arm[i, 2]) * normal[i, 2]
-        off[i] = x + y + z
-        relative = off[i] / scale
-        weight = 1 / (1 + relative * relative) * share / _VARIANCE_M2
-        for a in range(4):
-            weighted[i, a] = slope[i, a] * weight
-    return slope, weighted, off
-
-
 def _shift_of_ends(
     before: NDArray[np.float64], now: NDArray[np.float64], velocity: NDArray[np.float64]
-) -> list[tuple[NDArray[np.float64], float]]:
-    """Return the directions in which two sightings show the same ends of an actor, (3,) world, and the shift of these ends, in metres.
+) -> NDArray[np.float64]:
+    """Return (K, 4) the directions, world, in which two sightings show the same ends of an actor, and the shift of these ends, in metres.
 
     A flat face determines no motion along it, but its ends do: the rear of a car that drives ahead shows where the car is across the
     street. If what is seen has the same width in both sightings, its ends are taken for the same.
     """
     speed = float(np.hypot(velocity[0], velocity[1]))
     if speed < _SLOW_M_S or min(len(before), len(now)) < _END_POINTS:
-        return []
+        return np.empty((0, 4))
     ahead = np.array([velocity[0], velocity[1], 0.0]) / speed
     shifts = []
     for direction in (ahead, np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])):
         (low, high), (low_now, high_now) = (ends((points * direction).sum(axis=1)) for points in (before, now))
         if abs((high_now - low_now) - (high - low)) < _SAME_WIDTH_M:
-            shifts.append((direction, (low_now + high_now) / 2 - (low + high) / 2))
-    return shifts
+            shifts.append(np.append(direction, (low_now + high_now) / 2 - (low + high) / 2))
+    return np.array(shifts).reshape(-1, 4)
 
 
 def ends(values: NDArray[np.float64]) -> tuple[float, float]:
@@ -362,12 +275,6 @@ def ends(values: NDArray[np.float64]) -> tuple[float, float]:
 
 def _between(low: float, high: float, share: float) -> float:
     return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
-
-
-def _pose(state: NDArray[np.float64]) -> Transform:
-    pose = rotation_z(float(state[3]))
-    pose[:3, 3] = state[:3]
-    return pose
 
 
 def middles_of(sightings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

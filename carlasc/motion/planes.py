@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, thin
+from carlasc.core.geometry import thin
 from carlasc.motion.solving import principal_axes
 
 _CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most so many
@@ -52,20 +52,10 @@ class Planes:
         self._order = np.argsort(joined[:, self._widest], kind="stable")
         self._sorted = joined[self._order]
 
-    def near(
-        self, points: NDArray[np.float64], world_T_actor: Transform, squared_m: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Pair the points of a sighting with the nearest points of the model.
-
-        Args:
-            points: (N, 3) metres, world.
-            world_T_actor: (4, 4) pose of the actor.
-            squared_m: the square of a distance: points that are not nearer than this to the model have no pair.
-
-        Returns:
-            (P,) indices of points that have a pair, increasing, and (P,) indices of the points of the model, the lowest of several.
-        """
-        return nearest_within(points, world_T_actor, self._sorted, self._order, self._widest, squared_m)
+    @property
+    def in_order(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], int]:
+        """(M, 3) points, sorted along the axis on which they are spread most, their (M, 3) normals, the (M,) index of each before, and the axis."""
+        return self._sorted, self.normals[self._order], self._order, self._widest
 
 
 def covariances(sums: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -124,7 +114,7 @@ def nearest_within(
     axis: int,
     squared: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return what `Planes.near` returns, from points of the model that are sorted along an axis.
+    """Pair points with the nearest points of a model that are sorted along an axis: those that are nearer than a distance.
 
     The search goes from the place of a point on the axis outwards, until all others are farther away along this axis alone.
 
@@ -135,6 +125,9 @@ def nearest_within(
         order: (M,) index of each of them before it was sorted.
         axis: along which they are sorted.
         squared: the square of the distance that pairs must be nearer than.
+
+    Returns:
+        (P,) indices of points that have a pair, increasing, and (P,) indices of the points of the model, the lowest of several.
     """
     rows, nearest, moved = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(3)
     place, count, last = np.empty(3), 0, len(model) - 1

@@ -9,7 +9,7 @@ channels too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,40 +25,46 @@ _DEPTH_M, _DEPTH_SHARE = (
     0.25,
     0.003,
 )  # a return within this distance, and share of the range, of a point is of the same surface
+SAME_PLACE_M = 0.3  # rays that began within this distance of each other began at one place
 _GAP_M = 0.8  # maximum distance between two rays, one above the other, between which space is as free as along them
 
 FREE, HIT = 1, 2
 
 
-@dataclass(frozen=True)
-class SortedReturns:
+class SortedReturns(NamedTuple):
     """The returns of one scan, sorted for looking up directions.
 
     Attributes:
         start: (C + 1,) int32, first return of each column of azimuth.
         slope: (N,) float32 height over horizontal distance of each return, increasing within a column.
-        distance: (N,) float32 metres from the sensor.
+        distance: (N,) float32 metres from where its ray began.
+        origin: (C, 3) float32 where the rays of each column began, metres, in the frame of the scan.
     """
 
     start: NDArray[np.int32]
     slope: NDArray[np.float32]
     distance: NDArray[np.float32]
+    origin: NDArray[np.float32]
 
     @classmethod
-    def of(cls, points: NDArray[np.float32]) -> SortedReturns:
-        """Sort the (N, 3) points of a scan, metres, sensor frame."""
-        column, slope, distance = _directions(np.ascontiguousarray(points[:, :3], np.float32))
-        kept = np.flatnonzero(distance >= _MIN_RANGE_M)
-        # One key: columns are integers, and the arc tangent of the slope is within a column.
-        key = column[kept] + (np.arctan(slope[kept]) / np.float32(np.pi) + np.float32(0.5)).astype(np.float64)
-        order = kept[np.argsort(key)]
-        start = np.zeros(_COLUMNS + 1, np.int32)
-        start[1:] = np.cumsum(np.bincount(column[kept], minlength=_COLUMNS))
-        return cls(start, slope[order], distance[order])
+    def of(cls, points: NDArray[np.float32], origins: NDArray[np.float32] | None = None) -> SortedReturns:
+        """Sort the points of a scan by the directions of their rays.
+
+        A column holds rays of one place. Where the first and the last rays of a turn overlap, a moving sensor was at two: the fewer are left out.
+
+        Args:
+            points: (N, 3) metres.
+            origins: (N, 3) where the ray of each point began; None: at (0, 0, 0).
+        """
+        began = np.zeros_like(points[:, :3]) if origins is None else origins
+        column, slope, distance = _directions(np.ascontiguousarray(points[:, :3] - began, np.float32))
+        start, order, origin = _by_column(column, slope, np.ascontiguousarray(began, np.float32))
+        return cls(start, slope[order], distance[order], origin)
 
 
 @cached
 def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the column of each point, seen from where its ray began; -1 if it is too near; its slope and its distance."""
     n = len(points)
     column, slope, distance = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
@@ -66,8 +72,43 @@ def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray
         flat = math.sqrt(x * x + y * y)
         distance[i] = math.sqrt(flat * flat + z * z)
         slope[i] = z / max(flat, 1e-3)
-        column[i] = _column(fast_azimuth(x, y)) if flat > 0 else 0
+        column[i] = -1
+        if distance[i] >= _MIN_RANGE_M:
+            column[i] = _column(fast_azimuth(x, y)) if flat > 0 else 0
     return column, slope, distance
+
+
+@cached
+def _by_column(
+    column: NDArray[np.int32], slope: NDArray[np.float32], began: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Return `start`, the points in the order of columns and slopes, and `origin`: see `SortedReturns`."""
+    begin = np.zeros(_COLUMNS + 1, np.int64)
+    for i in range(len(column)):
+        begin[column[i] + 1] += column[i] >= 0
+    begin = np.cumsum(begin)
+    filled, members = begin.copy(), np.empty(begin[_COLUMNS], np.int32)
+    for i in range(len(column)):
+        if column[i] >= 0:
+            members[filled[column[i]]] = i
+            filled[column[i]] += 1
+    start, order, count = np.zeros(_COLUMNS + 1, np.int32), np.empty_like(members), 0
+    origin = np.zeros((_COLUMNS, 3), np.float32)
+    for c in range(_COLUMNS):
+        own = members[begin[c] : begin[c + 1]]
+        if len(own):
+            place = began[own[len(own) // 2]]
+            origin[c] = place
+            for k in np.argsort(slope[own]):
+                x, y, z = began[own[k], 0] - place[0], began[own[k], 1] - place[1], began[own[k], 2] - place[2]
+                if x * x + y * y + z * z <= SAME_PLACE_M * SAME_PLACE_M:
+                    order[count] = own[k]
+                    count += 1
+        start[c + 1] = count
+    for c in range(2 * _COLUMNS):  # columns without rays: where those before them began
+        if begin[c % _COLUMNS] == begin[c % _COLUMNS + 1]:
+            origin[c % _COLUMNS] = origin[(c - 1) % _COLUMNS]
+    return start, order[:count], origin
 
 
 @inlined
@@ -78,10 +119,9 @@ def _column(azimuth: float) -> int:
 @cached
 def look_up(
     points: NDArray[np.float32],
+    asked: NDArray[np.int32],
     pose: Pose,
-    start: NDArray[np.int32],
-    slope: NDArray[np.float32],
-    distance: NDArray[np.float32],
+    view: SortedReturns,
     bit: int,
     free: NDArray[np.uint32],
     hit: NDArray[np.uint32],
@@ -90,17 +130,25 @@ def look_up(
 
     Args:
         points: (M, 3) metres.
-        pose: from the points' frame to the sensor of the other scan.
-        start: (C + 1,) first return of each column of azimuth of the other scan.
-        slope: (N,) height over horizontal distance of its returns, increasing within a column.
-        distance: (N,) metres from its sensor.
+        asked: (A,) indices of those points that are looked up.
+        pose: from the points' frame to that of the other scan.
+        view: the returns of the other scan.
         bit: number of the bit that is set.
         free: (M,) gets the bit where the place of the point was free.
         hit: (M,) gets the bit where it was occupied.
     """
     flag = np.uint32(1) << np.uint32(bit)
-    for i in range(len(points)):
+    start, slope, distance, origin = view
+    moved = (origin != origin[0]).any()
+    for i in asked:
         x, y, z = transform(pose, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
+        if (
+            moved and x * x + y * y > 0
+        ):  # seen from there, it is in a column near this one, whose rays began at nearly the same place
+            place = origin[_column(fast_azimuth(x, y))]
+            x, y, z = x - place[0], y - place[1], z - place[2]
+        else:
+            x, y, z = x - origin[0, 0], y - origin[0, 1], z - origin[0, 2]
         flat = math.sqrt(x * x + y * y)
         if flat < _MIN_RANGE_M:
             continue
@@ -110,6 +158,50 @@ def look_up(
             free[i] |= flag
         elif answer == HIT:
             hit[i] |= flag
+
+
+@inlined
+def _count(bits: np.int64) -> np.int64:
+    """Return how many of the lower 32 bits are set."""
+    bits -= (bits >> 1) & 0x55555555
+    bits = (bits & 0x33333333) + ((bits >> 2) & 0x33333333)
+    return (((bits + (bits >> 4)) & 0x0F0F0F0F) * 0x01010101 & 0xFFFFFFFF) >> 24
+
+
+@cached
+def undecided(
+    asked: NDArray[np.int32],
+    free: NDArray[np.uint32],
+    hit: NDArray[np.uint32],
+    left: tuple[int, int],
+    least: tuple[int, int],
+) -> NDArray[np.int32]:
+    """Return those points about which the scans that are left may still change the answer.
+
+    Args:
+        asked: (A,) indices of points.
+        free: (2, M) bits of the scans before, and of those after, that saw through the place of a point. Higher bits are farther away.
+        hit: (2, M) those that saw it occupied.
+        left: number of scans before and after that are not looked up yet, all nearer than the others.
+        least: number of scans that must see through the place of what moved, and number of scans in a row if it is free on one side only.
+    """
+    kept = np.empty_like(asked)
+    count, rest = 0, left[0] + left[1]
+    for i in asked:
+        passed = _count(np.int64(free[0, i])) + _count(np.int64(free[1, i]))
+        occupied = _count(np.int64(hit[0, i])) + _count(np.int64(hit[1, i]))
+        moves = passed >= least[0] and passed > occupied + rest
+        may_change = passed + rest >= occupied
+        for side in range(2):  # those in a row end at the first that saw it occupied
+            h = np.int64(hit[side, i])
+            for shift in (1, 2, 4, 8, 16):
+                h |= h >> shift
+            in_a_row = _count(np.int64(free[side, i]) & ~h) + (left[side] if h == 0 else 0)
+            may_change = may_change or in_a_row >= least[1]
+        if may_change and not moves:
+            kept[count] = i
+            count += 1
+    return kept[:count]
 
 
 @inlined
@@ -130,8 +222,6 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
     half = _SIDE_M / flat + _SIDE_RAD
     high = half * (1 + steep * steep)
     near, beyond = far - _DEPTH_M - _DEPTH_SHARE * far, far + _DEPTH_M + _DEPTH_SHARE * far
-    first = math.floor((azimuth - half + math.pi) * _PER_RAD)
-    last = math.floor((azimuth + half + math.pi) * _PER_RAD)
     # Most places are occupied, and most of them show it in the middle: this column is looked at first.
     middle = math.floor((azimuth + math.pi) * _PER_RAD) % _COLUMNS
     lo, end = _first_above(steep - high, start[middle], start[middle + 1], slope), start[middle + 1]
@@ -139,6 +229,8 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
         if near <= distance[lo] <= beyond:
             return HIT
         lo += 1
+    first = math.floor((azimuth - half + math.pi) * _PER_RAD)
+    last = math.floor((azimuth + half + math.pi) * _PER_RAD)
     passed, hidden = 0, 0
     below, above = -1e9, 1e9
     below_range, above_range = 0.0, 0.0

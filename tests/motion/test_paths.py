@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
-from carlasc.core.geometry import rotation_z
 from carlasc.motion.paths import (
     best_sighting,
     corrections,
@@ -14,7 +13,6 @@ from carlasc.motion.paths import (
     headings_by_turns,
     headings_of,
     is_standing,
-    lay,
 )
 
 FRAMES = range(25)
@@ -146,19 +144,6 @@ def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
     sightings = sightings_of(actor)
     path, _ = follow(sightings, SECONDS, best_sighting(sightings))
     assert np.abs(np.diff(path, axis=0) - (0.8, 0, 0)).max() < 0.1
-
-
-def test_points_are_laid_on_planes_with_the_bits_of_numpy():
-    rng = np.random.default_rng(2)
-    points, arm, normal = rng.normal(size=(3, 80, 3))
-    place, scale, share = rotation_z(0.7)[:3, 0] * 30, 0.3, 0.4
-    slope, weighted, off = lay(points, place, arm, normal, scale, share)
-    distance = ((points - place - arm) * normal).sum(axis=1)
-    turning = arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]
-    weight = 1 / (1 + (distance / scale) ** 2) * share / 0.05**2
-    assert np.array_equal(off, distance)
-    assert np.array_equal(slope, np.column_stack([normal, turning]))
-    assert np.array_equal(weighted, slope * weight[:, None])
 
 
 @pytest.mark.parametrize("count", [1, 2, 20, 21, 26, 50, 51, 101, 400])

@@ -16,6 +16,11 @@ def planes_of(points):
     return model
 
 
+def pairs(points, pose, model, squared):
+    ordered, _, order, axis = model.in_order
+    return nearest_within(points, pose, ordered, order, axis, squared)
+
+
 def sighting(rng, count=300):
     """Two sides of a car, some of whose points are in cells that another sighting had."""
     points = rng.uniform(0, 1, (count, 3)) * (4.4, 1.8, 1.5)
@@ -121,7 +126,7 @@ def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
     model, points = planes_of(sighting(rng)), sighting(rng) + (30, -20, 1)
     pose = translation((30.2, -20.1, 1)) @ rotation_z(0.1)
     squared = np.square(transform_points(invert(pose), points)[:, None] - model.points).sum(axis=2)
-    rows, nearest = model.near(points, pose, 0.04)
+    rows, nearest = pairs(points, pose, model, 0.04)
     assert np.array_equal(rows, np.flatnonzero(squared.min(axis=1) < 0.04))
     assert np.array_equal(nearest, squared.argmin(axis=1)[rows])
     assert 50 < len(rows) < 300
@@ -129,7 +134,7 @@ def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
 
 def test_a_pose_that_is_not_finite_pairs_nothing():
     model = planes_of(sighting(np.random.default_rng(7)))
-    rows, nearest = model.near(model.points, np.full((4, 4), np.nan), 1.0)
+    rows, nearest = pairs(model.points, np.full((4, 4), np.nan), model, 1.0)
     assert len(rows) == len(nearest) == 0
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.geometry import invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
+from carlasc.core.scans import finite
 from carlasc.groundtruth.from_scans.body_regions import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant
@@ -139,7 +140,7 @@ def _numbered(feed: ScanFeed, frame: int) -> Numbered:
     scan = feed.sequence.scan(frame, ("instances",))
     if scan.instances is None:
         return np.empty((0, 3), np.float32), np.empty(0, np.int64)
-    own = (scan.instances > 0) & np.isfinite(scan.points).all(axis=1)
+    own = (scan.instances > 0) & finite(scan.points)
     return transform_points(feed.pose(frame), scan.points[own]).astype(np.float32), scan.instances[own].astype(np.int64)
 
 

@@ -47,12 +47,15 @@ from carlasc.storage.sinks import SequenceWriter
 TRACKS, POSES = "tracks", "poses"
 """What the files that keep actors and refined poses are called, in the folder of what is derived."""
 
-_VERSIONS = {TRACKS: 4, POSES: 1}  # of the methods: they change only when the same input gives another result
+_VERSIONS = {TRACKS: 5, POSES: 1}  # of the methods: they change only when the same input gives another result
 _NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
 _BATCH = 200  # frames that are read before their finished tracks are estimated
 _MOVERS = 32  # movers whose tracks are estimated in one piece
 _SHAPE_POINTS = 128  # points of a boxed object in a scan that show its shape and its motion
-_BLOCK = 100  # frames whose evidence is found in one piece
+_BLOCK = (
+    100,
+    400,
+)  # least and most frames whose evidence is found in one piece: each piece reads the scans of some seconds around it too
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -157,7 +160,8 @@ class _MotionPass:
     ) -> tuple[list[Track], dict[int, NDArray[np.integer]], list[NDArray[np.float64]]]:
         """Return the tracks of what moved although no field shows it, and what else `MovingActors` has: `moving` and `own`."""
         frames = list(self.feed.times)
-        blocks = [tuple(frames[begin : begin + _BLOCK]) for begin in range(0, len(frames), _BLOCK)]
+        size = min(max(-(-len(frames) // self.run.processes), _BLOCK[0]), _BLOCK[1])
+        blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
 
         def evidence() -> Iterator[FreeSpaceEvidence]:
             with self._each(_FindEvidence(self.feed, boxes), blocks) as results:
