@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -13,7 +14,7 @@ from carlasc.core.geometry import invert, thin, transform_points
 from carlasc.core.scans import Scan
 from carlasc.errors import CarlascError
 from carlasc.inspection.auditing.hypotheses import Family, families
-from carlasc.inspection.auditing.loops import count_occupied_under, crossings, grown
+from carlasc.inspection.auditing.loops import count_occupied_under, crossings, grown, voxels_at
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.sums import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
@@ -21,8 +22,8 @@ from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
 
 HEIGHTS = 4  # layers of equal height that shares are told by
 MAX_ID = 511  # larger ids of classes count as this one
-# Points of a frame that are spread over places, and that are left of these; rays that are followed.
-_SPREAD, _FIT_POINTS, _RAYS = 20_000, 2500, 8000
+_SPREAD, _RAYS = 20_000, 8000  # points of a frame that are spread over places, and rays that are followed
+_LEAST, _MOST, _IN_ALL = 500, 2500, 250_000  # points that are left of these in a frame, and in all frames
 _TIMES = (*range(-20, -1, 2), *range(2, 21, 2))  # frames before and after, at which actors are looked for
 _APART = 20  # frames to the scans that show a drift
 _CLEAR_RAYS = 3  # so many rays cross a phantom
@@ -46,6 +47,7 @@ class _Frame:
     occupied: NDArray[np.bool_]
     known: NDArray[np.bool_] | None
     crossed: NDArray[np.int64]
+    turns: bool  # whether the grid is cylindrical
 
     @cached_property
     def hit(self) -> NDArray[np.bool_]:
@@ -53,6 +55,11 @@ class _Frame:
         hit = np.zeros(self.occupied.size, np.bool_)
         hit[self.voxels[self.voxels >= 0]] = True
         return hit.reshape(self.occupied.shape)
+
+    @cached_property
+    def around(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) these voxels and their neighbours."""
+        return grown(self.hit, self.turns)
 
 
 @dataclass
@@ -105,7 +112,8 @@ class FrameCounter:
         crossed = crossings(self.matched.place(begun), points[rays], spec, margin)
         voxels = np.where(returns, spec.flat_index(points), -1)
         kinds = labels if labels.dtype == np.uint8 else np.minimum(labels, MAX_ID)
-        return _Frame(frame, scan, points, voxels, kinds, occupied, known, crossed)
+        turns = spec.coordinates == "cylindrical"
+        return _Frame(frame, scan, points, voxels, kinds, occupied, known, crossed, turns)
 
     def _scan(self, frame: int) -> Scan:
         if frame not in self._scans:
@@ -122,25 +130,27 @@ class FrameCounter:
 
     def _fits(self, seen: _Frame) -> NDArray[np.int64]:
         """Return (H, 2) points, and those in occupied voxels, under all corrections of all families."""
-        own = self._fit_points(seen.number)
-        counts = [
-            self._fit(seen, family, own) for family in self._families if family.kind not in ("height drift", "lag")
-        ]
         drift, lag = self._families[-2:]
+        own = self._fit_points(seen.number)
+        counts = [self._fit(seen, family.warps, own) for family in self._families[:-2]]
         drifts = np.zeros((len(drift.values), 2), np.int64)
         for other in (seen.number - _APART, seen.number + _APART):
             if (placed := self._standing(seen.number, other)) is not None:
-                later = self._second(other) - self._second(seen.number)
-                drifts += self._fit(seen, drift, thin(placed, _FIT_POINTS), later)
-        lags = [self._fit(seen, lag, self._fit_points(seen.number + int(value)))[lag.neutral] for value in lag.values]
-        return np.concatenate([*counts, drifts, lags])
+                later_s = self._second(other) - self._second(seen.number)
+                drifts += self._fit(seen, drift.warps, thin(placed, self._most), later_s)
+        lags = [self._fit(seen, lag.warps[:1], self._fit_points(seen.number + int(value))) for value in lag.values]
+        return np.concatenate([*counts, drifts, *lags])
 
     def _fit(
-        self, seen: _Frame, family: Family, points: NDArray[np.float64], later_s: float = 0.0
+        self, seen: _Frame, warps: NDArray[np.float64], points: NDArray[np.float64], later_s: float = 0.0
     ) -> NDArray[np.int64]:
         timed = np.column_stack([points, np.full(len(points), later_s)])
-        found = count_occupied_under(timed, family.warps, self.matched.spec, seen.occupied)
+        found = count_occupied_under(timed, warps, self.matched.spec, seen.occupied)
         return np.column_stack([np.full(len(found), len(points)), found])
+
+    @property
+    def _most(self) -> int:
+        return int(np.clip(_IN_ALL // len(self.matched.frames), _LEAST, _MOST))
 
     def _fit_points(self, frame: int) -> NDArray[np.float64]:
         """Return (N, 3) points of a scan inside the grid, about as many of each place; none if it cannot be read."""
@@ -152,7 +162,7 @@ class FrameCounter:
                 scan = None
             some = np.empty((0, 3), np.float32) if scan is None else thin(scan.points[_are_returns(scan)], _SPREAD)
             points = self.matched.place(some[first_of_cells(np.floor(some / edge).astype(np.int64))])
-            self._spread[frame] = thin(points[spec.flat_index(points) >= 0], _FIT_POINTS)
+            self._spread[frame] = thin(points[spec.flat_index(points) >= 0], self._most)
             while len(self._spread) > _KEPT:
                 self._spread.pop(next(iter(self._spread)))
         return self._spread[frame]
@@ -234,7 +244,7 @@ class FrameCounter:
     def _add_phantoms(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
         """Count occupied voxels that rays cross, of those that rays see, by class, distance and height, and return the wrong ones."""
         spec, clear = self.matched.spec, seen.crossed >= _CLEAR_RAYS
-        wrong = seen.occupied & clear & ~grown(seen.hit, spec.coordinates == "cylindrical")
+        wrong = seen.occupied & clear & ~seen.around
         # rays run along the ground for metres, and through its voxels
         wrong &= ~(np.isin(seen.labels, self.ground) if len(self.ground) else lowest_of_columns(seen.occupied))
         looked = np.nonzero(seen.occupied & (clear | seen.hit))
@@ -255,7 +265,9 @@ class FrameCounter:
         heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(np.int64)
         bands = np.searchsorted(BANDS_M, np.linalg.norm(points, axis=1), side="right") - 1
         shape = (MAX_ID + 1, len(BANDS_M) - 1, HEIGHTS, 2)
-        cells = np.ravel_multi_index((np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights, wrong.astype(np.int64)), shape)
+        cells = np.ravel_multi_index(
+            (np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights, wrong.astype(np.int64)), shape
+        )
         counts = np.bincount(cells, minlength=int(np.prod(shape))).reshape(shape)
         add(sums, name, np.stack([counts.sum(axis=3), counts[..., 1]], axis=3))
 
@@ -288,13 +300,11 @@ class FrameCounter:
                 add(sums, f"actor {name}", [0, 0, len(own), flat[own].sum(), 1])
         if (grid_T_world := self._grid_T_world(seen.number)) is not None:
             wide = max(float(self.matched.spec.voxel_size[0]), _AROUND_M)
-            # what the scan meets is there, whoever it is
-            here = grown(seen.hit, self.matched.spec.coordinates == "cylindrical").reshape(-1)
+            here = seen.around.reshape(-1).copy()  # what the scan meets is there, whoever it is
             for track in self.actors.tracks.values():
-                here[self._body(track, seen.number, grid_T_world, wide)] = True
+                here[self._body(track, [seen.number], grid_T_world, wide)] = True
             for number, track in self.actors.tracks.items():
-                bodies = [self._body(track, seen.number + k, grid_T_world, -_INSET_M) for k in _TIMES]
-                path = np.unique(np.concatenate(bodies))
+                path = self._body(track, [seen.number + k for k in _TIMES], grid_T_world, -_INSET_M)
                 path = path[~here[path]]
                 if len(path):
                     trails[path[flat[path]]] = True
@@ -313,24 +323,26 @@ class FrameCounter:
         parts = zip(found.tolist(), np.split(order, starts[1:]), strict=True)
         return [(str(i), own) for i, own in parts if i and (labels is None or np.isin(labels[own], movable).all())]
 
-    def _body(self, track: Track, frame: int, grid_T_world: NDArray[np.float64], margin_m: float) -> NDArray[np.int64]:
-        """Return the voxels in the body of an actor at a frame, wider by a margin; above the ground where it is narrower."""
-        pose, spec = track.pose(frame), self.matched.spec
+    def _body(
+        self, track: Track, frames: Sequence[int], grid_T_world: NDArray[np.float64], margin_m: float
+    ) -> NDArray[np.int64]:
+        """Return the voxels in the body of an actor at some frames, wider by a margin; above the ground where it is narrower."""
+        spec, poses = self.matched.spec, [pose for frame in frames if (pose := track.pose(frame)) is not None]
         lower, upper = track.lower - margin_m, track.upper + margin_m
         if margin_m < 0:
             lower[2] = track.lower[2] + float(spec.voxel_size[2])
-        if pose is None or (upper <= lower).any():
+        if not poses or (upper <= lower).any():
             return np.empty(0, np.int64)
         edge = float(spec.voxel_size[[0, 2]].min()) / 1.5
         lines = [np.linspace(a, b, max(2, round((b - a) / edge) + 1)) for a, b in zip(lower, upper, strict=True)]
         lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        found = np.unique(spec.flat_index(transform_points(grid_T_world @ pose, lattice)))
-        return found[found >= 0]
+        return voxels_at(lattice, grid_T_world @ np.stack(poses), spec)
 
 
 def _are_returns(scan: Scan) -> NDArray[np.bool_]:
     """Return (N,) which points are returns: some sensors write (0, 0, 0) where there is none."""
-    return np.asarray(scan.points.any(axis=1))
+    x, y, z = scan.points.T
+    return np.asarray((x != 0) | (y != 0) | (z != 0))
 
 
 def _name(number: int, track: Track) -> str:

@@ -1,4 +1,4 @@
-"""What the audit counts in compiled code: points under many corrections, and the rays that cross each voxel."""
+"""What the audit counts in compiled code: points under many corrections, the voxels of bodies, and the rays that cross each voxel."""
 
 from __future__ import annotations
 
@@ -81,10 +81,32 @@ def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[n
                 crossed[voxel] += 1
 
 
+def voxels_at(points: NDArray[np.float64], poses: NDArray[np.float64], spec: GridSpec) -> NDArray[np.int64]:
+    """Return the voxels that hold any of (N, 3) points at any of (P, 4, 4) poses in the frame of the grid, rising."""
+    inside = np.zeros(spec.num_voxels + 1, np.bool_)
+    _mark(points, np.ascontiguousarray(poses), Cells.of(spec), inside)
+    return np.flatnonzero(inside[:-1])
+
+
+@cached
+def _mark(points, poses, cells, inside):  # type: ignore[no-untyped-def]
+    for p in range(len(poses)):
+        m = poses[p]
+        for i in range(len(points)):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            voxel = find_voxel(
+                m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+                m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+                cells,
+            )
+            inside[voxel] = True
+
+
 def grown(mask: NDArray[np.bool_], turns: bool) -> NDArray[np.bool_]:
     """Return a mask grown by one voxel in each direction, around the full turn of a cylindrical grid if it `turns`."""
     for axis in range(3):
         sides = [(1, 1) if a == axis else (0, 0) for a in range(3)]
-        wide = np.pad(mask, sides, mode="wrap") if turns and axis == 1 else np.pad(mask, sides)
-        mask = np.asarray(np.lib.stride_tricks.sliding_window_view(wide, 3, axis=axis).any(axis=-1))
+        wide = np.moveaxis(np.pad(mask, sides, mode="wrap" if turns and axis == 1 else "constant"), axis, 0)
+        mask = np.moveaxis(wide[:-2] | wide[1:-1] | wide[2:], 0, axis)
     return mask
