@@ -116,6 +116,29 @@ def test_the_actor_of_a_fault_is_named(town, tmp_path, fault, check):
     assert f"actor {actor} " in str(found[check])
 
 
+SOURCES = {  # what shows motion -> how the recording is copied
+    "flow": lambda town, out: planted.without_fields(town, out, "instances"),
+    "boxes": planted.with_boxes,
+    "evidence": lambda town, out: planted.without_fields(town, out, "instances", "flow"),
+    "evidence without labels": lambda town, out: planted.without_fields(town, out, "instances", "flow", "labels"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOURCES)
+def test_an_actor_without_voxels_and_its_trail_are_found_by_whatever_shows_motion(town, tmp_path, name):
+    scans, actor = SOURCES[name](town, tmp_path / "scans"), planted.fastest(planted.sequence_of(town))
+    named = {"boxes": f"actor {actor} "}.get(name, "actor mover 0, first seen in scan ")
+    assert planted.sequence_of(scans).fields() & {"instances", "flow", "boxes"} == {name} - {
+        name if "evid" in name else ""
+    }
+    for fault, check in ((None, None), (planted.erased, "erased actors"), (planted.trail, "ghost trails")):
+        out = tmp_path / f"{check}"
+        found = faults(planted.write_grids(town, out, None if fault is None else fault(actor)), scans)
+        assert set(found) == {check} - {None}
+        assert all(named in str(verdict) for verdict in found.values())
+
+
 @pytest.mark.slow
 def test_a_turn_of_a_degree_is_named(town, tmp_path):
     drive, turned = TownDrive(1, "light", LIDAR), rotation_z(np.radians(1.0))

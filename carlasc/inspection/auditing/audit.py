@@ -6,7 +6,7 @@ import io
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from carlasc.core.frames import Frames
 from carlasc.errors import ArgumentError, CarlascError, reading
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.motion_pass import find_actors, read_or_find_actors
+from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.inputs import RunProgress
 from carlasc.inspection.auditing.counting import OCCUPIED, FrameCounter
 from carlasc.inspection.auditing.geometry import judge_geometry
@@ -31,7 +31,7 @@ from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Verd
 from carlasc.metrics.pairs import Place
 from carlasc.motion.options import MotionOptions
 from carlasc.motion.tracks import MovingActors
-from carlasc.running.processes import run_all
+from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.protocol import Source
@@ -42,7 +42,10 @@ _VERSION = 2  # of what is counted: it changes when the same input gives other s
 _STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and stretches of a sequence at least
 _DRAWN = 50  # stretches that are drawn at most: neighbours are drawn together where there are more
 _SHOWN = 4  # frames that are drawn
-_REACH = 30  # frames before and after a stretch in which actors matter
+_REACH, _BLOCK = (
+    30,
+    400,
+)  # frames before and after a stretch in which actors matter, and for which they are found together
 _SUMS, _WORST, _KEY = (
     "audit",
     "worst",
@@ -145,8 +148,9 @@ def audit(
         raise ArgumentError("part", expected="`keep`, the folder in which parts are put together", found="no folder")
     matched = match_grids(grids, scans, grid, frames)
     notes = [f"{one.path}: {note}" for one in matched for note in one.notes]
-    stretches = list(chain.from_iterable(_stretches_of(one, made_from, keep, run, notes) for one in matched))
-    sums, worst, failures, is_whole = _count_all(stretches, run)
+    stretches = list(chain.from_iterable(_stretches_of(one, made_from, keep) for one in matched))
+    with one_pool(run) as spread:
+        sums, worst, failures, is_whole = _count_all(stretches, spread, notes)
     verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched} if is_whole else {}
     return AuditResult(
         grids.location if isinstance(grids, Source) else str(grids),
@@ -155,7 +159,7 @@ def audit(
         {one.path: len(one.frames) for one in matched},
         {one.path: one.frame_name for one in matched},
         tuple(sorted(worst, key=lambda row: -row[3])[:_SHOWN]),
-        tuple(notes),
+        tuple(dict.fromkeys(notes)),
         tuple(failures),
         grid,
         time.perf_counter() - start,
@@ -165,7 +169,7 @@ def audit(
 def voxels_of(result: AuditResult, path: str, number: int, frame: int) -> tuple[MatchedGrids, NDArray[np.uint8]]:
     """Count a frame of an audit again: return its grids, and what its voxels are (see `FrameCounter.add_frame`)."""
     one = next(one for one in match_grids(result.grids, result.scans, result.grid, None) if one.path == path)
-    return one, FrameCounter(one, _actors_of(one, None, Run(workers=1), [])).add_frame({}, number, frame)
+    return one, FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), [])).add_frame({}, number, frame)
 
 
 def _judge(sums: Stretches, one: MatchedGrids, window: tuple[int, int] | None) -> tuple[Verdict, ...]:
@@ -174,50 +178,61 @@ def _judge(sums: Stretches, one: MatchedGrids, window: tuple[int, int] | None) -
     return (*geometry, *judge_contents(sums, one, window, wrong))
 
 
-def _stretches_of(
-    one: MatchedGrids, window: tuple[int, int] | None, keep: str | Path | None, run: Run, notes: list[str]
-) -> Iterator[_Stretch]:
-    """Yield the stretches of a sequence; each has only the actors that are near."""
+def _stretches_of(one: MatchedGrids, window: tuple[int, int] | None, keep: str | Path | None) -> Iterator[_Stretch]:
+    """Yield the stretches of a sequence, without actors."""
     writer, digest, scans = None, "", one.scans.frames("points")
     if keep is not None:
         writer, digest = FolderSink(keep).sequence(one.path), scans_digest(one.scans, scans)
         digest = derived_key(one.scans, scans, digest) if layout.POSES in one.scans.documents() else digest
-    actors, size = _actors_of(one, writer, run, notes), int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
+    size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
     for first in range(0, len(one.frames), size):
-        frames = one.frames[first : first + size]
-        near = actors.between(frames[0][1] - _REACH, frames[-1][1] + _REACH)
-        yield _Stretch(FrameCounter(one, near, window), frames, writer, digest)
+        yield _Stretch(FrameCounter(one, MovingActors(), window), one.frames[first : first + size], writer, digest)
 
 
-def _actors_of(one: MatchedGrids, writer: SequenceWriter | None, run: Run, notes: list[str]) -> MovingActors:
-    """Return what moves in a recording: by its fields, and if it has none by free space."""
+def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> Iterator[_Stretch]:
+    """Yield stretches with what moves near them, which is found for some hundred frames at a time, so that memory does not grow."""
+    known, actors = ("", -1), MovingActors()
+    for stretch in stretches:
+        if stretch.read() is None:
+            one, (first, last) = stretch.counter.matched, (stretch.frames[0][1], stretch.frames[-1][1])
+            block = first // _BLOCK
+            if known != (one.path, block):
+                known = one.path, block
+                actors = _actors_of(one, block * _BLOCK, (block + 1) * _BLOCK + last - first, run, notes)
+            near = actors.between(first - _REACH, last + _REACH)
+            yield replace(stretch, counter=replace(stretch.counter, actors=near))
+        else:
+            yield stretch
+
+
+def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[str]) -> MovingActors:
+    """Return what moves near some frames of a recording: by its fields, and if it has none by free space."""
     if layout.POSES not in one.scans.documents():
         notes.append(f"{one.path}: the scans have no poses: what moves, and drift, cannot be told")
         return MovingActors()
-    feed = ScanFeed(one.scans, FromScans())
-    named = [name for name in feed.motion if name != "evidence"]
-    if named:  # the fields name actors, and evidence would only add doubtful ones
-        feed = ScanFeed(one.scans, FromScans(motion=MotionOptions(named[0])))  # type: ignore[arg-type]
-    steps = RunProgress(None, 0, 0)
+    frames = one.scans.frames("points")
+    far = frames[(frames < first - 2 * _REACH) | (frames > last + 2 * _REACH)].tolist()
+    scans, named = WithoutScans(one.scans, far), [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"]
+    # where fields name actors, evidence would only add doubtful ones
+    observe = FromScans(motion=MotionOptions(named[0] if named else "evidence"))  # type: ignore[arg-type]
     try:
-        return find_actors(feed, run) if writer is None else read_or_find_actors(feed, writer, run, steps)
+        return find_actors(ScanFeed(scans, observe), run)
     except CarlascError as error:
         notes.append(f"{one.path}: what moves cannot be told: {error}")
         return MovingActors()
 
 
 def _count_all(
-    stretches: list[_Stretch], run: Run
+    stretches: list[_Stretch], run: Run, notes: list[str]
 ) -> tuple[dict[str, list[Sums]], list[Row], list[AuditFailure], bool]:
     """Count the stretches of this part, and read those of others: sums by sequence, frames, failures, and whether all are there."""
-    own, steps = (
-        run.part.take(range(len(stretches))),
-        RunProgress(run.progress, 0, sum(len(s.frames) for s in stretches)),
-    )
+    own = run.part.take(range(len(stretches)))
+    steps = RunProgress(run.progress, 0, sum(len(stretch.frames) for stretch in stretches))
     lengths = Counter(stretch.counter.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
     worst, failures, is_whole, rows = list[Row](), list[AuditFailure](), True, Counter[str]()
-    with closing(run_all(_Stretch.count, [stretches[index] for index in own], run, lost=_fail)) as results:
+    tasks = _with_actors((stretches[index] for index in own), run, notes)
+    with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
         for index, stretch in enumerate(stretches):
             found, failed = next(results) if index in own else (stretch.read(), [])
             path, is_whole = stretch.counter.matched.path, is_whole and found is not None

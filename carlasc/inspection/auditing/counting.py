@@ -346,4 +346,9 @@ def _are_returns(scan: Scan) -> NDArray[np.bool_]:
 
 
 def _name(number: int, track: Track) -> str:
-    return str(track.instance) if 0 < track.instance < FIRST_MOVER else f"mover {number}"
+    is_named = 0 < track.instance < FIRST_MOVER
+    return (
+        str(track.instance)
+        if is_named
+        else f"mover {number}, first seen in scan {min(track.members, default=track.first)}"
+    )
