@@ -12,6 +12,7 @@ import numpy as np
 
 import carlasc
 from carlasc import Boxes, GridSpec
+from carlasc.core.benchmarks import CARLAOCC_TO_CARLA
 from carlasc.core.geometry import invert, quaternions_of, transform_points
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -161,3 +162,18 @@ def with_boxes(source: Path, out: Path) -> Path:
         boxes = Boxes(*numbers.T, poses[:, :3, 3], quaternions_of(poses[:, :3, :3]), sizes, known)
         writer.write("boxes", frame, boxes.to_table())
     return out
+
+
+def write_carlaocc(source: Path, out: Path, name: str = "Town01_Opt_Seq07") -> None:
+    """Write left-handed grids of CARLA's classes as a sequence of CarlaOcc, whose axes are right-handed."""
+    sequence = sequence_of(source)
+    spec, folder = sequence.grids[GRID], out / name / "occupancy" / "vs_0_4_surround_view"
+    tag_of = {new: tag for tag, new in reversed(CARLAOCC_TO_CARLA.mapping.items())}
+    tags = np.array([tag_of.get(i, 0) for i in range(max(tag_of) + 1)], np.uint16)
+    folder.mkdir(parents=True)
+    for frame in sequence.frames(f"{GRID}/labels").tolist():
+        labels = tags[sequence.grid(GRID, frame).labels[:, ::-1]]
+        cells = np.argwhere(labels > 0)
+        rows = np.column_stack([cells, 1000 * labels[labels > 0]]).astype(np.uint16)
+        geometry = {"voxel_size": spec.voxel_size[0], "voxel_origin": np.float32(spec.lower), "volume_size": spec.size}
+        np.savez_compressed(folder / f"{frame:04d}.npz", occupancy=rows, **geometry)
